@@ -1,0 +1,40 @@
+"""POPGym Arcade for PyTorch: ten pixel games as MDP/POMDP twins, stepped in JAX, seen by TorchRL without a copy.
+
+Public names are resolved on first use, so that importing the package costs little and
+``import arcade_torch.envs_jax`` never loads torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "ArcadeCollector": "arcade_torch.collector",
+    "ArcadeEnv": "arcade_torch.env",
+    "make": "arcade_torch.env",
+    "next_pixels": "arcade_torch.frames",
+    "registered_ids": "arcade_torch.envs_jax",
+}
+
+if TYPE_CHECKING:
+    from arcade_torch.collector import ArcadeCollector
+    from arcade_torch.env import ArcadeEnv, make
+    from arcade_torch.envs_jax import registered_ids
+    from arcade_torch.frames import next_pixels
+
+__all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "next_pixels", "registered_ids"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for (PEP 562)."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'arcade_torch' has no attribute {name!r}; public names: {', '.join(__all__)}")
+    value = getattr(import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names, for completion."""
+    return sorted(__all__)

@@ -1,0 +1,146 @@
+"""Many episodes at once: per-env keys, auto-reset, and one drawing a step.
+
+Every env carries its own random key, so env ``i`` of a large batch walks the very path it walks alone, and stepping
+then resetting by mask gives the same bits as the fused step.
+"""
+
+from functools import partial
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.game import Array, Game
+
+State = TypeVar("State")
+
+
+class Batch(NamedTuple):
+    """Everything that is known about N running episodes."""
+
+    key: Array  # uint32 [N, 2], advanced by every step and every reset of its env
+    state: Any  # the game's state, leaves [N, ...]
+    partial: Array  # bool [N], true where the player sees the POMDP twin
+    last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
+    step_count: Array  # int32 [N], steps since the episode began
+    episode_reward: Array  # float32 [N], undiscounted return so far
+
+
+class Outcome(NamedTuple):
+    """What one step gave."""
+
+    reward: Array  # float32 [N]
+    terminated: Array  # bool [N], the game's own end
+    truncated: Array  # bool [N], the time limit
+    done: Array  # bool [N], terminated or truncated
+
+
+def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
+    """Random keys for a batch of envs.
+
+    Args:
+        seed: Seed of the whole batch, 0 <= seed < 2**32.
+        num_envs: Number of envs.
+        first: Index of the first env; the key of env ``i`` depends on ``seed`` and ``first + i`` alone.
+
+    Returns:
+        uint32 [num_envs, 2].
+
+    Raises:
+        ValueError: The seed is out of range.
+
+    Example:
+        >>> bool((env_keys(3, 8)[5:] == env_keys(3, 3, first=5)).all())
+        True
+    """
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
+    index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.PRNGKey(jnp.uint32(seed)), index)
+
+
+def _where(mask: Array, yes: Any, no: Any) -> Any:
+    """Choose whole rows of two pytrees by a bool [N] mask."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, yes, no)
+
+
+class BatchedGame(Generic[State]):
+    """Compiled functions over a batch of one game; each is compiled once per batch size.
+
+    Args:
+        game: The game to batch.
+    """
+
+    def __init__(self, game: Game[State]) -> None:
+        self.game = game
+        self.init = jax.jit(self._init)
+        self.step = jax.jit(self._step)
+        self.reset_where = jax.jit(self._reset_where)
+        self.render = jax.jit(self._render)
+        self.step_auto = jax.jit(self._step_auto)
+        self.step_render = jax.jit(self._step_render)
+        self.reset_render = jax.jit(self._reset_render)
+        self.render_rows = jax.jit(self._render_rows)
+
+    def _init(self, keys: Array, partial: Array) -> Batch:
+        """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""
+        key, first = _split(keys)
+        zeros = jnp.zeros(keys.shape[0], jnp.int32)
+        state = jax.vmap(self.game.reset)(first)
+        return Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
+
+    def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
+        """Take one action in every env; ended episodes stay at their final state."""
+        key, now = _split(batch.key)
+        state, reward, terminated, truncated = jax.vmap(self.game.step)(now, batch.state, action)
+        stepped = Batch(key, state, batch.partial, action, batch.step_count + 1, batch.episode_reward + reward)
+        return stepped, Outcome(reward, terminated, truncated, terminated | truncated)
+
+    def _reset_where(self, batch: Batch, mask: Array) -> Batch:
+        """Begin a new episode where ``mask`` (bool [N]) is true; all other rows keep their bits."""
+        key, first = _split(batch.key)
+        zeros = jnp.zeros_like(batch.step_count)
+        state = jax.vmap(self.game.reset)(first)
+        fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
+        return Batch(*_where(mask, fresh, batch))
+
+    def _render(self, batch: Batch) -> Array:
+        """Draw every env: uint8 [N, S, S, 3]."""
+        return jax.vmap(self.game.render)(batch.state, batch.partial)
+
+    def _step_auto(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
+        """Step, begin anew where an episode ended, then draw once.
+
+        Returns:
+            The batch to go on with, the batch before the resets (its ended rows are the final states), what the step
+            gave, and the frames of the first.
+        """
+        stepped, outcome = self._step(batch, action)
+        root = self._reset_where(stepped, outcome.done)
+        return root, stepped, outcome, self._render(root)
+
+    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
+        """Step and draw, without any reset."""
+        stepped, outcome = self._step(batch, action)
+        return stepped, outcome, self._render(stepped)
+
+    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
+        """Begin anew where ``mask`` is true, and draw all."""
+        root = self._reset_where(batch, mask)
+        return root, self._render(root)
+
+    def _render_rows(self, batch: Batch, index: Array) -> Array:
+        """Draw the envs in ``index`` (int32 [K]) alone: uint8 [K, S, S, 3]."""
+        rows = jax.tree.map(lambda leaf: leaf[index], (batch.state, batch.partial))
+        return jax.vmap(self.game.render)(*rows)
+
+
+@partial(jax.vmap, out_axes=0)
+def _split(key: Array) -> tuple[Array, Array]:
+    """Split one key into the key to keep and the key to use."""
+    keep, use = jax.random.split(key)
+    return keep, use

@@ -1,0 +1,37 @@
+"""The numbers of CartPole and NoisyCartPole."""
+
+from dataclasses import dataclass
+
+GRAVITY = 9.8  # m/s^2
+CART_MASS = 1.0  # kg
+POLE_MASS = 0.1  # kg
+TOTAL_MASS = CART_MASS + POLE_MASS
+HALF_POLE = 0.5  # m
+FORCE = 10.0  # N
+TAU = 0.02  # s, one step
+X_LIMIT = 2.4  # m
+THETA_LIMIT = 12 * 2 * 3.141592653589793 / 360  # rad
+START = 0.05  # all four variables start uniformly in [-START, START]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty.
+
+    Attributes:
+        max_steps: Time limit in steps; each survived step pays ``1 / max_steps``.
+        sigma: Standard deviation of the noise on what is drawn (m, m/s, rad, rad/s).
+    """
+
+    max_steps: int
+    sigma: float = 0.0
+
+
+LEVELS = {
+    "CartPoleEasy": Level(200),
+    "CartPoleMedium": Level(400),
+    "CartPoleHard": Level(600),
+    "NoisyCartPoleEasy": Level(200, 0.1),
+    "NoisyCartPoleMedium": Level(200, 0.2),
+    "NoisyCartPoleHard": Level(200, 0.3),
+}

@@ -1,0 +1,148 @@
+"""Scripted players of MineSweeper: one walks a known board, one infers it from the numbers it has seen."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
+from arcade_torch.envs_jax.minesweeper.picture import KINDS
+from arcade_torch.envs_jax.minesweeper.rules import COVERED_SAFE
+
+Board = npt.NDArray[Any]
+
+
+def snake(side: int) -> npt.NDArray[np.int64]:
+    """A walk over the whole board from the top left, row by row in turns: (x, y), int64 [side**2, 2]."""
+    return np.array([(x if y % 2 == 0 else side - 1 - x, y) for y in range(side) for x in range(side)])
+
+
+def towards(x: Board, y: Board, goal_x: Board, goal_y: Board) -> npt.NDArray[np.int32]:
+    """The move that brings each cursor nearer to its goal, first sideways; ``FIRE`` where it is there."""
+    sideways = np.where(goal_x > x, RIGHT, LEFT)
+    along = np.where(goal_y > y, DOWN, UP)
+    return np.where(goal_x != x, sideways, np.where(goal_y != y, along, FIRE)).astype(np.int32)
+
+
+class MineSweeperState:
+    """Sees the mines: goes to the nearest corner, then walks the board in turns and sweeps what is safe.
+
+    The walk takes at most ``side - 2`` steps to a corner, ``cells - 1`` over the board and ``safe`` sweeps, which fits
+    in the time limit at every difficulty: the return is always 1.
+    """
+
+    def __init__(self, game: Any) -> None:
+        self.side = game.level.side
+        walk = snake(self.side)
+        last = self.side - 1
+        # Four walks, one from each corner.
+        flips = [(fx, fy) for fx in (0, 1) for fy in (0, 1)]
+        self.walks = np.stack(
+            [
+                np.stack([np.where(fx, last - walk[:, 0], walk[:, 0]), np.where(fy, last - walk[:, 1], walk[:, 1])], -1)
+                for fx, fy in flips
+            ]
+        )
+        self.walk = np.zeros(0, np.int64)
+
+    def act(self, seen: Any, is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
+        if len(self.walk) != len(is_init):
+            self.walk = np.zeros(len(is_init), np.int64)
+        nearest = (seen.x * 2 >= self.side) * 2 + (seen.y * 2 >= self.side)
+        self.walk = np.where(is_init, nearest, self.walk)
+        envs = np.arange(len(is_init))
+        path = self.walks[self.walk]  # [N, cells, 2]
+        safe = seen.grid[envs[:, None], path[..., 0], path[..., 1]] == COVERED_SAFE
+        goal = path[envs, safe.argmax(1)]
+        return towards(seen.x, seen.y, goal[:, 0], goal[:, 1])
+
+
+class MineSweeperFrames:
+    """Sees the POMDP's frames: remembers every number seen and infers where mines may lie.
+
+    Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen and to the number of
+    mines (iterative proportional fitting), sweeps the nearest cell that is surely safe, and otherwise the least likely
+    mine. Its return stays below 1 for two reasons that no memory mends: the first sweeps are guesses, and the time
+    limit.
+
+    Args:
+        game: The MineSweeper to play.
+        rounds: Fitting rounds a step.
+    """
+
+    def __init__(self, game: Any, rounds: int = 30) -> None:
+        self.screen, self.level, self.rounds = game.screen, game.level, rounds
+        self.known: npt.NDArray[np.int64] = np.zeros((0, 0, 0), np.int64)
+
+    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
+        side, envs = self.level.side, np.arange(len(seen))
+        if len(self.known) != len(seen):
+            self.known = np.full((len(seen), side, side), -1)
+        self.known[is_init] = -1
+        codes = read_board(seen, self.screen.board, side)  # [N, row, column]
+        cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
+        y, x = cursor // side, cursor % side
+        number = codes[envs, y, x] - KINDS - 1
+        self.known[envs, y, x] = np.maximum(number, self.known[envs, y, x])
+
+        covered = self.known < 0
+        risk = np.where(covered, mine_chances(self.known, self.level.mines, self.rounds), np.inf)
+        rows, columns = np.mgrid[:side, :side]
+        distance = np.abs(rows - y[:, None, None]) + np.abs(columns - x[:, None, None])
+        cost = np.where(risk < 0.02, 0.0, risk) + 1e-3 * distance
+        goal = cost.reshape(len(seen), -1).argmin(1)
+        return towards(x, y, goal % side, goal // side)
+
+
+def read_board(frames: npt.NDArray[np.uint8], board: Any, side: int) -> npt.NDArray[np.int64]:
+    """Which tile each cell shows, by comparing pixels with the atlas: int64 [N, rows, columns].
+
+    Args:
+        frames: uint8 [N, S, S, 3].
+        board: The :class:`~arcade_torch.envs_jax.render.TileGrid` drawn on them.
+        side: Cells per side.
+    """
+    pitch = board.atlas.shape[1]
+    area = frames[:, board.y : board.y + side * pitch, board.x : board.x + side * pitch]
+    tiles = area.reshape(len(frames), side, pitch, side, pitch, 3).swapaxes(2, 3).reshape(len(frames), side, side, -1)
+    codes = np.full(tiles.shape[:3], -1)
+    for code, picture in enumerate(board.atlas.reshape(len(board.atlas), -1)):
+        codes[(tiles == picture).all(-1)] = code
+    return codes
+
+
+def block_sum(values: Board) -> Board:
+    """Sum over the 3 x 3 block around each cell, for values [N, side, side]."""
+    padded = np.pad(values, ((0, 0), (1, 1), (1, 1)))
+    rows = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    total: Board = rows[:, :, :-2] + rows[:, :, 1:-1] + rows[:, :, 2:]
+    return total
+
+
+def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.NDArray[np.float64]:
+    """Chance of a mine in each covered cell, fitted to the numbers seen.
+
+    Args:
+        known: int64 [N, side, side], the number of each swept cell, -1 where covered.
+        mines: Mines on the board.
+        rounds: Fitting rounds.
+
+    Returns:
+        float64 [N, side, side]; 0 in swept cells.
+    """
+    covered: Board = known < 0
+    count = np.maximum(covered.sum((1, 2), keepdims=True), 1)
+    chance: npt.NDArray[np.float64] = covered * np.minimum(mines / count, 1.0)
+    for _ in range(rounds):
+        expected = block_sum(chance)
+        factor = np.where(~covered, known / np.maximum(expected, 1e-9), 1.0)
+        log_factor = np.where(~covered, np.log(np.clip(factor, 1e-6, 1e6)), 0.0)
+        # Every cell moves by the mean wish of the numbers around it, except that a 0 decides alone.
+        near = np.maximum(block_sum((~covered).astype(float)), 1.0)
+        chance = covered * np.clip(chance * np.exp(block_sum(log_factor) / near), 0.0, 1.0)
+        chance[block_sum(((known == 0) & ~covered).astype(float)) > 0] = 0.0
+        chance *= np.clip(mines / np.maximum(chance.sum((1, 2), keepdims=True), 1e-9), 0.5, 2.0) ** 0.5
+        chance = np.minimum(chance, 1.0)
+    return chance

@@ -1,0 +1,44 @@
+"""Drawing for games: host-side primitives, text, and the atlas renderer. Users may build games of their own with it."""
+
+from arcade_torch.envs_jax.render.canvas import arc, bitmap, blank, disc, paint, pixel_centres, polygon, rectangle
+from arcade_torch.envs_jax.render.screen import (
+    GRID_LINE,
+    GridLayout,
+    Slot,
+    TileGrid,
+    gather,
+    grid_layout,
+    lined_board,
+    number_slot,
+    place,
+    titled_background,
+)
+from arcade_torch.envs_jax.render.text import DIGITS, LETTERS, PATTERN, TEXT, centred, draw_name, number_pictures
+
+__all__ = [
+    "DIGITS",
+    "GRID_LINE",
+    "LETTERS",
+    "PATTERN",
+    "TEXT",
+    "GridLayout",
+    "Slot",
+    "TileGrid",
+    "arc",
+    "bitmap",
+    "blank",
+    "centred",
+    "disc",
+    "draw_name",
+    "gather",
+    "grid_layout",
+    "lined_board",
+    "number_pictures",
+    "number_slot",
+    "paint",
+    "pixel_centres",
+    "place",
+    "polygon",
+    "rectangle",
+    "titled_background",
+]

@@ -1,0 +1,58 @@
+"""Helpers shared by the tests of the games."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from arcade_torch.envs_jax import BatchedGame, env_keys, make, registered_ids
+
+ALL_IDS = registered_ids()
+
+
+class Walk:
+    """A rollout without resets: states, outcomes and frames of N envs over T steps, as numpy arrays [T, N, ...]."""
+
+    def __init__(self, game, actions, seed=0, partial=None):
+        envs = actions.shape[1]
+        batched = BatchedGame(game)
+        batch = batched.init(env_keys(seed, envs), jnp.zeros(envs, bool) if partial is None else jnp.asarray(partial))
+        states, outcomes = [batch.state], []
+        for action in actions:
+            batch, outcome = batched.step(batch, action.astype(np.int32))
+            states.append(batch.state)
+            outcomes.append(outcome)
+        self.states = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *states)
+        self.outcomes = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *outcomes)
+        self.last = batch
+
+
+@pytest.fixture(scope="session")
+def walk():
+    """The class itself, so that tests need no import."""
+    return Walk
+
+
+def random_actions(steps, envs, seed=0):
+    """Uniformly random actions, int32 [steps, envs]."""
+    return np.random.default_rng(seed).integers(0, 5, (steps, envs), dtype=np.int32)
+
+
+def one(game, **changes):
+    """A state of the game (from key 0) with some of its variables replaced."""
+    state = game.reset(jax.random.PRNGKey(0))
+    return state._replace(**{name: jnp.asarray(value, getattr(state, name).dtype) for name, value in changes.items()})
+
+
+_compiled = {}
+
+
+def draw(game, state, partial):
+    """The frame of one state as a numpy array, by a renderer compiled once a game."""
+    key = (repr(game), getattr(game, "arrow", None))
+    if key not in _compiled:
+        _compiled[key] = jax.jit(game.render)
+    return np.asarray(_compiled[key](state, partial))
+
+
+__all__ = ["ALL_IDS", "Walk", "draw", "make", "one", "random_actions"]

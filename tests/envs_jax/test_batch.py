@@ -1,0 +1,156 @@
+"""Laws of batching that hold for every game."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from arcade_torch.envs_jax import BatchedGame, env_keys, make
+
+from .conftest import ALL_IDS, random_actions
+
+FAMILIES = ["CartPoleEasy", "NoisyCartPoleHard", "MineSweeperEasy"]
+CACHE = {}
+
+
+def batched(id, **options):
+    """One compiled game for all tests that need it."""
+    key = (id, *options.items())
+    if key not in CACHE:
+        CACHE[key] = BatchedGame(make(id, **options))
+    return CACHE[key]
+
+
+def same(a, b):
+    """Whether two pytrees agree bit for bit."""
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def rows(tree, index):
+    """Rows of every leaf."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+
+@pytest.mark.parametrize("id", FAMILIES)
+def test_env_i_of_512_walks_the_path_it_walks_alone(id):
+    game, index = batched(id), 391
+    many = game.init(env_keys(5, 512), jnp.zeros(512, bool))
+    alone = game.init(env_keys(5, 1, first=index), jnp.zeros(1, bool))
+    for action in random_actions(40, 512, seed=1):
+        many, _, outcome, frames = game.step_auto(many, action)
+        alone, _, outcome_alone, frames_alone = game.step_auto(alone, action[index : index + 1])
+        assert same(rows(many, [index]), alone)
+        assert same(rows(outcome, [index]), outcome_alone)
+        assert np.array_equal(np.asarray(frames)[index], np.asarray(frames_alone)[0])
+
+
+@pytest.mark.parametrize("id", FAMILIES)
+def test_the_fused_step_equals_step_then_reset(id):
+    game = batched(id)
+    fused = apart = game.init(env_keys(0, 16), jnp.arange(16) % 2 == 0)
+    ends = 0
+    for action in random_actions(60, 16):
+        fused, stepped, outcome, frames = game.step_auto(fused, action)
+        before, outcome_apart, final_frames = game.step_render(apart, action)
+        apart, root_frames = game.reset_render(before, outcome_apart.done)
+        ended = np.flatnonzero(outcome.done)
+        ends += len(ended)
+        assert same(fused, apart) and same(stepped, before) and same(outcome, outcome_apart)
+        assert np.array_equal(frames, root_frames)
+        chosen = np.asarray(
+            game.render_rows(stepped, np.resize(ended, 16).astype(np.int32) if len(ended) else np.zeros(16, np.int32))
+        )
+        assert np.array_equal(chosen[: len(ended)], np.asarray(final_frames)[ended])
+    assert ends > 10
+
+
+@pytest.mark.parametrize("id", FAMILIES)
+@settings(max_examples=15, deadline=None)
+@given(mask=hnp.arrays(bool, 16), steps=st.integers(0, 6), seed=st.integers(0, 2**32 - 1))
+def test_a_masked_reset_leaves_the_others_untouched(id, mask, steps, seed):
+    game = batched(id)
+    batch = game.init(env_keys(seed, 16), jnp.zeros(16, bool))
+    for action in random_actions(steps, 16, seed=seed):
+        batch, _ = game.step(batch, action)
+    after = game.reset_where(batch, mask)
+    assert same(rows(after, ~mask), rows(batch, ~mask))
+    assert (np.asarray(after.step_count)[mask] == 0).all() and (np.asarray(after.episode_reward)[mask] == 0).all()
+    assert np.array_equal(after.last_action, batch.last_action)
+    assert (np.asarray(after.key)[mask] != np.asarray(batch.key)[mask]).any(axis=-1).all()
+
+
+@pytest.mark.parametrize("rules", ["default", "reference"])
+@pytest.mark.parametrize("id", FAMILIES)
+def test_twins_step_in_lockstep(id, rules):
+    game = batched(id, rules=rules)
+    full, partial = (game.init(env_keys(2, 16), jnp.full(16, flag)) for flag in (False, True))
+    hidden = 0
+    for action in random_actions(50, 16):
+        full, _, outcome, frames = game.step_auto(full, action)
+        partial, _, outcome_partial, frames_partial = game.step_auto(partial, action)
+        assert same(full._replace(partial=partial.partial), partial) and same(outcome, outcome_partial)
+        hidden += not np.array_equal(frames, frames_partial)
+    assert hidden > 40, "the twins ought to look different"
+
+
+@pytest.mark.parametrize("id", FAMILIES)
+def test_the_frame_is_a_function_of_state_and_twin_alone(id):
+    game = batched(id)
+    batch = game.init(env_keys(3, 16), jnp.arange(16) % 3 == 0)
+    for action in random_actions(12, 16):
+        batch, _, _, frames = game.step_auto(batch, action)
+        assert np.array_equal(frames, game.render(batch))
+        switched = batch._replace(partial=~np.asarray(batch.partial))
+        again = switched._replace(
+            partial=~np.asarray(switched.partial), key=batch.key * 0, last_action=batch.last_action * 0
+        )
+        assert np.array_equal(game.render(again), frames)
+
+
+@pytest.mark.parametrize("id", ALL_IDS)
+@pytest.mark.parametrize("rules", ["default", "reference"])
+def test_long_random_rollouts_keep_the_contract(id, rules):
+    game = batched(id, rules=rules)
+    low, high = game.game.return_range
+    batch = game.init(env_keys(7, 64), jnp.arange(64) % 2 == 0)
+    returns, longest = [], 0
+    for action in random_actions(150, 64, seed=3):
+        batch, stepped, outcome, frames = game.step_auto(batch, action)
+        done = np.asarray(outcome.done)
+        assert np.array_equal(done, np.asarray(outcome.terminated) | np.asarray(outcome.truncated))
+        assert outcome.reward.dtype == np.float32 and np.isfinite(outcome.reward).all()
+        returns.extend(np.asarray(stepped.episode_reward)[done])
+        longest = max(longest, int(np.asarray(stepped.step_count).max()))
+    assert frames.dtype == np.uint8 and frames.shape == (64, 128, 128, 3)
+    assert all(len(np.unique(frame)) > 2 for frame in np.asarray(frames)), "a blank frame"
+    assert len(returns) > 64
+    assert low - 1e-5 <= min(returns) and max(returns) <= high + 1e-5
+    assert longest <= game.game.max_steps + (rules == "reference")
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), actions=hnp.arrays(np.int32, (20, 16), elements=st.integers(0, 4)))
+def test_equal_seeds_and_actions_give_equal_bits(seed, actions):
+    game = batched("MineSweeperEasy")
+
+    def play():
+        batch = game.init(env_keys(seed, 16), jnp.zeros(16, bool))
+        for action in actions:
+            batch, _, _, frames = game.step_auto(batch, action)
+        return batch, frames
+
+    assert same(play(), play())
+
+
+def test_a_seed_out_of_range_is_refused():
+    for seed in (-1, 2**32):
+        with pytest.raises(ValueError, match="seed is"):
+            env_keys(seed, 2)
+
+
+def test_keys_depend_on_seed_and_index_alone():
+    assert np.array_equal(env_keys(9, 512)[100:103], env_keys(9, 3, first=100))
+    assert len(np.unique(np.asarray(env_keys(9, 512)), axis=0)) == 512

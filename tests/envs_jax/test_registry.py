@@ -1,0 +1,74 @@
+"""The registry says clearly what it does not know."""
+
+import pytest
+
+from arcade_torch.envs_jax import make, option_names, register, registered_ids, resolve_id
+
+
+def test_ids_are_versioned_and_sorted():
+    ids = registered_ids()
+    assert ids == sorted(ids)
+    assert all(id.endswith("-v0") for id in ids)
+    assert {
+        f"{name}{level}-v0"
+        for name in ("CartPole", "NoisyCartPole", "MineSweeper")
+        for level in ("Easy", "Medium", "Hard")
+    } <= set(ids)
+
+
+def test_a_bare_name_means_the_newest_version():
+    assert make("CartPoleEasy").id == make("CartPoleEasy-v0").id == "CartPoleEasy-v0"
+
+
+@pytest.mark.parametrize("level", ["Easy", "Medium", "Hard"])
+def test_noisy_pole_is_an_alias(level):
+    assert resolve_id(f"NoisyPole{level}") == resolve_id(f"NoisyPole{level}-v0") == f"NoisyCartPole{level}-v0"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"),
+    [("CartPole", "CartPole"), ("minesweepereasy", "MineSweeperEasy"), ("NoisyPoleEsy", "NoisyPoleEasy")],
+)
+def test_an_unknown_id_names_itself_the_nearest_and_the_list(wrong, near):
+    with pytest.raises(ValueError) as error:
+        make(wrong)
+    assert repr(wrong) in str(error.value)
+    assert near in str(error.value).replace(repr(wrong), "")
+    assert "registered_ids" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_version_names_the_newest():
+    with pytest.raises(ValueError, match=r"CartPoleEasy-v7.*CartPoleEasy-v0"):
+        make("CartPoleEasy-v7")
+
+
+@pytest.mark.parametrize("size", [64, 128.5, "128", True, None])
+def test_a_wrong_size_is_refused(size):
+    with pytest.raises(ValueError, match=r"obs_size.*128, 256"):
+        make("CartPoleEasy", obs_size=size)
+
+
+def test_wrong_rules_and_options_are_refused():
+    with pytest.raises(ValueError, match="rules is 'house', allowed: 'default', 'reference'"):
+        make("CartPoleEasy", rules="house")
+    with pytest.raises(TypeError, match="no option 'arow': its options are arrow"):
+        make("CartPoleEasy", arow="log")
+    with pytest.raises(ValueError, match="arrow is 'big', allowed: 'log', 'linear'"):
+        make("CartPoleEasy", arrow="big")
+    with pytest.raises(ValueError, match="mine_reward"):
+        make("MineSweeperEasy", mine_reward=1.0)
+    with pytest.raises(TypeError, match="env id"):
+        make(3)
+
+
+def test_options_are_listed():
+    assert option_names("CartPoleEasy") == ["arrow"]
+    assert option_names("MineSweeperHard") == ["mine_reward"]
+
+
+def test_registering_needs_a_version_and_a_free_name():
+    with pytest.raises(ValueError, match="no version"):
+        register("Mine", lambda **_: None)
+    with pytest.raises(ValueError, match="registered already"):
+        register("CartPoleEasy-v0", lambda **_: None)
