@@ -1,36 +1,37 @@
 """Helpers shared by the tests of the games."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from arcade_torch.envs_jax import BatchedGame, env_keys, make, registered_ids
 
 ALL_IDS = registered_ids()
 
 
+@functools.cache
+def batched(id, **options):
+    """One compiled game for all tests that need it."""
+    return BatchedGame(make(id, **options))
+
+
 class Walk:
     """A rollout without resets: states, outcomes and frames of N envs over T steps, as numpy arrays [T, N, ...]."""
 
-    def __init__(self, game, actions, seed=0, partial=None):
+    def __init__(self, game, actions, seed=0):
         envs = actions.shape[1]
-        batched = BatchedGame(game)
-        batch = batched.init(env_keys(seed, envs), jnp.zeros(envs, bool) if partial is None else jnp.asarray(partial))
+        compiled = batched(game.id, rules=game.rules)
+        batch = compiled.init(env_keys(seed, envs), jnp.zeros(envs, bool))
         states, outcomes = [batch.state], []
         for action in actions:
-            batch, outcome = batched.step(batch, action.astype(np.int32))
+            batch, outcome = compiled.step(batch, action.astype(np.int32))
             states.append(batch.state)
             outcomes.append(outcome)
         self.states = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *states)
         self.outcomes = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *outcomes)
         self.last = batch
-
-
-@pytest.fixture(scope="session")
-def walk():
-    """The class itself, so that tests need no import."""
-    return Walk
 
 
 def random_actions(steps, envs, seed=0):
@@ -55,4 +56,4 @@ def draw(game, state, partial):
     return np.asarray(_compiled[key](state, partial))
 
 
-__all__ = ["ALL_IDS", "Walk", "draw", "make", "one", "random_actions"]
+__all__ = ["ALL_IDS", "Walk", "batched", "draw", "make", "one", "random_actions"]

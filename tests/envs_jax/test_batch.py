@@ -8,20 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from arcade_torch.envs_jax import BatchedGame, env_keys, make
+from arcade_torch.envs_jax import env_keys
 
-from .conftest import ALL_IDS, random_actions
+from .conftest import ALL_IDS, batched, random_actions
 
 FAMILIES = ["CartPoleEasy", "NoisyCartPoleHard", "MineSweeperEasy"]
-CACHE = {}
-
-
-def batched(id, **options):
-    """One compiled game for all tests that need it."""
-    key = (id, *options.items())
-    if key not in CACHE:
-        CACHE[key] = BatchedGame(make(id, **options))
-    return CACHE[key]
 
 
 def same(a, b):

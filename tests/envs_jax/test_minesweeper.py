@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arcade_torch.envs_jax import BatchedGame, env_keys, make
+from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.minesweeper.oracle import mine_chances, read_board
 from arcade_torch.envs_jax.minesweeper.picture import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_MINE, SWEPT
 
-from .conftest import Walk, draw, one, random_actions
+from .conftest import Walk, batched, draw, one, random_actions
 
 LEVELS = {"MineSweeperEasy": (4, 2), "MineSweeperMedium": (6, 6), "MineSweeperHard": (8, 10)}
 KEY = jax.random.PRNGKey(0)
@@ -19,7 +19,7 @@ COMPILED = {}
 
 def boards(id, count=512, seed=0):
     """Fresh states of many envs, with numpy leaves."""
-    game = BatchedGame(make(id))
+    game = batched(id)
     return jax.tree.map(np.asarray, game.init(env_keys(seed, count), jnp.zeros(count, bool)).state)
 
 
@@ -158,13 +158,13 @@ def test_sweeping_the_last_safe_cell_terminates_with_return_one():
 def test_template_matching_recovers_every_number_at_every_size(id, size):
     """Board, cursor and numbers can be read back from the MDP picture alone."""
     game = make(id, obs_size=size)
-    batched = BatchedGame(game)
+    compiled = batched(id, obs_size=size)
     side = game.level.side
-    states = [batched.init(env_keys(4, 24), jnp.zeros(24, bool))]
+    states = [compiled.init(env_keys(4, 24), jnp.zeros(24, bool))]
     for action in random_actions(60, 24, seed=8):
-        states.append(batched.step(states[-1], action)[0])
+        states.append(compiled.step(states[-1], action)[0])
     for batch in states[:: len(states) // 4]:
-        codes = read_board(np.asarray(batched.render(batch)), game.screen.board, side)
+        codes = read_board(np.asarray(compiled.render(batch)), game.screen.board, side)
         state = jax.tree.map(np.asarray, batch.state)
         expected = np.where(state.grid == SWEPT, 1 + state.neighbours, 0)
         expected[np.arange(24), state.x, state.y] += KINDS

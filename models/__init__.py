@@ -1,0 +1,64 @@
+"""Memory models in torch: cells, networks around them, and their place in TorchRL.
+
+A memory model is an ``nn.Module`` with two methods: ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H],
+state)`` and ``initial_state(batch_size)``. Acting is the same call with T = 1; the state is a TensorDict of fixed-shape
+tensors; ``is_init`` marks the steps that open an episode, before which everything is forgotten.
+
+* :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru gru mlp``).
+* :func:`check_memory`: do the laws hold for this module? Yours too. :class:`MemoryLawError` says which does not.
+* :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of ``LSTMModule``.
+* :func:`make_network`, :class:`MemoryNetwork`: pixels to Q-values, presets "paper" and "small".
+* :class:`MemoryBlock`: the stack of cells between encoder and head.
+* :func:`linear_scan`: the recurrence h_t = a_t h_{t-1} + b_t as a torch operator.
+
+Nothing here knows an environment or JAX. TorchRL is imported only when :class:`MemoryModule` is asked for.
+
+Example:
+    >>> import torch
+    >>> memory = make_memory("lru", input_size=8, hidden_size=16)
+    >>> x, is_init = torch.randn(4, 10, 8), torch.zeros(4, 10, dtype=torch.bool)
+    >>> y, state = memory(x, memory.initial_state(4), is_init)
+    >>> y.shape
+    torch.Size([4, 10, 16])
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from arcade_torch.models.base import Memory, MemoryContract, ReplayableMemory
+from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
+from arcade_torch.models.laws import MemoryLawError, check_memory
+from arcade_torch.models.networks import MemoryNetwork, make_network
+from arcade_torch.models.registry import make_memory, memory_names, register_memory
+from arcade_torch.models.scan import linear_scan, linear_scan_loop
+from arcade_torch.models.stack import MemoryBlock
+
+if TYPE_CHECKING:
+    from arcade_torch.models.module import MemoryModule
+
+__all__ = [
+    "Encoder",
+    "Memory",
+    "MemoryBlock",
+    "MemoryContract",
+    "MemoryLawError",
+    "MemoryModule",
+    "MemoryNetwork",
+    "PaperEncoder",
+    "ReplayableMemory",
+    "SmallEncoder",
+    "check_memory",
+    "linear_scan",
+    "linear_scan_loop",
+    "make_memory",
+    "make_network",
+    "memory_names",
+    "register_memory",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import ``MemoryModule``, and TorchRL with it, on first use."""
+    if name != "MemoryModule":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+    return import_module("arcade_torch.models.module").MemoryModule

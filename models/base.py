@@ -1,0 +1,151 @@
+"""What a memory model is: two methods, and the shared half of ours."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+__all__ = ["Memory", "MemoryContract", "ReplayableMemory", "replay"]
+
+
+@runtime_checkable
+class MemoryContract(Protocol):
+    """The two methods by which any module, ours or yours, is a memory model; ``check_memory`` tests the laws."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """Read a chunk of steps.
+
+        Args:
+            x: float [B, T, D], inputs; acting is the same call with T = 1.
+            state: TensorDict [B] of fixed-shape tensors, the recurrent state before step 0.
+            is_init: bool [B, T], True where a step opens an episode: everything before it is forgotten *before*
+                that step is read (at index 0: ``state`` is ignored).
+
+        Returns:
+            (y float [B, T, H], state TensorDict [B] after the last step); the given state is not modified.
+        """
+
+    def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
+        """The state at the start of an episode, TensorDict [batch_size]."""
+
+
+@runtime_checkable
+class ReplayableMemory(MemoryContract, Protocol):
+    """A memory that also replays stored data at full speed; without this method :func:`replay` steps through time."""
+
+    def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """Read sequences whose every step carries the recurrent state that was stored when it was acted.
+
+        Args:
+            x: float [B, T, D].
+            stored: TensorDict [B, T], the state *before* each step; loaded at index 0 and wherever ``is_init`` is set
+                (zeros after a real reset, a real state where a sampler cut an episode), not looked at elsewhere.
+            is_init: bool [B, T].
+
+        Returns:
+            (y float [B, T, H], states TensorDict [B, T] *after* each step).
+        """
+
+
+def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+    """Read stored sequences with any memory: by its own ``replay`` method, or step by step where it has none.
+
+    Args:
+        memory: a memory model.
+        x: float [B, T, D].
+        stored: TensorDict [B, T], see :class:`ReplayableMemory`.
+        is_init: bool [B, T].
+
+    Returns:
+        (y float [B, T, H], states TensorDict [B, T] after each step).
+    """
+    if isinstance(memory, ReplayableMemory):
+        return memory.replay(x, stored, is_init)
+    state, carried_on = stored[:, 0], torch.zeros_like(is_init[:, :1])
+    outputs, states = [], []
+    for t in range(x.shape[1]):
+        if t > 0:
+            state = stored[:, t].where(is_init[:, t], state)
+        y, state = memory(x[:, t : t + 1], state, carried_on)
+        outputs.append(y)
+        states.append(state)
+    return torch.cat(outputs, dim=1), torch.stack(states, dim=1)
+
+
+class Memory(nn.Module):
+    """Base of the memory models of this package whose state is one tensor ``"h"``.
+
+    A model says what shape its state has (``state_shape``, None for none) and implements :meth:`run`.
+
+    Args:
+        input_size: D, features per step.
+        hidden_size: H, features of the output.
+
+    Raises:
+        ValueError: a size is not positive.
+    """
+
+    state_shape: tuple[int, ...] | None = None
+
+    def __init__(self, input_size: int, hidden_size: int) -> None:
+        super().__init__()
+        if input_size < 1 or hidden_size < 1:
+            raise ValueError(f"sizes must be positive, got input_size={input_size}, hidden_size={hidden_size}")
+        self.input_size, self.hidden_size = input_size, hidden_size
+
+    def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
+        """Read a chunk of steps.
+
+        Args:
+            x: float [B, T, D].
+            h0: [B, *state_shape], the state before step 0, or [B, T, *state_shape], one stored state per step (loaded
+                at index 0 and wherever ``is_init`` is set).
+            is_init: bool [B, T].
+
+        Returns:
+            (y [B, T, H], state after each step [B, T, *state_shape]).
+        """
+        raise NotImplementedError
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """See :class:`MemoryContract`."""
+        self._check(x, is_init)
+        y, h = self.run(x, state["h"], is_init)
+        return y, TensorDict({"h": h[:, -1]}, batch_size=[x.shape[0]])
+
+    def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """See :class:`ReplayableMemory`."""
+        self._check(x, is_init)
+        y, h = self.run(x, stored["h"], is_init)
+        return y, TensorDict({"h": h}, batch_size=x.shape[:2])
+
+    def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
+        """Zeros, in the dtype and on the device of the parameters.
+
+        Args:
+            batch_size: B, or a whole batch shape.
+
+        Returns:
+            TensorDict [batch_size] with ``"h"`` of shape [batch_size, *state_shape].
+        """
+        batch = [batch_size] if isinstance(batch_size, int) else list(batch_size)
+        if self.state_shape is None:
+            return TensorDict({}, batch_size=batch)
+        like = next(self.parameters())
+        h = torch.zeros(*batch, *self.state_shape, dtype=like.dtype, device=like.device)
+        return TensorDict({"h": h}, batch_size=batch)
+
+    def _check(self, x: Tensor, is_init: Tensor) -> None:
+        if x.ndim != 3 or x.shape[-1] != self.input_size:
+            raise ValueError(f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)")
+        if is_init.shape != x.shape[:2]:
+            raise ValueError(
+                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {list(is_init.shape)}; "
+                "[B, T, 1] needs squeeze(-1)"
+            )
+
+    def extra_repr(self) -> str:
+        """Sizes, for printing."""
+        return f"input_size={self.input_size}, hidden_size={self.hidden_size}"

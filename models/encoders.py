@@ -1,0 +1,201 @@
+"""Pixel encoders: from uint8 frames [..., S, S, 3] to features [..., E].
+
+An encoder also says what of a frame is worth storing (``compress``) and learns its input scaling from random play
+(``calibrate``); both do nothing where there is nothing to do. Float frames in the range 0..255 are accepted as well,
+and gradients reach them.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+__all__ = ["Encoder", "PaperEncoder", "SmallEncoder"]
+
+
+class Encoder(nn.Module):
+    """What the encoders share.
+
+    Args:
+        obs_size: S, side of a full frame in pixels.
+        stored_size: s, side of a compressed frame in pixels.
+        feature_size: E.
+    """
+
+    def __init__(self, obs_size: int, stored_size: int, feature_size: int) -> None:
+        super().__init__()
+        self.obs_size, self.stored_size, self.feature_size = obs_size, stored_size, feature_size
+
+    def compress(self, pixels: Tensor) -> Tensor:
+        """The part of a frame that the encoder looks at; here the frame itself.
+
+        Args:
+            pixels: uint8 (or float, 0..255) [..., S, S, 3].
+
+        Returns:
+            same dtype, [..., s, s, 3].
+        """
+        return pixels
+
+    def calibrate(self, pixels: Tensor) -> None:
+        """Set the input scaling from frames of random play, uint8 [..., S, S, 3] or compressed; here nothing to do."""
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Encode frames.
+
+        Args:
+            pixels: uint8 or float (0..255), full [..., S, S, 3] or compressed [..., s, s, 3].
+
+        Returns:
+            float [..., E], dtype of the parameters.
+
+        Raises:
+            ValueError: the last three dimensions are neither.
+        """
+        frames = self._frames(pixels)
+        return self.features(frames).reshape(*pixels.shape[:-3], self.feature_size)
+
+    def features(self, frames: Tensor) -> Tensor:
+        """Encode compressed frames [N, s, s, 3] -> [N, E]."""
+        raise NotImplementedError
+
+    def _frames(self, pixels: Tensor) -> Tensor:
+        """Compressed frames with one batch dimension, [N, s, s, 3]."""
+        size, full = tuple(pixels.shape[-3:]), (self.obs_size, self.obs_size, 3)
+        stored = (self.stored_size, self.stored_size, 3)
+        if size not in (full, stored):
+            raise ValueError(
+                f"frames must be [..., {self.obs_size}, {self.obs_size}, 3] (height, width, colour)"
+                + ("" if full == stored else f" or compressed [..., {self.stored_size}, {self.stored_size}, 3]")
+                + f", got {list(pixels.shape)}"
+            )
+        frames = pixels.reshape(-1, *size)
+        return frames if size == stored else self.compress(frames)
+
+
+# (kernel, stride) of the four convolutions and of the pool behind each; None: no pool.
+_PAPER_LAYERS: dict[int, list[tuple[tuple[int, int], tuple[int, int] | None]]] = {
+    128: [((5, 2), (2, 2)), ((3, 2), (2, 2)), ((3, 2), (3, 1)), ((1, 1), None)],
+    256: [((7, 2), (2, 2)), ((3, 2), (2, 2)), ((3, 2), (2, 2)), ((3, 2), None)],
+}
+_PAPER_CHANNELS = (3, 64, 128, 256, 512)
+
+
+class PaperEncoder(Encoder):
+    """The paper's CNN: four convolutions (64, 128, 256, 512 channels), LeakyReLU, three max pools, 512 features.
+
+    Frames are divided by 255 here, once. The pool stands before the LeakyReLU (it is monotone, so the result is the
+    same and the activation handles a quarter of the values), and everything is channels-last, which is how frames
+    arrive: together 2.7 times as fast on a CPU as the textbook order.
+
+    Args:
+        obs_size: 128 (505,472 parameters) or 256 (1,558,656).
+
+    Raises:
+        ValueError: another size.
+
+    Source: POPGym Arcade, network tables; third pool as the reference implementation has it (3x3, stride 1).
+    """
+
+    def __init__(self, obs_size: int = 128) -> None:
+        if obs_size not in _PAPER_LAYERS:
+            raise ValueError(f"the paper's encoder exists for obs_size 128 and 256, got {obs_size}")
+        super().__init__(obs_size, obs_size, _PAPER_CHANNELS[-1])
+        layers: list[nn.Module] = []
+        for i, ((kernel, stride), pool) in enumerate(_PAPER_LAYERS[obs_size]):
+            layers.append(nn.Conv2d(_PAPER_CHANNELS[i], _PAPER_CHANNELS[i + 1], kernel, stride))
+            if pool is not None:
+                layers.append(nn.MaxPool2d(*pool))
+            layers.append(nn.LeakyReLU(inplace=True))
+        self.layers = nn.Sequential(*layers)
+        self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def features(self, frames: Tensor) -> Tensor:
+        """[N, S, S, 3] -> [N, 512]."""
+        x = frames.permute(0, 3, 1, 2).to(self.layers[0].weight.dtype) / 255  # type: ignore[arg-type]
+        return self.layers(x).flatten(1)  # type: ignore[no-any-return]
+
+
+class SmallEncoder(Encoder):
+    """A CNN for one CPU core: frames pooled to 32x32, two convolutions, 128 features.
+
+    Pooled frames are uint8 (floor of the block's mean), 3 KiB each, so they are pooled once and stored pooled. Input
+    scaling: minus a per-pixel mean, divided by one number, the RMS of the centred pixels; :meth:`calibrate` sets both
+    (before that: division by 255). Float frames are pooled without the floor.
+
+    Args:
+        obs_size: S, 32 times a power of two up to 256.
+
+    Raises:
+        ValueError: another size.
+    """
+
+    SIDE = 32
+
+    def __init__(self, obs_size: int = 128) -> None:
+        if obs_size not in (32, 64, 128, 256):
+            raise ValueError(f"obs_size must be 32, 64, 128 or 256, got {obs_size}")
+        super().__init__(obs_size, self.SIDE, 128)
+        self.conv1 = nn.Conv2d(3, 32, 4, 4)
+        self.conv2 = nn.Conv2d(32, 32, 3)
+        self.linear = nn.Linear(32 * 6 * 6, 128)
+        self.register_buffer("mean", torch.zeros(3, self.SIDE, self.SIDE))
+        self.register_buffer("inverse_rms", torch.tensor(1 / 255))
+        self.mean: Tensor
+        self.inverse_rms: Tensor
+
+    def compress(self, pixels: Tensor) -> Tensor:
+        """Average pooling to 32x32.
+
+        Args:
+            pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3].
+
+        Returns:
+            same dtype, [..., 32, 32, 3].
+        """
+        lead, side, block = pixels.shape[:-3], self.SIDE, self.obs_size // self.SIDE
+        if pixels.is_floating_point():
+            return pixels.reshape(*lead, side, block, side, block, 3).mean(dim=(-4, -2))
+        if pixels.device.type == "cpu" and lead.numel() > 64:  # beyond that the sums leave the cache: half as fast
+            chunks = pixels.reshape(-1, *pixels.shape[-3:]).split(64)
+            return torch.cat([self._pool(chunk) for chunk in chunks]).reshape(*lead, side, side, 3)
+        return self._pool(pixels).reshape(*lead, side, side, 3)
+
+    def _pool(self, pixels: Tensor) -> Tensor:
+        """uint8 [..., S, S, 3] -> uint8 [N, 32, 32, 3], floor of the block mean."""
+        side, block = self.SIDE, self.obs_size // self.SIDE
+        # Sums fit int16 (8 * 8 * 255). Rows first, on whole lines; then columns, moved so that 96 values lie in a row.
+        lines = pixels.reshape(-1, side, block, self.obs_size * 3).unbind(2)
+        rows = lines[0].to(torch.int16)
+        for line in lines[1:]:
+            rows = rows.add_(line)
+        columns = rows.view(-1, side, side, block, 3).permute(0, 1, 3, 4, 2).contiguous()
+        total = columns.sum(2, dtype=torch.int16)
+        mean = (total >> (2 * (block.bit_length() - 1))).to(torch.uint8)
+        return mean.permute(0, 1, 3, 2).contiguous()
+
+    @torch.no_grad()
+    def calibrate(self, pixels: Tensor) -> None:
+        """Set mean and RMS from frames of random play (3,200 frames are plenty).
+
+        Args:
+            pixels: uint8, full [..., S, S, 3] or compressed [..., 32, 32, 3].
+
+        Raises:
+            ValueError: no frames, or of another size.
+        """
+        chunks = pixels.reshape(-1, *pixels.shape[-3:]).split(256)
+        frames = torch.cat([self._frames(chunk) for chunk in chunks])
+        if frames.shape[0] == 0:
+            raise ValueError("calibrate needs at least one frame, got none")
+        centred = frames.to(self.mean.device, torch.float64)
+        mean = centred.mean(0)
+        rms = (centred - mean).square().mean().sqrt().clamp_min(1.0)  # one grey level: frames that never change
+        self.mean.copy_(mean.permute(2, 0, 1))
+        self.inverse_rms.copy_(1 / rms)
+
+    def features(self, frames: Tensor) -> Tensor:
+        """[N, 32, 32, 3] -> [N, 128]."""
+        x = torch.sub(frames.permute(0, 3, 1, 2).contiguous(), self.mean) * self.inverse_rms
+        x = F.leaky_relu_(self.conv1(x))
+        x = F.leaky_relu_(self.conv2(x)).flatten(1)
+        return F.leaky_relu_(F.layer_norm(self.linear(x), (self.feature_size,)))

@@ -1,0 +1,314 @@
+"""The laws of a memory model, checked on any module that anybody hands in."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from arcade_torch.models.base import ReplayableMemory, replay
+
+__all__ = ["MemoryLawError", "check_memory"]
+
+
+class MemoryLawError(AssertionError):
+    """A memory model breaks one of the laws.
+
+    Attributes:
+        law: name of the law, as in the keys that :func:`check_memory` returns.
+        discrepancy: largest absolute difference found, NaN if the law is not about numbers.
+    """
+
+    def __init__(self, law: str, found: str, cause: str, discrepancy: float = float("nan")) -> None:
+        super().__init__(f"law {law!r} is broken: {found}. Likely cause: {cause}.")
+        self.law, self.discrepancy = law, discrepancy
+
+
+def check_memory(
+    module: nn.Module, *, input_size: int | None = None, tolerance: float = 1e-7, seed: int = 0, gradients: bool = True
+) -> dict[str, float]:
+    """Check that a module is a lawful memory model.
+
+    Works on a copy in float64 and evaluation mode, with random inputs; takes a second or so for small sizes.
+
+    Args:
+        module: has ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
+            ``initial_state(batch_size)``; ``replay`` is checked too where there is one.
+        input_size: D; None reads ``module.input_size``.
+        tolerance: largest absolute difference allowed between two ways to compute the same outputs of order 1.
+        seed: of the random inputs.
+        gradients: also compare gradients with finite differences (the slowest law).
+
+    Returns:
+        For each law the largest discrepancy that was found (all within tolerance).
+
+    Raises:
+        MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
+        ValueError: the input size is not known.
+
+    Example:
+        >>> from arcade_torch.models import check_memory, make_memory
+        >>> sorted(check_memory(make_memory("mingru", 3, 4)))[:3]
+        ['batch rows are independent', 'gradients are right', 'nothing leaks over a start']
+    """
+    size = input_size if input_size is not None else getattr(module, "input_size", None)
+    if not isinstance(size, int):
+        raise ValueError("input size unknown: pass check_memory(module, input_size=...) or set module.input_size")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        subject = _Subject(copy.deepcopy(module).double().eval(), size, tolerance)
+        laws: list[tuple[str, Callable[[_Subject, str], float]]] = [
+            ("shapes are fixed", _shapes),
+            ("scan equals step by step", _scan_equals_steps),
+            ("several calls equal one", _calls_equal_one),
+            ("packed equals apart", _packed_equals_apart),
+            ("nothing leaks over a start", _no_leak),
+            ("batch rows are independent", _rows_independent),
+        ]
+        if isinstance(module, ReplayableMemory):
+            laws.append(("replay loads stored states", _replay_loads))
+        if gradients:
+            laws.append(("gradients are right", _gradients))
+        return {name: law(subject, name) for name, law in laws}
+
+
+@dataclass
+class _Subject:
+    """The copy under test and what the laws need to poke it."""
+
+    module: nn.Module
+    input_size: int
+    tolerance: float
+
+    def random(self, batch: int, steps: int) -> Tensor:
+        """Random x [batch, steps, D] where the parameters are."""
+        like = next(self.module.parameters(), torch.zeros(0))
+        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(like.device)
+
+    def inputs(self, batch: int, steps: int, resets: float = 0.0) -> tuple[Tensor, TensorDict, Tensor]:
+        """Random x, a state that some steps have led to, and start flags."""
+        x, warm = self.random(batch, steps), self.random(batch, 3)
+        with torch.no_grad():
+            _, state = self.module(warm, self.initial(batch), torch.zeros_like(warm[..., 0], dtype=torch.bool))
+        return x, state, (torch.rand(batch, steps) < resets).to(x.device)
+
+    def initial(self, batch: int) -> TensorDict:
+        return self.module.initial_state(batch)  # type: ignore[operator]
+
+    def compare(self, law: str, found: str, cause: str, *pairs: tuple[Tensor, Tensor]) -> float:
+        """Largest difference of the pairs; raises if above the tolerance or not a number."""
+        worst = max((float((p - q).abs().max()) for p, q in pairs if p.numel()), default=0.0)
+        if not worst <= self.tolerance:
+            raise MemoryLawError(law, f"{found} (largest difference {worst:.2g})", cause, worst)
+        return worst
+
+
+def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
+    """The tensors of a state, by path."""
+    return {key if isinstance(key, tuple) else (key,): state.get(key) for key in state.keys(True, True)}
+
+
+def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
+    """Tensors of two states side by side, as floats."""
+    theirs = _leaves(q)
+    return [(leaf.double(), theirs[key].double()) for key, leaf in _leaves(p).items()]
+
+
+def _shapes(s: _Subject, law: str) -> float:
+    for batch, steps in ((1, 1), (3, 1), (2, 5)):
+        x = s.random(batch, steps)
+        y, after = s.module(x, s.initial(batch), torch.zeros_like(x[..., 0], dtype=torch.bool))
+        if y.shape[:2] != (batch, steps) or y.ndim != 3:
+            raise MemoryLawError(
+                law, f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]", "time and batch are exchanged"
+            )
+        expected = {k: (list(v.shape), v.dtype) for k, v in _leaves(s.initial(batch)).items()}
+        got = {k: (list(v.shape), v.dtype) for k, v in _leaves(after).items()}
+        if expected != got:
+            raise MemoryLawError(
+                law,
+                f"initial_state({batch}) has {expected} but forward returned {got}",
+                "the state grows with time, lacks the batch dimension, or has a dtype of its own "
+                "(take dtype and device from the parameters)",
+            )
+        if y.dtype != torch.float64:
+            raise MemoryLawError(
+                law, f"float64 parameters and inputs gave {y.dtype}", "a constant or a cast in another dtype"
+            )
+    x, state, flags = s.inputs(2, 5, 0.3)
+    before = state.clone()
+    s.module(x, state, flags)
+    return s.compare(law, "forward changed the state that it was given", "an in-place write", *_pairs(before, state))
+
+
+def _steps(s: _Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
+    """The same chunk, one call a step."""
+    outputs = []
+    for t in range(x.shape[1]):
+        y, state = s.module(x[:, t : t + 1], state, flags[:, t : t + 1])
+        outputs.append(y)
+    return torch.cat(outputs, dim=1), state
+
+
+@torch.no_grad()
+def _scan_equals_steps(s: _Subject, law: str) -> float:
+    worst = 0.0
+    for steps in (1, 2, 3, 7, 12, 17):
+        for resets in (0.0, 0.3):
+            x, state, flags = s.inputs(3, steps, resets)
+            y, after = s.module(x, state, flags)
+            stepped, stepped_after = _steps(s, x, state, flags)
+            found = f"one call over T={steps} steps {'with' if resets else 'without'} resets and T calls of one differ"
+            cause = (
+                "an operator that is not associative, a scan that mishandles lengths that are no power of two, "
+                "a look into the future, or acting and learning in different code"
+            )
+            if resets:
+                cause = "start flags applied one step late or early, or only at index 0; otherwise: " + cause
+            worst = max(worst, s.compare(law, found, cause, (y, stepped), *_pairs(after, stepped_after)))
+    return worst
+
+
+@torch.no_grad()
+def _calls_equal_one(s: _Subject, law: str) -> float:
+    worst = 0.0
+    x, state, flags = s.inputs(3, 11, 0.2)
+    y, after = s.module(x, state, flags)
+    for cuts in ((5,), (1, 4, 10), (3, 6)):
+        parts, carried = [], state
+        for begin, end in zip((0, *cuts), (*cuts, 11), strict=True):
+            part, carried = s.module(x[:, begin:end], carried, flags[:, begin:end])
+            parts.append(part)
+        worst = max(
+            worst,
+            s.compare(
+                law,
+                f"11 steps in one call and in calls cut at {cuts} differ",
+                "the returned state is not the one after the last step, or the given state is not used",
+                (y, torch.cat(parts, dim=1)),
+                *_pairs(after, carried),
+            ),
+        )
+    return worst
+
+
+@torch.no_grad()
+def _packed_equals_apart(s: _Subject, law: str) -> float:
+    worst = 0.0
+    lengths = (1, 4, 2, 6)
+    x, state, flags = s.inputs(2, sum(lengths))
+    begin = 0
+    for length in lengths:
+        flags[:, begin] = True
+        begin += length
+    y, _ = s.module(x, state, flags)
+    begin = 0
+    for length in lengths:
+        part = x[:, begin : begin + length]
+        alone, _ = s.module(part, s.initial(2), torch.zeros_like(flags[:, :length]))
+        worst = max(
+            worst,
+            s.compare(
+                law,
+                f"an episode of {length} steps packed behind others at index {begin} and run on its own differ",
+                "the start flag does not restore initial_state, or restores it after reading the first step",
+                (y[:, begin : begin + length], alone),
+            ),
+        )
+        begin += length
+    return worst
+
+
+def _no_leak(s: _Subject, law: str) -> float:
+    cause = "the state is multiplied by 0 (0 * inf = NaN) or left in place at a start; select with torch.where"
+    x, state, flags = s.inputs(2, 9)
+    flags[:, 4] = True
+    leaves = [v.requires_grad_() for v in _leaves(state).values() if v.is_floating_point()]
+    x.requires_grad_()
+    y, _ = s.module(x, state, flags)
+    after = y[:, 4:].sum()
+    grads = torch.autograd.grad(after, [x, *leaves], allow_unused=True, materialize_grads=True)
+    earlier = [grads[0][:, :4], *grads[1:]]
+    worst = s.compare(law, "gradients flow backward over a start", cause, *[(g, torch.zeros_like(g)) for g in earlier])
+    with torch.no_grad():
+        other, other_state, _ = s.inputs(2, 9)
+        changed, _ = s.module(torch.cat([other[:, :4], x[:, 4:]], 1), other_state, flags)
+        found = "outputs after a start depend on what was before it"
+        worst = max(worst, s.compare(law, found, cause, (y[:, 4:], changed[:, 4:])))
+        flags[:, 0] = True
+        poisoned = state.apply(lambda v: torch.full_like(v, torch.nan) if v.is_floating_point() else v)
+        clean, after_clean = s.module(x, s.initial(2), flags)
+        survived, after_poison = s.module(x, poisoned, flags)
+        found = "a NaN in the carried state comes through a start at index 0"
+        pairs = ((clean, survived), *_pairs(after_clean, after_poison))
+        return max(worst, s.compare(law, found, cause, *pairs))
+
+
+@torch.no_grad()
+def _rows_independent(s: _Subject, law: str) -> float:
+    x, state, flags = s.inputs(4, 5, 0.3)
+    y, after = s.module(x, state, flags)
+    alone, alone_after = s.module(x[1:3], state[1:3], flags[1:3])
+    return s.compare(
+        law,
+        "two rows of a batch of four and the same two alone differ",
+        "batch statistics, a reshape that mixes batch and time, or a flag of one row that resets others",
+        (y[1:3], alone),
+        *_pairs(after[1:3], alone_after),
+    )
+
+
+@torch.no_grad()
+def _replay_loads(s: _Subject, law: str) -> float:
+    x, _, flags = s.inputs(3, 9, 0.3)
+    stored = torch.stack([s.inputs(3, 1)[1] for _ in range(9)], dim=1)
+    y, states = s.module.replay(x, stored, flags)  # type: ignore[operator]
+    stepped, stepped_states = replay(_WithoutReplay(s.module), x, stored, flags)
+    return s.compare(
+        law,
+        "replay and a loop that loads stored states by hand differ",
+        "replay must start from stored[:, t] at t = 0 and wherever is_init is set, and return the states after "
+        "each step",
+        (y, stepped),
+        *_pairs(states, stepped_states),
+    )
+
+
+class _WithoutReplay(nn.Module):
+    """The module with its ``replay`` method hidden, so that replaying it steps through time."""
+
+    def __init__(self, module: nn.Module) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        return self.module(x, state, is_init)  # type: ignore[no-any-return]
+
+
+def _gradients(s: _Subject, law: str) -> float:
+    x, state, flags = s.inputs(2, 5)
+    flags[0, 2] = True
+    keys = [k for k, v in _leaves(state).items() if v.is_floating_point()]
+    names = [name for name, p in s.module.named_parameters() if p.requires_grad]
+    parameters = [s.module.get_parameter(name).detach().clone() for name in names]
+    arguments = [v.detach().clone().requires_grad_() for v in (x, *(state.get(k) for k in keys), *parameters)]
+
+    def outputs(x: Tensor, *rest: Tensor) -> Tensor:
+        given = state.clone()
+        for key, leaf in zip(keys, rest[: len(keys)], strict=True):
+            given.set(key, leaf)
+        weights = dict(zip(names, rest[len(keys) :], strict=True))
+        y: Tensor = torch.func.functional_call(s.module, weights, (x, given, flags))[0]
+        return y
+
+    try:
+        torch.autograd.gradcheck(outputs, arguments, fast_mode=True, atol=1e-5, rtol=1e-3)
+    except RuntimeError as error:  # gradcheck's own error class derives from it
+        raise MemoryLawError(
+            law,
+            f"autograd and finite differences disagree in float64 ({str(error).strip().splitlines()[0]})",
+            "a hand-written backward pass, a detach, a .data or an in-place write",
+        ) from error
+    return 0.0

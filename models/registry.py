@@ -1,0 +1,81 @@
+"""Memory models by name: one dictionary, open to models of your own."""
+
+import difflib
+from collections.abc import Callable
+from typing import Any
+
+from torch import nn
+
+from arcade_torch.models.gru import GRU
+from arcade_torch.models.lru import LRU
+from arcade_torch.models.mingru import MinGRU
+from arcade_torch.models.stateless import Stateless
+
+__all__ = ["make_memory", "memory_names", "register_memory"]
+
+MemoryFactory = Callable[..., nn.Module]
+
+_FACTORIES: dict[str, MemoryFactory] = {"lru": LRU, "mingru": MinGRU, "gru": GRU, "mlp": Stateless}
+
+
+def memory_names() -> list[str]:
+    """All names that :func:`make_memory` knows, in the order of registration.
+
+    Example:
+        >>> memory_names()[:4]
+        ['lru', 'mingru', 'gru', 'mlp']
+    """
+    return list(_FACTORIES)
+
+
+def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) -> nn.Module:
+    """Make a memory model.
+
+    Args:
+        name: one of :func:`memory_names`.
+        input_size: D, features of an input step.
+        hidden_size: H, features of an output step.
+        **options: those of the model, such as ``candidate="linear"`` of MinGRU.
+
+    Returns:
+        ``nn.Module`` with ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
+        ``initial_state(batch_size)``; see ``MemoryContract``.
+
+    Raises:
+        ValueError: unknown name; the message has the nearest match and the list.
+        TypeError: an option that the model does not have.
+
+    Example:
+        >>> import torch
+        >>> memory = make_memory("mingru", input_size=3, hidden_size=4)
+        >>> y, state = memory(torch.zeros(2, 5, 3), memory.initial_state(2), torch.zeros(2, 5, dtype=torch.bool))
+        >>> y.shape, state["h"].shape
+        (torch.Size([2, 5, 4]), torch.Size([2, 4]))
+    """
+    if name not in _FACTORIES:
+        near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(f"unknown memory {name!r}: {hint}known are {', '.join(_FACTORIES)}; add with register_memory")
+    return _FACTORIES[name](input_size, hidden_size, **options)
+
+
+def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = False) -> None:
+    """Make a model of your own available by name, here and on the command line.
+
+    Args:
+        name: what to call it; a Python identifier in lower case.
+        factory: called as ``factory(input_size, hidden_size, **options)``, returns a module that keeps the contract of
+            ``MemoryContract`` (run ``check_memory`` on one).
+        overwrite: allow replacing a registered name.
+
+    Raises:
+        ValueError: the name is taken, or not a lower-case identifier.
+        TypeError: ``factory`` cannot be called.
+    """
+    if not name.isidentifier() or name != name.lower():
+        raise ValueError(f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}")
+    if not callable(factory):
+        raise TypeError(f"factory must be callable as factory(input_size, hidden_size, **options), got {factory!r}")
+    if name in _FACTORIES and not overwrite:
+        raise ValueError(f"memory {name!r} is registered already; choose another name or pass overwrite=True")
+    _FACTORIES[name] = factory

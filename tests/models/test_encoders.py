@@ -1,0 +1,148 @@
+"""Encoders: published sizes, exact pooling, scaling from random play, gradients to float frames."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+from torch.nn import functional as F
+
+from arcade_torch.models import PaperEncoder, SmallEncoder
+
+
+def frames(*shape, size=128):
+    return torch.randint(0, 256, (*shape, size, size, 3), dtype=torch.uint8)
+
+
+@pytest.mark.parametrize(("size", "count"), [(128, 505_472), (256, 1_558_656)])
+def test_the_papers_encoder_has_the_published_size_and_512_features(size, count):
+    encoder = PaperEncoder(size)
+    assert sum(p.numel() for p in encoder.parameters()) == count
+    assert encoder(frames(2, size=size)).shape == (2, 512)
+
+
+def test_the_papers_encoder_equals_the_textbook_order_activation_then_pool():
+    encoder = PaperEncoder(128)
+    convolutions = [m for m in encoder.layers if isinstance(m, nn.Conv2d)]
+    pixels = frames(3)
+    x = pixels.permute(0, 3, 1, 2).float() / 255
+    for convolution, pool in zip(convolutions, [(2, 2), (2, 2), (3, 1), None], strict=True):
+        x = F.leaky_relu(convolution(x), 0.01)
+        x = x if pool is None else F.max_pool2d(x, *pool)
+    torch.testing.assert_close(encoder(pixels), x.flatten(1))
+
+
+@given(
+    block=st.sampled_from([1, 2, 4, 8]),
+    lead=st.lists(st.integers(0, 3), max_size=2),
+    high=st.sampled_from([1, 2, 256]),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=25, deadline=None)
+def test_small_pooling_is_the_floor_of_the_block_mean(block, lead, high, seed):
+    size = 32 * block
+    generator = torch.Generator().manual_seed(seed)
+    pixels = torch.randint(256 - high, 256, (*lead, size, size, 3), dtype=torch.uint8, generator=generator)
+    pooled = SmallEncoder(size).compress(pixels)
+    sums = pixels.long().reshape(*lead, 32, block, 32, block, 3).sum((-4, -2))
+    assert pooled.dtype == torch.uint8 and pooled.shape == (*lead, 32, 32, 3) and pooled.is_contiguous()
+    assert torch.equal(pooled, (sums // block**2).to(torch.uint8))
+
+
+def test_pooling_does_not_write_to_the_frames():
+    pixels = frames(2)
+    before = pixels.clone()
+    SmallEncoder().compress(pixels)
+    SmallEncoder()(pixels)
+    assert torch.equal(pixels, before)
+
+
+def test_pooling_many_frames_at_once_equals_pooling_each():
+    pixels = frames(33, 2)
+    encoder = SmallEncoder()
+    assert torch.equal(encoder.compress(pixels), torch.stack([encoder.compress(row) for row in pixels]))
+
+
+def test_pooling_reads_frames_that_are_not_contiguous():
+    pixels = frames(4, 6)
+    assert torch.equal(SmallEncoder().compress(pixels[:, ::2]), SmallEncoder().compress(pixels[:, ::2].contiguous()))
+
+
+@pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
+def test_leading_dimensions_are_kept_and_do_not_mix(make):
+    encoder = make()
+    pixels = frames(2, 3)
+    features = encoder(pixels)
+    assert features.shape == (2, 3, encoder.feature_size)
+    torch.testing.assert_close(encoder(pixels[1, 2]), features[1, 2])
+
+
+def test_full_and_compressed_frames_give_the_same_features():
+    encoder = SmallEncoder()
+    pixels = frames(3)
+    assert torch.equal(encoder(pixels), encoder(encoder.compress(pixels)))
+    assert torch.equal(PaperEncoder().compress(pixels), pixels)
+
+
+@pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
+def test_float_frames_equal_uint8_frames_and_have_gradients(make):
+    encoder = make().double()
+    blocky = frames(2, size=32).repeat_interleave(4, 1).repeat_interleave(4, 2)  # block means without a remainder
+    smooth = blocky.double().requires_grad_()
+    torch.testing.assert_close(encoder(smooth), encoder(blocky))
+    encoder(smooth)[:, :7].square().sum().backward()
+    assert (smooth.grad != 0).double().mean() > 0.2
+    direction = torch.randn_like(smooth)
+    with torch.no_grad():
+        slope = (encoder(smooth + 1e-5 * direction) - encoder(smooth - 1e-5 * direction))[:, :7] / 2e-5
+        expected = (2 * encoder(smooth)[:, :7] * slope).sum()
+    torch.testing.assert_close((smooth.grad * direction).sum(), expected, rtol=1e-4, atol=1e-8)
+
+
+def test_compressed_float_frames_are_read_too():
+    encoder = SmallEncoder()
+    pooled = frames(2, size=32)
+    assert torch.equal(encoder(pooled.float()), encoder(pooled))
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_calibration_centres_each_pixel_and_scales_all_to_rms_one(compressed):
+    encoder = SmallEncoder()
+    pixels = (frames(300, 2) // 3 + torch.arange(128, dtype=torch.uint8).view(128, 1, 1)).to(torch.uint8)
+    pooled = encoder.compress(pixels)
+    encoder.calibrate(pooled if compressed else pixels)
+    x = (pooled.permute(0, 1, 4, 2, 3) - encoder.mean) * encoder.inverse_rms
+    torch.testing.assert_close(x.mean((0, 1)), torch.zeros(3, 32, 32), rtol=0, atol=1e-4)
+    torch.testing.assert_close(x.square().mean(), torch.tensor(1.0), rtol=0, atol=1e-4)
+    assert {"mean", "inverse_rms"} <= set(encoder.state_dict())
+
+
+def test_calibration_on_frames_that_never_change_stays_finite():
+    encoder = SmallEncoder()
+    encoder.calibrate(frames(1).expand(5, -1, -1, -1))
+    assert torch.isfinite(encoder(frames(2))).all() and encoder.inverse_rms == 1
+
+
+def test_wrong_sizes_get_one_clear_line():
+    with pytest.raises(
+        ValueError, match=r"\[\.\.\., 128, 128, 3\].*compressed \[\.\.\., 32, 32, 3\], got \[2, 3, 128, 128\]"
+    ):
+        SmallEncoder()(torch.zeros(2, 3, 128, 128))
+    with pytest.raises(ValueError, match="128 and 256, got 64"):
+        PaperEncoder(64)
+    with pytest.raises(ValueError, match="got 100"):
+        SmallEncoder(100)
+    with pytest.raises(ValueError, match="at least one"):
+        SmallEncoder().calibrate(frames(0))
+
+
+def test_the_small_encoder_is_the_documented_stack_on_scaled_frames():
+    encoder, pixels = SmallEncoder(), frames(40) // 2
+    encoder.calibrate(pixels)
+    pooled = encoder.compress(pixels).permute(0, 3, 1, 2).float()
+    centred = pooled - pooled.mean(0)
+    x = centred / centred.square().mean().sqrt()
+    x = F.leaky_relu(F.conv2d(x, encoder.conv1.weight, encoder.conv1.bias, stride=4))
+    x = F.leaky_relu(F.conv2d(x, encoder.conv2.weight, encoder.conv2.bias))
+    x = F.leaky_relu(F.layer_norm(F.linear(x.flatten(1), encoder.linear.weight, encoder.linear.bias), (128,)))
+    torch.testing.assert_close(encoder(pixels), x, rtol=1e-4, atol=1e-4)

@@ -1,0 +1,128 @@
+"""check_memory passes lawful modules of anybody's, and names the law that a broken one breaks."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from arcade_torch.models.laws import MemoryLawError, check_memory
+from arcade_torch.models.mingru import MinGRU
+
+
+class LeakyAverage(nn.Module):
+    """A third party's model: two methods, no base class. ``flaw`` switches one mistake on."""
+
+    input_size = 3
+
+    def __init__(self, flaw=None):
+        super().__init__()
+        self.linear = nn.Linear(3, 4)
+        self.flaw = flaw
+
+    def initial_state(self, batch_size):
+        return TensorDict({"h": self.linear.weight.new_zeros(batch_size, 4)}, batch_size=[batch_size])
+
+    def forward(self, x, state, is_init):
+        flaw, h = self.flaw, state["h"]
+        if flaw == "in place":
+            h.mul_(0.5)
+        if flaw == "ignores state":
+            h = torch.zeros_like(h)
+        inputs = torch.tanh(self.linear(x))
+        if flaw == "batch statistics":
+            inputs = inputs - inputs.mean(0)
+        if flaw == "looks ahead":
+            inputs = inputs + inputs.flip(1)
+        outputs = []
+        for t in range(x.shape[1]):
+            begins = is_init[:, t : t + 1]
+            if flaw == "late flag":
+                begins = is_init[:, t - 1 : t] if t else torch.zeros_like(begins)
+            if flaw == "any row":
+                begins = begins.any().expand_as(begins)
+            if flaw == "only at index 0" and t:
+                begins = torch.zeros_like(begins)
+            h = h * (1 - begins.to(h.dtype)) if flaw == "multiplies" else torch.where(begins, 0, h)
+            if flaw == "leaks":
+                h = h + 1e-3 * state["h"]
+            previous = h
+            h = 0.9 * h + inputs[:, t]
+            if flaw == "detach":
+                h = 0.9 * previous.detach() + inputs[:, t]
+            outputs.append(h)
+        y = torch.stack(outputs, 1)
+        if flaw == "grows":
+            return y, TensorDict({"h": y}, batch_size=[len(x)])
+        if flaw == "returns the state before":
+            return y, TensorDict({"h": previous}, batch_size=[len(x)])
+        if flaw == "float32":
+            y = y.float()
+        return (y.transpose(0, 1) if flaw == "time first" else y), TensorDict({"h": h}, batch_size=[len(x)])
+
+
+def test_a_third_partys_lawful_module_passes():
+    report = check_memory(LeakyAverage())
+    assert len(report) == 7 and max(report.values()) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("flaw", "law", "word"),
+    [
+        ("in place", "shapes are fixed", "in-place"),
+        ("grows", "shapes are fixed", "grows"),
+        ("time first", "shapes are fixed", "exchanged"),
+        ("float32", "shapes are fixed", "float32"),
+        ("ignores state", "scan equals step by step", "differ"),
+        ("looks ahead", "scan equals step by step", "future"),
+        ("late flag", "scan equals step by step", "late"),
+        ("only at index 0", "scan equals step by step", "only at index 0"),
+        ("returns the state before", "scan equals step by step", "without resets"),
+        ("leaks", "scan equals step by step", "differ"),
+        ("multiplies", "nothing leaks over a start", "torch.where"),
+        ("batch statistics", "batch rows are independent", "statistics"),
+        ("any row", "batch rows are independent", "flag of one row"),
+        ("detach", "gradients are right", "detach"),
+    ],
+)
+def test_a_flaw_is_named_with_the_law_it_breaks(flaw, law, word):
+    with pytest.raises(MemoryLawError, match=word) as caught:
+        check_memory(LeakyAverage(flaw))
+    assert caught.value.law == law
+    assert law in str(caught.value) and "Likely cause" in str(caught.value)
+
+
+def test_the_size_of_the_discrepancy_is_reported():
+    with pytest.raises(MemoryLawError, match="largest difference") as caught:
+        check_memory(LeakyAverage("late flag"))
+    assert 1e-3 < caught.value.discrepancy < 100
+
+
+class ForgetfulReplay(MinGRU):
+    """Loads the stored state at index 0 only."""
+
+    def replay(self, x, stored, is_init):
+        y, h = self.run(x, stored["h"][:, 0], is_init)
+        return y, TensorDict({"h": h}, batch_size=x.shape[:2])
+
+
+def test_a_wrong_replay_is_caught():
+    with pytest.raises(MemoryLawError, match="stored") as caught:
+        check_memory(ForgetfulReplay(3, 4))
+    assert caught.value.law == "replay loads stored states"
+
+
+def test_the_module_itself_is_left_alone():
+    memory = LeakyAverage().train()
+    weights = memory.linear.weight.clone()
+    state = torch.random.get_rng_state()
+    check_memory(memory)
+    assert memory.training and memory.linear.weight.dtype == torch.float32
+    assert torch.equal(memory.linear.weight, weights) and torch.equal(torch.random.get_rng_state(), state)
+
+
+def test_the_input_size_is_asked_for_when_it_cannot_be_known():
+    memory = LeakyAverage()
+    memory.input_size = None
+    with pytest.raises(ValueError, match="input_size"):
+        check_memory(memory)
+    check_memory(memory, input_size=3)

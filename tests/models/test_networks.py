@@ -1,0 +1,206 @@
+"""Networks: published sizes, acting equals learning, options do what they say."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from arcade_torch.models import MemoryBlock, check_memory, make_network
+from arcade_torch.models.heads import HEADS, make_head
+
+CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
+
+
+def count(module):
+    return sum(p.numel() for p in module.parameters())
+
+
+def inputs(batch=2, steps=5, size=32):
+    pixels = torch.randint(0, 256, (batch, steps, size, size, 3), dtype=torch.uint8)
+    return pixels, torch.randint(0, 5, (batch, steps)), torch.rand(batch, steps) < 0.3
+
+
+@pytest.mark.parametrize("memory", CELLS)
+def test_the_papers_network_has_the_published_size(memory):
+    assert count(make_network("paper", memory)) == 1_428_613 + 2 * CELLS[memory]
+
+
+@pytest.mark.parametrize(("memory", "size"), [("mingru", 225_733), ("mlp", 209_221), ("gru", 291_397)])
+def test_the_small_network_has_the_documented_size(memory, size):
+    assert count(make_network("small", memory)) == size
+
+
+@pytest.mark.parametrize("memory", CELLS)
+@pytest.mark.parametrize("skip", ["residual", "none"])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_the_block_keeps_the_laws_of_a_memory(memory, skip, layers):
+    check_memory(MemoryBlock(3, 4, memory, layers=layers, skip=skip), tolerance=1e-6)
+
+
+@pytest.mark.parametrize("memory", CELLS)
+def test_acting_step_by_step_equals_learning_on_the_sequence(memory):
+    network = make_network("small", memory)
+    pixels, last_action, is_init = inputs(3, 9, 128)
+    with torch.no_grad():
+        out, last = network(pixels, last_action, is_init, network.initial_state(3))
+        state, stepped = network.initial_state(3), []
+        for t in range(9):
+            features = network.encode(network.compress(pixels[:, t])).unsqueeze(1)
+            q, state = network.remember(features, last_action[:, t : t + 1], is_init[:, t : t + 1], state)
+            stepped.append(q)
+    torch.testing.assert_close(torch.cat(stepped, 1), out, rtol=0, atol=1e-5)
+    for key in last.keys(True, True):
+        torch.testing.assert_close(state[key], last[key], rtol=0, atol=1e-5)
+
+
+def test_the_papers_network_acts_as_it_learns():
+    network = make_network("paper", "lru")
+    pixels, last_action, is_init = inputs(2, 3, 128)
+    with torch.no_grad():
+        out, _ = network(pixels, last_action, is_init, network.initial_state(2))
+        state, stepped = network.initial_state(2), []
+        for t in range(3):
+            q, state = network(pixels[:, t : t + 1], last_action[:, t : t + 1], is_init[:, t : t + 1], state)
+            stepped.append(q)
+    torch.testing.assert_close(torch.cat(stepped, 1), out, rtol=0, atol=1e-5)
+
+
+def test_the_residual_skip_lets_the_input_bypass_the_memory_and_none_does_not():
+    x, flags = torch.randn(2, 4, 3), torch.zeros(2, 4, dtype=torch.bool)
+    for skip in ("residual", "none"):
+        block = MemoryBlock(3, 4, "gru", layers=1, skip=skip)
+        block.linears[0].weight.data.zero_(), block.linears[0].bias.data.zero_()  # the layer then adds LeakyReLU(0)
+        y, _ = block(x, block.initial_state(2), flags)
+        expected = block.linear(x) if skip == "residual" else torch.zeros(2, 4, 4)
+        torch.testing.assert_close(y, expected)
+
+
+def last_action_matters(network, is_init):
+    """Does the output at step 0 depend on the last action shown there?"""
+    pixels, last_action, _ = inputs(1, 1)
+    state = network.initial_state(1)
+    with torch.no_grad():
+        first, _ = network(pixels, last_action, torch.tensor([[is_init]]), state)
+        other, _ = network(pixels, (last_action + 1) % 5, torch.tensor([[is_init]]), state)
+    return not torch.equal(first, other)
+
+
+def test_the_last_action_is_seen_and_zeroed_at_a_start_only_where_asked():
+    small = {"preset": "small", "memory": "gru"}
+    assert last_action_matters(make_network(**small), is_init=False)
+    assert not last_action_matters(make_network(**small), is_init=True)
+    assert last_action_matters(make_network(**small, zero_action_on_reset=False), is_init=True)
+    assert not last_action_matters(make_network(**small, use_last_action=False), is_init=False)
+    assert not make_network("paper", "mlp").zero_action_on_reset
+
+
+def test_saliency_reaches_every_earlier_frame_through_the_memory():
+    network = make_network("small", "mingru")
+    pixels, last_action, is_init = inputs(1, 4, 128)
+    smooth = pixels.float().requires_grad_()
+    q, _ = network(smooth, last_action, torch.zeros_like(is_init), network.initial_state(1))
+    q[0, -1].max().backward()
+    assert (smooth.grad.abs().sum((0, 2, 3, 4)) > 0).all()
+    smooth.grad = None
+    is_init[:] = torch.tensor([[True, False, True, False]])
+    q, _ = network(smooth, last_action, is_init, network.initial_state(1))
+    q[0, -1].max().backward()
+    assert (smooth.grad.abs().sum((0, 2, 3, 4)) > 0).tolist() == [False, False, True, True]
+
+
+def test_the_state_is_nested_by_layer_and_zero_at_first():
+    state = make_network("paper", "lru").initial_state(3)
+    assert isinstance(state, TensorDict) and state.batch_size == (3,)
+    assert {key: tuple(state[key].shape) for key in state.keys(True, True)} == {
+        ("layer0", "h"): (3, 512, 2),
+        ("layer1", "h"): (3, 512, 2),
+    }
+    assert all((state[key] == 0).all() for key in state.keys(True, True))
+    assert make_network("small", "mlp").initial_state(3).is_empty()
+
+
+def test_small_starts_with_small_values_and_slow_gates():
+    network = make_network("small", "mingru")
+    assert network.head.bias.eq(0).all() and network.head.weight.abs().max() <= 0.1 / 128**0.5
+    bias = network.block.cells[0].gate_and_candidate.bias[:128]
+    assert bias.min() < -4 and bias.max() <= 0
+    fast = make_network("small", "mingru", memory_options={"slow_gates": False}).block.cells[0]
+    assert fast.gate_and_candidate.bias.min() > -1
+
+
+def test_sizes_heads_and_outputs_are_options():
+    network = make_network("paper", "mingru", layers=8, hidden_size=128, head="paper", num_outputs=1)
+    assert len(network.block.cells) == 8 and network.block.hidden_size == 128
+    assert count(network.head) == (128 * 256 + 256) + (256 * 256 + 256) + 512 + 257
+    for name in HEADS:
+        assert make_head(name, 16, 3)(torch.zeros(2, 5, 16)).shape == (2, 5, 3)
+
+
+def test_a_memory_of_ones_own_can_be_a_factory():
+    from arcade_torch.models import make_memory
+
+    made = []
+
+    def factory(input_size, hidden_size, **options):
+        made.append((input_size, hidden_size, options))
+        return make_memory("gru", input_size, hidden_size)
+
+    make_network("small", factory, memory_options={"depth": 3})
+    assert made == [(128, 128, {"depth": 3})]
+
+
+def test_calibration_goes_through_the_network_and_is_saved_with_it():
+    pixels = inputs(4, 3, 128)[0]
+    network, twin = make_network("small", "mlp"), make_network("small", "mlp")
+    network.calibrate(network.compress(pixels))
+    assert (network.encoder.mean != 0).any()
+    twin.load_state_dict(network.state_dict())
+    assert torch.equal(twin.encode(pixels), network.encode(pixels))
+    make_network("paper", "mlp").calibrate(pixels)  # nothing to do, but allowed
+
+
+def test_dtype_follows_the_parameters():
+    network = make_network("small", "lru").double()
+    pixels, last_action, is_init = inputs()
+    out, state = network(pixels, last_action, is_init, network.initial_state(2))
+    assert out.dtype == torch.float64 and state["layer0", "h"].dtype == torch.float64
+
+
+@pytest.mark.parametrize("memory", ["mingru", "lru"])
+def test_a_network_runs_under_one_compiled_graph(memory):
+    network = make_network("small", memory)
+    pixels, last_action, is_init = inputs(2, 4)
+    features, state = network.encode(pixels).detach(), network.initial_state(2)
+
+    def loss(features, last_action, is_init):
+        return network.remember(features, last_action, is_init, state)[0].square().mean()
+
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(features, last_action, is_init), loss(features, last_action, is_init))
+    weights = [p for p in network.parameters() if isinstance(p, nn.Parameter)]
+    ours = torch.autograd.grad(compiled(features, last_action, is_init), weights, allow_unused=True)
+    eager = torch.autograd.grad(loss(features, last_action, is_init), weights, allow_unused=True)
+    for p, q in zip(ours, eager, strict=True):
+        if q is not None:
+            torch.testing.assert_close(p, q)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"preset": "smal"}, "mean 'small'"),
+        ({"memory": "lur"}, "mean 'lru'"),
+        ({"head": "big"}, "reference, paper, linear"),
+        ({"skip": "dense"}, "residual"),
+        ({"layers": 0}, "at least 1"),
+        ({"obs_size": 100}, "128 and 256"),
+    ],
+)
+def test_wrong_options_get_one_clear_line(options, message):
+    with pytest.raises(ValueError, match=message):
+        make_network(**{"preset": "paper", "memory": "lru"} | options)
+
+
+def test_an_unknown_option_is_refused_by_name():
+    with pytest.raises(TypeError, match=r"width.*allowed are encoder, hidden_size"):
+        make_network("small", "gru", width=3)
