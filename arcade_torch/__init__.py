@@ -12,15 +12,16 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "ArcadeCollector": "arcade_torch.collector",
     "ArcadeEnv": "arcade_torch.env",
-    "make": "arcade_torch.env",
+    "make": "arcade_torch.factory",
     "next_pixels": "arcade_torch.frames",
     "registered_ids": "arcade_torch.envs_jax",
 }
 
 if TYPE_CHECKING:
     from arcade_torch.collector import ArcadeCollector
-    from arcade_torch.env import ArcadeEnv, make
+    from arcade_torch.env import ArcadeEnv
     from arcade_torch.envs_jax import registered_ids
+    from arcade_torch.factory import make
     from arcade_torch.frames import next_pixels
 
 __all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "next_pixels", "registered_ids"]

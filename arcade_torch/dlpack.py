@@ -1,0 +1,185 @@
+"""Tensors and arrays over the same memory: torch <-> JAX through DLPack, without a copy.
+
+What is shared is shared both ways: a write through torch shows in JAX, whose arrays are meant never to change. Tensors
+that come from JAX are therefore **read only by contract**; clone before writing in place.
+"""
+
+import functools
+import importlib.util
+import os
+import warnings
+
+import numpy as np
+import torch
+from torch.utils.dlpack import from_dlpack
+
+
+def share_gpu() -> bool:
+    """Let JAX and torch live on one GPU: stop JAX from taking 75 % of its memory at the first use.
+
+    Sets ``XLA_PYTHON_CLIENT_PREALLOCATE=false`` unless the user has set it, and only where torch has CUDA. It takes
+    effect if it is called before JAX makes its first array; importing this module calls it.
+
+    Returns:
+        Whether this process is set up to share a GPU.
+    """
+    if not torch.cuda.is_available():
+        return False
+    return os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false").lower() in ("false", "0")
+
+
+share_gpu()
+
+import jax  # noqa: E402  (after share_gpu)
+
+_WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
+_CPU_ALIGNMENT_BYTES = 64
+
+
+def _numpy_shares_read_only() -> bool:
+    """Whether this numpy hands out read-only memory through DLPack (2.1 and later)."""
+    array = np.zeros(1)
+    array.flags.writeable = False
+    try:
+        return bool(from_dlpack(array).data_ptr() == array.ctypes.data)
+    except (BufferError, RuntimeError, TypeError):
+        return False
+
+
+_NUMPY_SHARES_READ_ONLY = _numpy_shares_read_only()
+
+
+def to_torch(array: jax.Array, device: torch.device | None = None) -> torch.Tensor:
+    """See a JAX array as a tensor. Waits until the array has been computed.
+
+    Args:
+        array: Any JAX array but typed random keys (export their ``jax.random.key_data``).
+        device: Where the tensor is wanted; default: where the array is. On another device than the array's, the data
+            is copied.
+
+    Returns:
+        The tensor, over the same memory when the device is the same. Read only by contract.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> x = jnp.arange(3)
+        >>> to_torch(x).data_ptr() == x.unsafe_buffer_pointer()
+        True
+    """
+    if _NUMPY_SHARES_READ_ONLY and array.platform() == "cpu":
+        tensor = from_dlpack(np.asarray(array))  # half the price of asking JAX
+    else:
+        tensor = from_dlpack(array)  # not the capsule form, which would not hand torch's stream to JAX
+    if device is None or tensor.device == device:
+        return tensor
+    if device.type == "cuda" and tensor.device.type == "cpu":
+        warn_frames_are_copied()
+        return tensor.pin_memory().to(device)
+    return tensor.to(device)
+
+
+def to_jax(tensor: torch.Tensor) -> jax.Array:
+    """See a tensor as a JAX array, or say why that would need a copy.
+
+    JAX would copy silently in the refused cases; ask for the copy yourself instead (``.to(torch.int32)``,
+    ``.contiguous()``, ``.clone()``).
+
+    Args:
+        tensor: At most 32 bits an element, dense, detached, and on the CPU aligned to 64 bytes (fresh tensors are).
+
+    Returns:
+        An array over the same memory. Do not write to the tensor as long as JAX may read it.
+
+    Raises:
+        TypeError: A 64-bit type, which JAX would turn into the 32-bit one.
+        ValueError: The tensor requires grad, is not dense, or is not aligned.
+
+    Example:
+        >>> to_jax(torch.zeros(2, dtype=torch.int64))
+        Traceback (most recent call last):
+            ...
+        TypeError: torch.int64 would be copied on its way to JAX: convert it yourself with .to(torch.int32)
+    """
+    if tensor.dtype in _WIDE and not jax.config.read("jax_enable_x64"):
+        raise TypeError(
+            f"{tensor.dtype} would be copied on its way to JAX: convert it yourself with .to({_WIDE[tensor.dtype]})"
+        )
+    if tensor.requires_grad:
+        raise ValueError("the tensor requires grad, JAX cannot record it: pass tensor.detach()")
+    if not (tensor.is_contiguous() or _is_dense(tensor)):
+        raise ValueError(f"strides {tensor.stride()} of shape {tuple(tensor.shape)} have holes: pass .contiguous()")
+    if tensor.device.type == "cpu" and tensor.data_ptr() % _CPU_ALIGNMENT_BYTES:
+        raise ValueError("the tensor does not begin at a multiple of 64 bytes, JAX would copy it: pass .clone()")
+    array: jax.Array = jax.dlpack.from_dlpack(tensor)
+    return array
+
+
+def _is_dense(tensor: torch.Tensor) -> bool:
+    """Whether some order of the axes makes the tensor contiguous."""
+    order = sorted(range(tensor.ndim), key=lambda axis: (tensor.stride(axis), tensor.shape[axis]), reverse=True)
+    return tensor.permute(order).is_contiguous()
+
+
+def int32_argument(tensor: torch.Tensor) -> np.ndarray | jax.Array:
+    """Make integers ready for a compiled function: a private int32 copy.
+
+    The copy is deliberate. JAX reads its arguments after the call has returned, so memory that the caller may write to
+    must not be handed over.
+
+    Args:
+        tensor: Any integer type.
+
+    Returns:
+        On the CPU a numpy view (three times cheaper than DLPack), on CUDA a JAX array.
+    """
+    copied = tensor.to(torch.int32, copy=True)
+    return copied.numpy() if copied.device.type == "cpu" else to_jax(copied)
+
+
+def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.Device]:
+    """Choose where tensors live and where JAX computes.
+
+    Args:
+        device: The device on which tensors are wanted, or None for the one that JAX computes on.
+
+    Returns:
+        The torch device (with an index for CUDA) and the JAX device. They are of different kinds only if CUDA is asked
+        for and JAX has the CPU alone; then every frame is copied, and a warning says so once.
+
+    Raises:
+        ValueError: Unknown kind of device, no such GPU, or torch without CUDA.
+    """
+    if device is None:
+        on_gpu = jax.default_backend() == "gpu" and torch.cuda.is_available()
+        device = "cuda" if on_gpu else "cpu"
+    try:
+        wanted = torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(f"device is {device!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
+    if wanted.type == "cpu":
+        return torch.device("cpu"), jax.devices("cpu")[0]
+    if wanted.type != "cuda":
+        raise ValueError(f"device is {str(device)!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...")
+    if not torch.cuda.is_available():
+        raise ValueError(f"device is {str(device)!r}, but torch sees no GPU: use 'cpu', or install torch with CUDA")
+    index = wanted.index if wanted.index is not None else torch.cuda.current_device()
+    if index >= torch.cuda.device_count():
+        raise ValueError(f"device is {str(device)!r}, but there are {torch.cuda.device_count()} GPUs")
+    wanted = torch.device("cuda", index)
+    if jax.default_backend() != "gpu":
+        warn_frames_are_copied()
+        return wanted, jax.devices("cpu")[0]
+    return wanted, jax.devices("gpu")[index]
+
+
+@functools.cache
+def warn_frames_are_copied() -> None:
+    """Say once that torch is on CUDA and JAX is not, and which package is missing."""
+    major = (torch.version.cuda or "12").split(".")[0]
+    package = f"jax-cuda{major}-plugin"
+    have = "is installed but found no GPU" if importlib.util.find_spec(package.replace("-", "_")) else "is missing"
+    warnings.warn(
+        f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied to the GPU. "
+        f"Install it with: pip install 'jax[cuda{major}]'",
+        stacklevel=2,
+    )

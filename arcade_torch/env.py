@@ -1,0 +1,393 @@
+"""``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Unbounded
+from torchrl.envs import EnvBase
+
+from arcade_torch import specs
+from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
+from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
+from arcade_torch.envs_jax import Game
+from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.snapshot import Snapshots
+
+_INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
+_INTEGERS[torch.uint8] = np.uint8
+# Final frames are drawn in portions of one size, an eighth of the batch but some frames at least: one compiled shape.
+_FINAL_FRAME_SHARE, _FINAL_FRAMES_AT_LEAST = 8, 4
+
+
+class RawStep(NamedTuple):
+    """One fused step before any export: only the frames are a tensor, the rest is still as JAX made it."""
+
+    pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
+    step: Step  # everything else
+    any_done: bool  # whether some episode ended
+
+
+def check_num_envs(num_envs: int) -> None:
+    """Refuse anything but a positive int.
+
+    Args:
+        num_envs: What arrived.
+
+    Raises:
+        TypeError: Not an int.
+        ValueError: Not positive.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int):
+        raise TypeError(f"num_envs is {num_envs!r}, expected an int of 1 or more")
+    if num_envs < 1:
+        raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
+
+
+class ArcadeEnv(EnvBase):
+    """A batch of N episodes of one game, as a TorchRL environment with ``batch_size=[N]``.
+
+    Every key of the root and of ``"next"``: ``pixels`` uint8 [N, S, S, 3] (zero copy: **never write to it in place**),
+    ``last_action`` int64 [N] (the action that led here; it survives an episode's end, and is 0 at the very first
+    step), ``is_init`` bool [N, 1], ``step_count`` int64 [N, 1], ``episode_reward`` float32 [N, 1], ``done``,
+    ``terminated``, ``truncated`` bool [N, 1]; ``"next"`` has ``reward`` float32 [N, 1] too. ``("next", "pixels")`` at
+    an end is the true final frame; the following root is the first frame of the new episode.
+
+    ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
+    give equal bits, whatever N, and whichever path is taken.
+
+    Args:
+        game: A game, or a compiled one (whose functions are then shared).
+        num_envs: N.
+        observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
+        seed: Seed of the batch; None draws one from torch.
+        device: Device of all tensors; None for the device that JAX computes on.
+        categorical_actions: Actions are int64 [N]; False: one-hot [N, num_actions].
+        state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and makes every step start
+            from the ``state`` it is handed, so that a planner can branch.
+        debug: Whether actions are checked on CUDA too.
+
+    Raises:
+        ValueError: See ``make``.
+        TypeError: See ``make``.
+    """
+
+    batch_locked = True
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        game: Game[Any] | CompiledGame,
+        num_envs: int = 16,
+        observability: Observability = "full",
+        *,
+        seed: int | None = 0,
+        device: torch.device | str | None = None,
+        categorical_actions: bool = True,
+        state_in_td: bool = False,
+        debug: bool = False,
+    ) -> None:
+        check_num_envs(num_envs)
+        flags = partial_flags(observability, num_envs)
+        torch_device, jax_device = pick_devices(device)
+        super().__init__(device=torch_device, batch_size=[num_envs])
+        self._compiled = game if isinstance(game, CompiledGame) else CompiledGame(game)
+        self._batched = self._compiled.batched
+        self._jax_device = jax_device
+        self._check_actions = debug or torch_device.type == "cpu"
+        self.one_hot = not categorical_actions
+        self._state_in_td = state_in_td
+        keys = jax.device_put(env_keys(0, num_envs), jax_device)
+        self._live = _Live(self._batched.init(keys, jax.device_put(flags.numpy(), jax_device)))
+        self._snapshots = Snapshots(self._live.batch, self.game.id, torch_device, jax_device)
+        self._make_specs(categorical_actions)
+        self._set_seed(seed)
+
+    def _make_specs(self, categorical_actions: bool) -> None:
+        num_envs, actions = self.num_envs, self.game.num_actions
+        self.action_spec = specs.action_spec(num_envs, actions, categorical_actions, self.device)
+        observation = specs.observation_spec(num_envs, self.game.obs_size, actions, self.device)
+        if self._state_in_td:
+            observation["state"] = self._snapshots.spec()
+            self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=self.device)
+        self.observation_spec = observation
+        self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=self.device)
+        self.done_spec = specs.done_spec(num_envs, self.device)
+
+    @property
+    def game(self) -> Game[Any]:
+        """The game that is played."""
+        return self._batched.game
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs in the batch."""
+        return int(self.batch_size[0])
+
+    # -- observability and state ------------------------------------------------------------------------------------
+
+    @property
+    def observability(self) -> torch.Tensor:
+        """bool [N], true where the env shows its POMDP twin. A copy."""
+        return to_torch(self._live.batch.partial, self.device).clone()
+
+    def set_observability(self, observability: Observability) -> None:
+        """Change which twin is shown, also in mid-episode; only the frames drawn from now on change.
+
+        Args:
+            observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
+
+        Raises:
+            ValueError: Another word or another shape.
+            TypeError: Not a word and not a bool tensor.
+        """
+        flags = partial_flags(observability, self.num_envs)
+        partial = jax.device_put(flags.numpy(), self._jax_device)
+        self._live.replace(self._live.batch._replace(partial=partial))
+
+    def get_state(self) -> TensorDict:
+        """Copy everything that determines the future: game states, random keys, observability, counts.
+
+        Returns:
+            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game.
+        """
+        return self._snapshots.export(self._live.batch)
+
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Go on from a snapshot.
+
+        Args:
+            state: What ``get_state`` gave, here or on another env of the same game with as many envs.
+
+        Returns:
+            The root tensordict of that state: what a policy acts on next.
+
+        Raises:
+            ValueError: The state of another game or batch size, or a broken one.
+        """
+        self._live.replace(self._snapshots.load(state))
+        return self.observe()
+
+    def observe(self) -> TensorDict:
+        """Draw the live state.
+
+        Returns:
+            The root tensordict: what a policy acts on next.
+        """
+        batch = self._live.batch
+        return self._root(batch, to_torch(self._batched.render(batch), self.device))
+
+    @property
+    def generation(self) -> int:
+        """Grows whenever the state changes by anything but ``step_raw``, whose caller has the frames that follow."""
+        return self._live.generation
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The env's part of ``state_dict``."""
+        state: dict[str, Any] = self.get_state().to_dict()
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Load the env's part of a ``state_dict``."""
+        self._live.replace(self._snapshots.load(TensorDict(state, batch_size=self.batch_size)))
+
+    # -- the fast path ----------------------------------------------------------------------------------------------
+
+    def step_raw(self, action: torch.Tensor, meanwhile: Callable[[], object] | None = None) -> RawStep:
+        """Step, begin anew where an episode ended, and draw once: one compiled call and no tensordict.
+
+        Args:
+            action: Integers [N] in 0..4 (one-hot [N, 5] with ``categorical_actions=False``). Not read after the return.
+            meanwhile: Called while JAX computes, for work that needs no result of this step.
+
+        Returns:
+            The step; export from it what is needed.
+
+        Raises:
+            TypeError: Actions that are not integers.
+            ValueError: Actions of a wrong shape or out of range.
+        """
+        argument = int32_argument(self._check_action(action))
+        step = self._compiled.step(self._live.batch, argument)
+        if meanwhile is not None:
+            meanwhile()
+        frames = to_torch(step.pixels, self.device)  # waits; the argument must live until here
+        any_done = bool(np.asarray(step.outcome.done).any())
+        self._live.advance(step.root, step.root._replace(state=step.final_state) if any_done else None)
+        return RawStep(frames, step, any_done)
+
+    def final_frames(self, rows: torch.Tensor) -> torch.Tensor:
+        """Draw the true final frames of episodes that ended in the last fused step.
+
+        Args:
+            rows: int64 [n], envs of the batch; those that did not end give their current frame.
+
+        Returns:
+            uint8 [n, S, S, 3].
+
+        Raises:
+            RuntimeError: No episode ended in the last step.
+        """
+        if self._live.ended is None:
+            raise RuntimeError("no episode ended in the last step: there is no final frame to draw")
+        size = min(self.num_envs, max(_FINAL_FRAMES_AT_LEAST, self.num_envs // _FINAL_FRAME_SHARE))
+        portions = []
+        for portion in rows.to("cpu", torch.int32).split(size):
+            index = np.zeros(size, np.int32)
+            index[: len(portion)] = portion.numpy()
+            frames = to_torch(self._batched.render_rows(self._live.ended, index), self.device)
+            portions.append(frames[: len(portion)])
+        return portions[0] if len(portions) == 1 else torch.cat(portions)
+
+    def _check_action(self, action: torch.Tensor) -> torch.Tensor:
+        """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
+        num_actions, shape = self.game.num_actions, (self.num_envs,)
+        if self.one_hot:
+            if action.shape != (*shape, num_actions):
+                raise ValueError(f"action has shape {tuple(action.shape)}, expected one-hot {(*shape, num_actions)}")
+            return action.to(torch.uint8).argmax(-1)
+        unsigned = _INTEGERS.get(action.dtype)
+        if unsigned is None:
+            raise TypeError(f"action has dtype {action.dtype}, expected integers such as torch.int64")
+        if action.shape != shape:
+            raise ValueError(f"action has shape {tuple(action.shape)}, expected {shape}, one integer an env")
+        # Seen as unsigned, negative numbers are large: one comparison finds both kinds of error.
+        if self._check_actions and action.cpu().numpy().view(unsigned).max() >= num_actions:
+            lowest, highest = int(action.min()), int(action.max())
+            raise ValueError(f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}")
+        return action
+
+    # -- TorchRL's methods ------------------------------------------------------------------------------------------
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
+    ) -> TensorDictBase:
+        if set_state and tensordict is not None and "state" in tensordict:
+            return self.set_state(tensordict["state"])
+        mask = tensordict.get("_reset", None) if tensordict is not None else None
+        # A mask that is true everywhere is no special case: other random numbers would be drawn than on the fused path.
+        rows = np.ones(self.num_envs, np.bool_) if mask is None else mask.reshape(self.num_envs).cpu().numpy()
+        batch, pixels = self._batched.reset_render(self._live.batch, rows)
+        frames = to_torch(pixels, self.device)
+        self._live.replace(batch)
+        return self._root(batch, frames)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._load_state_of(tensordict)
+        action = self._check_action(tensordict["action"])
+        argument = int32_argument(action)
+        stepped, outcome, pixels = self._batched.step_render(self._live.batch, argument)
+        frames = to_torch(pixels, self.device)
+        self._live.replace(stepped)
+        step_count = to_torch(stepped.step_count, self.device).to(torch.int64)
+        episode_reward = to_torch(stepped.episode_reward, self.device).clone()
+        following = self._next(frames, action, step_count, episode_reward, outcome)
+        if self._state_in_td:
+            following["state"] = self._snapshots.export(stepped)
+        return following
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        if self._state_in_td or "_step" in tensordict or self._post_step_mdp_hooks is not None:
+            stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
+            return stock
+        self._assert_tensordict_shape(tensordict)
+        action = tensordict["action"]
+        raw = self.step_raw(action)
+        self._live.generation += 1
+        last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
+        frames = raw.pixels
+        if raw.any_done:
+            rows = to_torch(raw.step.outcome.done, self.device).nonzero().squeeze(-1)
+            frames = raw.pixels.clone()
+            frames[rows] = self.final_frames(rows)
+        numbers = to_torch(raw.step.numbers, self.device)
+        step_count, episode_reward = numbers[:, STEP_COUNT].to(torch.int64), numbers[:, EPISODE_REWARD]
+        following = self._next(frames, last_action, step_count, episode_reward, raw.step.outcome)
+        preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
+        if preset is not None:
+            following.update(preset.exclude(*following.keys(True, True)))
+        tensordict.set("next", following)
+        root: TensorDictBase = self._step_mdp(tensordict)
+        for key, value in self._root(raw.step.root, raw.pixels).items():
+            root.set(key, value)  # not update(), which would write into the nested state that root and next share
+        return tensordict, root
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Give every env a new random key and forget the last action; running episodes go on until they are reset."""
+        if seed is None:
+            seed = int(torch.randint(2**32, ()))
+        keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
+        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
+        self._live.replace(self._live.batch._replace(key=keys, last_action=last_action))
+
+    # -- exports ----------------------------------------------------------------------------------------------------
+
+    def _load_state_of(self, tensordict: TensorDictBase) -> None:
+        """With ``state_in_td``, go on from the state the caller handed over."""
+        if self._state_in_td:
+            self._live.replace(self._snapshots.load(tensordict["state"]))
+
+    def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
+        """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""
+        num_envs = self.num_envs
+        step_count = to_torch(batch.step_count, self.device).to(torch.int64).unsqueeze(-1)
+        flags = torch.zeros(3, num_envs, 1, dtype=torch.bool, device=self.device)
+        root = {
+            "pixels": frames,
+            "last_action": to_torch(batch.last_action, self.device).to(torch.int64),
+            "is_init": step_count == 0,
+            "step_count": step_count,
+            "episode_reward": to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1),
+            "done": flags[0],
+            "terminated": flags[1],
+            "truncated": flags[2],
+        }
+        if self._state_in_td:
+            root["state"] = self._snapshots.export(batch)
+        return TensorDict(root, batch_size=self.batch_size, device=self.device)
+
+    def _next(
+        self,
+        frames: torch.Tensor,
+        action: torch.Tensor,
+        step_count: torch.Tensor,
+        episode_reward: torch.Tensor,
+        outcome: Outcome,
+    ) -> TensorDict:
+        """The ``"next"`` tensordict. Frames, reward and flags are zero copy, since JAX never reads them again."""
+        following = {
+            "pixels": frames,
+            "last_action": action.to(torch.int64, copy=True),
+            "is_init": torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device),
+            "step_count": step_count.unsqueeze(-1),
+            "episode_reward": episode_reward.unsqueeze(-1),
+            "reward": to_torch(outcome.reward, self.device).unsqueeze(-1),
+            "done": to_torch(outcome.done, self.device).unsqueeze(-1),
+            "terminated": to_torch(outcome.terminated, self.device).unsqueeze(-1),
+            "truncated": to_torch(outcome.truncated, self.device).unsqueeze(-1),
+        }
+        return TensorDict(following, batch_size=self.batch_size, device=self.device)
+
+
+class _Live:
+    """The state of the env, outside of ``nn.Module``, whose attribute assignment is slow."""
+
+    __slots__ = ("batch", "ended", "generation")
+
+    def __init__(self, batch: Batch) -> None:
+        self.batch = batch
+        self.ended: Batch | None = None  # final states of the last fused step, if some episode ended in it
+        self.generation = 0
+
+    def advance(self, batch: Batch, ended: Batch | None) -> None:
+        """Go on after a step."""
+        self.batch, self.ended = batch, ended
+
+    def replace(self, batch: Batch) -> None:
+        """Put another state in place."""
+        self.batch, self.ended = batch, None
+        self.generation += 1

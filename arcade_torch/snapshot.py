@@ -1,0 +1,127 @@
+"""Snapshots: everything a batch of episodes is, as a TensorDict that can be stored, cloned, indexed and loaded.
+
+Leaves are private copies, never views of live JAX memory. Random keys (uint32) travel as int32 of the same bits, since
+tensordict has no arithmetic for unsigned integers.
+"""
+
+import zlib
+from typing import Any
+
+import jax
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite, Unbounded
+
+from arcade_torch.dlpack import to_torch
+from arcade_torch.envs_jax import registered_ids
+from arcade_torch.envs_jax.batch import Batch
+
+_SIGNED = {np.dtype(np.uint32): torch.int32, np.dtype(np.uint16): torch.int16}
+
+
+def fingerprint(game_id: str) -> int:
+    """A number for a game id, so that a snapshot can tell which game it belongs to: its CRC-32."""
+    return zlib.crc32(game_id.encode())
+
+
+def _names(path: tuple[Any, ...]) -> tuple[str, ...]:
+    """Key path of a pytree leaf as names."""
+    return tuple(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path)
+
+
+class Snapshots:
+    """Turns batches of one game into TensorDicts and back.
+
+    Args:
+        batch: Any batch of the game; fixes names, shapes and types.
+        game_id: Versioned id of the game.
+        device: Device of the tensors.
+        jax_device: Device of the arrays.
+    """
+
+    def __init__(self, batch: Batch, game_id: str, device: torch.device, jax_device: jax.Device) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten_with_path(batch)
+        self._keys = [_names(path) for path, _ in leaves]
+        self._dtypes = [np.dtype(leaf.dtype) for _, leaf in leaves]
+        self._shapes = [torch.Size(leaf.shape) for _, leaf in leaves]
+        self._num_envs = int(batch.step_count.shape[0])
+        self._game_id = game_id
+        self._device = device
+        self._jax_device = jax_device
+
+    def export(self, batch: Batch) -> TensorDict:
+        """Copy a batch out of JAX.
+
+        Args:
+            batch: The batch.
+
+        Returns:
+            TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own), ``partial`` bool [N],
+            ``last_action`` and ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``game`` int64 [N].
+        """
+        game = torch.full((self._num_envs,), fingerprint(self._game_id), device=self._device)
+        out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
+        for key, array in zip(self._keys, jax.tree.leaves(batch), strict=True):
+            tensor = to_torch(array, self._device)
+            signed = _SIGNED.get(np.dtype(array.dtype))
+            out[key] = (tensor if signed is None else tensor.view(signed)).clone()
+        return out
+
+    def load(self, td: TensorDictBase) -> Batch:
+        """Copy a snapshot into JAX.
+
+        Args:
+            td: What ``export`` gave, here or for another env of the same game and number of envs.
+
+        Returns:
+            The batch.
+
+        Raises:
+            ValueError: Another game, another number of envs, or leaves that are missing, or of another shape or type.
+        """
+        self._check_game(td)
+        arrays = []
+        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
+            name, tensor = ".".join(key), td.get(key, None)
+            if tensor is None:
+                raise ValueError(f"the state has no entry {name!r}: pass what get_state() gave")
+            value = tensor.detach().to("cpu", copy=True).numpy()
+            value = value.view(dtype) if dtype in _SIGNED and value.dtype.itemsize == dtype.itemsize else value
+            if value.dtype != dtype or value.shape != shape:
+                raise ValueError(
+                    f"state entry {name!r} is {value.dtype} {value.shape}, {self._game_id} with {self._num_envs} envs "
+                    f"expects {dtype} {tuple(shape)}"
+                )
+            arrays.append(jax.device_put(value, self._jax_device))
+        batch: Batch = jax.tree_util.tree_unflatten(self._tree, arrays)
+        return batch
+
+    def _check_game(self, td: TensorDictBase) -> None:
+        """Refuse the state of another game or of another number of envs."""
+        if td.batch_size != (self._num_envs,):
+            raise ValueError(f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} envs")
+        game = td.get("game", None)
+        if game is None:
+            raise ValueError("the state has no entry 'game': pass what get_state() gave")
+        mine = fingerprint(self._game_id)
+        others = [int(number) for number in game.unique() if int(number) != mine]
+        if others:
+            known = {fingerprint(other): other for other in registered_ids()}
+            theirs = known.get(others[0], "another game")
+            raise ValueError(f"the state is one of {theirs}, this env plays {self._game_id}")
+
+    def spec(self) -> Composite:
+        """Spec of what ``export`` gives."""
+        num_envs, device = self._num_envs, self._device
+        spec = Composite(shape=(num_envs,), device=device)
+        spec["game"] = Unbounded(shape=(num_envs,), dtype=torch.int64, device=device)
+        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
+            torch_dtype = _SIGNED.get(dtype) or torch.from_numpy(np.empty(0, dtype)).dtype
+            inner = spec
+            for name in key[:-1]:
+                if name not in inner:
+                    inner[name] = Composite(shape=(num_envs,), device=device)
+                inner = inner[name]
+            inner[key[-1]] = Unbounded(shape=shape, dtype=torch_dtype, device=device)
+        return spec

@@ -1,0 +1,287 @@
+"""Laws of the env: specs, zero copy, seeds, resets, snapshots, observability."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from arcade_torch.compiled import CompiledGame
+from arcade_torch.env import ArcadeEnv
+from arcade_torch.envs_jax.batch import env_keys
+from arcade_torch.factory import make
+from tests.arcade_torch.stub import StubGame
+
+N = 6
+GAME = CompiledGame(StubGame())
+LOCKSTEP = CompiledGame(StubGame(risk=0.0, max_steps=5))  # all envs end at once, more than one portion of final frames
+
+
+def stub_env(game: CompiledGame = GAME, num_envs: int = N, **options: Any) -> ArcadeEnv:
+    return ArcadeEnv(game, num_envs, **options)
+
+
+def scripted(td: TensorDictBase) -> TensorDictBase:
+    """A deterministic policy that reads the frame, the counts and the last action."""
+    pixels = td["pixels"][:, :, 0, 0].long()
+    td["action"] = (pixels.sum(-1) + 3 * td["step_count"].squeeze(-1) + td["last_action"]) % 5
+    return td
+
+
+def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
+    """Same keys, same bits."""
+    keys = set(one.keys(True, True))
+    assert keys == set(two.keys(True, True))
+    different = [key for key in keys if not torch.equal(one[key], two[key])]
+    assert not different, different
+
+
+def stock_rollout(env: ArcadeEnv, steps: int) -> TensorDict:
+    """TorchRL's own way: step, move to the root, reset by mask."""
+    td, taken = env.reset(), []
+    for _ in range(steps):
+        td = env.step(scripted(td))
+        taken.append(td)
+        td = env.maybe_reset(env.step_mdp(td))
+    return torch.stack(taken, 1)
+
+
+@pytest.mark.parametrize("options", [{}, {"categorical_actions": False}, {"state_in_td": True}])
+def test_specs_describe_the_data(options: dict[str, Any]) -> None:
+    check_env_specs(stub_env(**options), break_when_any_done="both", seed=0)
+
+
+@pytest.mark.parametrize("game", [GAME, LOCKSTEP])
+def test_the_fused_path_and_torchrls_stock_path_give_the_same_bits(game: CompiledGame) -> None:
+    fused = stub_env(game, seed=3).rollout(200, scripted, break_when_any_done=False)
+    stock = stock_rollout(stub_env(game, seed=3), 200)
+    assert fused["next", "done"].sum() > 100
+    assert_same(fused.contiguous(), stock.contiguous())
+
+
+def test_next_pixels_at_an_end_is_the_true_final_frame_and_the_root_is_fresh() -> None:
+    env = stub_env(LOCKSTEP, seed=1)
+    data = env.rollout(12, scripted, break_when_any_done=False)
+    ended = data["next", "done"].squeeze(-1)
+    assert torch.equal(ended.sum(0), torch.tensor([0, 0, 0, 0, N] * 2 + [0, 0]))
+    count = data["next", "pixels"][..., 0, 0, 0]  # the stub draws its step count
+    assert (count[ended] == 5).all()
+    assert (data["pixels"][:, 5, 0, 0, 0] == 0).all()
+    assert torch.equal(data["next", "pixels"][:, :-1][~ended[:, :-1]], data["pixels"][:, 1:][~ended[:, :-1]])
+
+
+def test_done_is_terminated_or_truncated_and_a_time_limit_only_truncates() -> None:
+    following = stub_env(LOCKSTEP).rollout(10, break_when_any_done=False)["next"]
+    assert torch.equal(following["done"], following["terminated"] | following["truncated"])
+    assert following["truncated"].any() and not following["terminated"].any()
+
+
+def test_native_counts_are_those_of_torchrls_transforms() -> None:
+    transforms = Compose(InitTracker("start"), StepCounter(step_count_key="steps"), RewardSum(["reward"], ["total"]))
+    env = TransformedEnv(stub_env(seed=5), transforms)
+    data = env.rollout(100, scripted, break_when_any_done=False)
+    for native, theirs in (("is_init", "start"), ("step_count", "steps"), ("episode_reward", "total")):
+        assert torch.equal(data[native], data[theirs])
+        assert torch.equal(data["next", native], data["next", theirs])
+    plain = stub_env(seed=5).rollout(100, scripted, break_when_any_done=False)
+    assert_same(plain, data.select(*plain.keys(True, True)))
+
+
+def test_last_action_is_the_action_that_led_here_also_over_an_end() -> None:
+    data = stub_env().rollout(50, break_when_any_done=False)
+    assert torch.equal(data["last_action"][:, 1:], data["action"][:, :-1])
+    assert torch.equal(data["next", "last_action"], data["action"])
+    assert (data["last_action"][:, 0] == 0).all()
+
+
+def test_frames_rewards_and_flags_are_the_memory_that_jax_wrote(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = stub_env(LOCKSTEP)
+    written = []
+    compiled = env._compiled.step
+    monkeypatch.setattr(env._compiled, "step", lambda *args: written.append(compiled(*args)) or written[-1])
+    td, following = env.step_and_maybe_reset(scripted(env.reset()))
+    pixels, outcome = written[0].pixels, written[0].outcome
+    assert td["next", "pixels"].data_ptr() == following["pixels"].data_ptr() == pixels.unsafe_buffer_pointer()
+    for key in ("reward", "done", "terminated", "truncated"):
+        assert td["next", key].data_ptr() == getattr(outcome, key).unsafe_buffer_pointer(), key
+
+
+def test_writing_to_what_the_env_gave_does_not_change_its_future() -> None:
+    wanton, careful = stub_env(seed=2), stub_env(seed=2)
+    ours, theirs = wanton.reset(), careful.reset()
+    for _ in range(10):
+        taken, following = wanton.step_and_maybe_reset(scripted(ours))
+        ours = following.clone()
+        taken.zero_()
+        following.zero_()
+        _, theirs = careful.step_and_maybe_reset(scripted(theirs))
+        assert_same(ours, theirs)
+
+
+@given(mask=st.lists(st.booleans(), min_size=N, max_size=N), seed=st.integers(0, 9))
+def test_a_partial_reset_leaves_the_other_envs_bit_identical(mask: list[bool], seed: int) -> None:
+    env = stub_env(seed=seed)
+    td = env.step_mdp(env.step(scripted(env.reset())))
+    before = env.get_state()
+    chosen = torch.tensor(mask)
+    out = env.reset(td.clone().set("_reset", chosen.unsqueeze(-1)))
+    assert_same(env.get_state()[~chosen], before[~chosen])
+    keys = ("pixels", "last_action", "step_count", "episode_reward", "is_init")
+    assert_same(out[~chosen].select(*keys), td[~chosen].select(*keys))
+    assert (out[chosen]["step_count"] == 0).all() and out[chosen]["is_init"].all()
+    fresh = env.get_state()["state", "clock", "serial"][chosen] != before["state", "clock", "serial"][chosen]
+    assert fresh.all()
+
+
+def test_resetting_all_by_mask_is_resetting_all() -> None:
+    one, two = stub_env(seed=4), stub_env(seed=4)
+    td = one.step_mdp(one.step(scripted(one.reset())))
+    two.step(scripted(two.reset()))
+    by_mask = one.reset(td.set("_reset", torch.ones(N, 1, dtype=torch.bool)))
+    assert torch.equal(by_mask["pixels"], two.reset()["pixels"])
+
+
+@settings(max_examples=5)
+@given(first=st.sampled_from([1, 4]), seed=st.integers(0, 2**32 - 1))
+def test_an_env_walks_the_same_path_whatever_the_batch_size(first: int, seed: int) -> None:
+    small, large = stub_env(num_envs=first), stub_env()
+    small.set_seed(seed)
+    large.set_seed(seed)
+    one = small.rollout(8, scripted, break_when_any_done=False)
+    many = large.rollout(8, scripted, break_when_any_done=False)
+    assert_same(one, many[:first])
+
+
+def test_the_seed_of_the_constructor_is_the_seed_of_set_seed() -> None:
+    env = stub_env(seed=0)
+    env.rollout(5)
+    env.set_seed(11)
+    assert_same(env.rollout(20, scripted), stub_env(seed=11).rollout(20, scripted))
+
+
+def test_the_first_reset_after_seeding_is_the_games_own_first_state() -> None:
+    env = stub_env(seed=8)
+    batch = GAME.batched.init(env_keys(8, N), np.zeros(N, bool))
+    assert np.array_equal(env.reset()["pixels"].numpy(), np.asarray(GAME.batched.render(batch)))
+
+
+def test_set_seed_returns_another_seed_unless_static() -> None:
+    env = stub_env()
+    assert env.set_seed(3) != 3
+    assert env.set_seed(3, static_seed=True) == 3
+
+
+def test_a_snapshot_gives_the_same_future_on_another_env() -> None:
+    env, other = stub_env(seed=1), stub_env(seed=99)
+    td = env.rollout(10, scripted, break_when_any_done=False)[:, -1]
+    snapshot = env.get_state()
+    expected = env.rollout(60, scripted, break_when_any_done=False, auto_reset=False, tensordict=env.observe())
+    other.rollout(3)
+    root = other.set_state(snapshot)
+    assert torch.equal(root["step_count"], td["next", "step_count"])
+    future = other.rollout(60, scripted, break_when_any_done=False, auto_reset=False, tensordict=root)
+    assert_same(expected, future)
+
+
+def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(tmp_path: Any) -> None:
+    env = stub_env(seed=1)
+    env.rollout(4)
+    torch.save(env.get_state().to_dict(), tmp_path / "state.pt")
+    state = TensorDict(torch.load(tmp_path / "state.pt", weights_only=True), [N])
+    root = stub_env(seed=2).reset(TensorDict({"state": state}, [N]), set_state=True)
+    assert_same(root.select("pixels", "step_count"), env.observe().select("pixels", "step_count"))
+
+
+def test_a_snapshot_is_a_private_copy() -> None:
+    env = stub_env(seed=1)
+    env.reset()
+    before = env.observe()["pixels"].clone()
+    env.get_state().zero_()
+    assert torch.equal(env.observe()["pixels"], before)
+
+
+def test_state_dict_of_the_env_restores_it() -> None:
+    env, other = stub_env(seed=1), stub_env(seed=2)
+    env.rollout(4)
+    other.load_state_dict(env.state_dict())
+    assert_same(other.get_state(), env.get_state())
+
+
+def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compiles_nothing() -> None:
+    env, twin = stub_env(seed=6), stub_env(seed=6)
+    actions = torch.randint(0, 5, (30, N))
+    ours, theirs = env.reset(), twin.reset()
+    compiled = GAME.step._cache_size()
+    flags = torch.arange(N) % 2 == 0
+    for time, action in enumerate(actions):
+        if time == 10:
+            env.set_observability(flags)
+            assert torch.equal(env.observability, flags)
+        taken, ours = env.step_and_maybe_reset(ours.set("action", action))
+        other, theirs = twin.step_and_maybe_reset(theirs.set("action", action))
+        assert_same(taken["next"].exclude("pixels"), other["next"].exclude("pixels"))
+        same = (ours["pixels"] == theirs["pixels"]).flatten(1).all(1)
+        assert torch.equal(same, ~flags if time >= 10 else torch.ones(N, dtype=torch.bool))
+    assert GAME.step._cache_size() == compiled or compiled == 0
+
+
+def test_the_state_in_the_tensordict_is_the_state_that_is_stepped() -> None:
+    env = stub_env(seed=3, state_in_td=True)
+    root = env.reset()
+    first = env.step(root.clone().set("action", torch.full((N,), 4)))
+    env.step(root.clone().set("action", torch.zeros(N, dtype=torch.int64)))
+    again = env.step(root.clone().set("action", torch.full((N,), 4)))
+    assert_same(first, again)
+    assert torch.equal(first["next", "state", "step_count"], root["state", "step_count"] + 1)
+
+
+def test_one_hot_actions_mean_the_same_as_integers() -> None:
+    integer, one_hot = stub_env(seed=3), stub_env(seed=3, categorical_actions=False)
+    action = torch.arange(N) % 5
+    hot = torch.nn.functional.one_hot(action, 5).bool()
+    ours = integer.step_and_maybe_reset(integer.reset().set("action", action))[0]
+    theirs = one_hot.step_and_maybe_reset(one_hot.reset().set("action", hot))[0]
+    assert_same(ours.exclude("action"), theirs.exclude("action"))
+
+
+@given(
+    action=st.lists(st.integers(0, 4), min_size=N, max_size=N),
+    dtype=st.sampled_from([torch.int64, torch.int32, torch.uint8]),
+)
+def test_any_integer_type_is_taken_and_may_be_overwritten_at_once(action: list[int], dtype: torch.dtype) -> None:
+    env, twin = stub_env(seed=3), stub_env(seed=3)
+    tensor = torch.tensor(action, dtype=dtype)
+    env.reset(), twin.reset()
+    env.step_raw(tensor)
+    tensor.fill_(0)
+    twin.step_raw(torch.tensor(action))
+    assert_same(env.get_state(), twin.get_state())
+    assert env.get_state()["last_action"].tolist() == action
+
+
+def test_what_the_policy_wrote_beside_the_action_is_kept_as_on_the_stock_path() -> None:
+    def run(env: ArcadeEnv, stock: bool) -> tuple[TensorDictBase, TensorDictBase]:
+        root = scripted(env.reset()).set("next", TensorDict({"memory": torch.arange(N)}, [N]))
+        root["value"] = torch.ones(N)
+        if stock:
+            taken = env.step(root)
+            return taken, env.maybe_reset(env.step_mdp(taken))
+        return env.step_and_maybe_reset(root)
+
+    ours, theirs = run(stub_env(LOCKSTEP), stock=False), run(stub_env(LOCKSTEP), stock=True)
+    assert "value" in ours[1] and ("next", "memory") in ours[0].keys(True)
+    assert_same(ours[0], theirs[0])
+    assert_same(ours[1], theirs[1])
+
+
+@pytest.mark.parametrize("id", ["CartPoleEasy", "MineSweeperEasy"])
+def test_real_games_pass_through(id: str) -> None:
+    env = make(id, num_envs=3, partial_obs=True)
+    check_env_specs(env, seed=0)
+    assert env.observability.all()
+    assert make(id, num_envs=3)._compiled is env._compiled

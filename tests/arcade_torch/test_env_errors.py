@@ -1,0 +1,123 @@
+"""Every wrong argument gets one clear line that says what arrived and what is allowed."""
+
+import re
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from arcade_torch.compiled import CompiledGame
+from arcade_torch.env import ArcadeEnv
+from arcade_torch.factory import make
+from tests.arcade_torch.stub import StubGame
+
+GAME = CompiledGame(StubGame())
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"id": "CartPolEasy"}, ValueError, "unknown env id 'CartPolEasy': did you mean 'CartPoleEasy'?"),
+        ({"num_envs": 0}, ValueError, "num_envs is 0, expected 1 or more"),
+        ({"num_envs": -3}, ValueError, "num_envs is -3, expected 1 or more"),
+        ({"num_envs": 2.5}, TypeError, "num_envs is 2.5, expected an int"),
+        ({"num_envs": True}, TypeError, "num_envs is True, expected an int"),
+        ({"observability": "half"}, ValueError, "observability is 'half', allowed: 'full', 'partial', or a bool"),
+        ({"observability": [True]}, TypeError, "observability is a list, allowed"),
+        ({"observability": torch.ones(3)}, TypeError, "observability has dtype torch.float32, allowed"),
+        ({"observability": torch.ones(2, dtype=torch.bool)}, ValueError, "observability has shape (2,), expected (3,)"),
+        ({"observability": "full", "partial_obs": True}, ValueError, "both observability and partial_obs are given"),
+        ({"partial_obs": "yes"}, TypeError, "partial_obs is 'yes', allowed: True, False"),
+        ({"device": "tpu"}, ValueError, "device is 'tpu', allowed: 'cpu', 'cuda'"),
+        ({"device": "meta"}, ValueError, "device is 'meta', allowed: 'cpu', 'cuda'"),
+        ({"obs_size": 64}, ValueError, "obs_size is 64, allowed: 128, 256"),
+        ({"rules": "new"}, ValueError, "rules is 'new', allowed"),
+        ({"seed": -1}, ValueError, "seed is -1, allowed"),
+        ({"colour": 1}, TypeError, "has no option 'colour'"),
+    ],
+)
+def test_make_explains_a_wrong_argument(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=re.escape(message)):
+        make(**{"id": "CartPoleEasy", "num_envs": 3, **options})
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without CUDA")
+def test_cuda_without_a_gpu_is_explained() -> None:
+    with pytest.raises(ValueError, match="torch sees no GPU"):
+        ArcadeEnv(GAME, 3, device="cuda")
+
+
+@pytest.mark.parametrize(
+    ("action", "error", "message"),
+    [
+        (torch.zeros(3), TypeError, "action has dtype torch.float32, expected integers"),
+        (torch.zeros(3, dtype=torch.bool), TypeError, "action has dtype torch.bool, expected integers"),
+        (torch.zeros(3, 1, dtype=torch.int64), ValueError, "action has shape (3, 1), expected (3,)"),
+        (torch.zeros(2, dtype=torch.int64), ValueError, "action has shape (2,), expected (3,)"),
+        (torch.tensor([0, 5, 1]), ValueError, "actions range from 0 to 5, allowed: 0 to 4"),
+        (torch.tensor([0, -1, 1]), ValueError, "actions range from -1 to 1, allowed: 0 to 4"),
+        (torch.tensor([0, 2**32, 1]), ValueError, "actions range from 0 to 4294967296, allowed: 0 to 4"),
+    ],
+)
+def test_a_wrong_action_is_explained_and_changes_nothing(
+    action: torch.Tensor, error: type[Exception], message: str
+) -> None:
+    env = ArcadeEnv(GAME, 3)
+    env.reset()
+    before = env.get_state()
+    with pytest.raises(error, match=re.escape(message)):
+        env.step_raw(action)
+    assert (env.get_state() == before).all()
+
+
+def test_a_wrong_one_hot_action_is_explained() -> None:
+    with pytest.raises(ValueError, match=re.escape("expected one-hot (3, 5)")):
+        ArcadeEnv(GAME, 3, categorical_actions=False).step_raw(torch.zeros(3, dtype=torch.int64))
+
+
+def test_a_tensordict_of_another_batch_size_is_refused() -> None:
+    env = ArcadeEnv(GAME, 3)
+    env.reset()
+    td = TensorDict({"action": torch.zeros(2, dtype=torch.int64)}, [2])
+    for step in (env.step, env.step_and_maybe_reset):
+        with pytest.raises(RuntimeError, match="batch_size"):
+            step(td.clone())
+
+
+def test_final_frames_without_an_end_are_refused() -> None:
+    env = ArcadeEnv(GAME, 3)
+    env.reset()
+    with pytest.raises(RuntimeError, match="no episode ended in the last step"):
+        env.final_frames(torch.tensor([0]))
+
+
+def broken(change: Any) -> TensorDict:
+    state = ArcadeEnv(GAME, 3).get_state()
+    change(state)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (lambda: ArcadeEnv(GAME, 4).get_state(), "the state is of batch size [4], this env has 3 envs"),
+        (lambda: make("CartPoleEasy", 3).get_state(), "state is one of CartPoleEasy-v0, this env plays StubEasy-v0"),
+        (lambda: broken(lambda s: s.pop("game")), "the state has no entry 'game'"),
+        (lambda: broken(lambda s: s["state"].pop("total")), "the state has no entry 'state.total'"),
+        (
+            lambda: broken(lambda s: s.set(("state", "dice"), torch.zeros(3, 1, dtype=torch.int32))),
+            "state entry 'state.dice' is int32 (3, 1), StubEasy-v0 with 3 envs expects int32 (3, 2)",
+        ),
+        (
+            lambda: broken(lambda s: s.set("step_count", torch.zeros(3))),
+            "state entry 'step_count' is float32 (3,), StubEasy-v0 with 3 envs expects int32 (3,)",
+        ),
+    ],
+)
+def test_a_wrong_state_is_explained_and_not_loaded(state: Any, message: str) -> None:
+    env = ArcadeEnv(GAME, 3)
+    before = env.get_state()
+    with pytest.raises(ValueError, match=re.escape(message)):
+        env.set_state(state())
+    assert (env.get_state() == before).all()
