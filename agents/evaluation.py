@@ -1,0 +1,144 @@
+"""Greedy evaluation on seeds that training never sees."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import arcade_torch
+from arcade_torch.agents.checks import require
+from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
+from arcade_torch.agents.metrics import confidence_95
+from arcade_torch.agents.protocols import Player
+
+
+@dataclass(frozen=True)
+class EvalResult:
+    """First finished episodes of fresh environments.
+
+    Attributes:
+        returns: float32 [E], undiscounted return of each episode.
+        lengths: int64 [E], steps of each episode.
+    """
+
+    returns: NDArray[np.float32]
+    lengths: NDArray[np.int64]
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(self.returns.mean())
+
+    @property
+    def std(self) -> float:
+        """Sample standard deviation of the returns; 0 for one episode."""
+        return float(self.returns.std(ddof=1)) if len(self.returns) > 1 else 0.0
+
+    @property
+    def ci(self) -> float:
+        """Half width of the normal 95 % interval of the mean return."""
+        return confidence_95(self.returns.tolist())
+
+
+def held_out_seed(seed: int) -> int:
+    """The environment seed that stands for evaluation seed ``seed``.
+
+    Training uses environment seeds below 2**30, evaluation those from 2**30 on, so no environment is ever in both.
+
+    Raises:
+        ValueError: ``seed`` is not in [0, 2**30).
+    """
+    require(0 <= seed < SEED_LIMIT, "seed", seed, f"in [0, {SEED_LIMIT})")
+    return SEED_LIMIT + seed
+
+
+def make_eval_env(config: TrainConfig, episodes: int, observability: Literal["full", "partial"] | None = None) -> Any:
+    """The environments an evaluation of this config plays in, one an episode.
+
+    Args:
+        config: of the run.
+        episodes: number of environments.
+        observability: another twin than the one trained on.
+
+    Returns:
+        An ``ArcadeEnv`` of batch size [episodes].
+    """
+    return arcade_torch.make(
+        config.env,
+        num_envs=episodes,
+        observability=observability or config.observability,
+        obs_size=config.obs_size,
+        seed=held_out_seed(0),
+        device=config.device,
+        rules=config.rules,
+        **dict(config.env_options),
+    )
+
+
+@torch.no_grad()
+def evaluate(
+    agent: Any,
+    observability: Literal["full", "partial"] | None = None,
+    episodes: int = 128,
+    seed: int = 0,
+    env: Any = None,
+) -> EvalResult:
+    """Play greedily and report the first finished episode of each of ``episodes`` fresh environments.
+
+    Every environment contributes exactly one episode, so long episodes count as much as short ones.
+
+    Args:
+        agent: an ``Agent``; with ``env`` given, anything with ``initial_state`` and ``act``.
+        observability: twin to play; default the one the agent was trained on. With ``env`` given, its own is put back
+            afterwards.
+        episodes: number of environments, and of episodes.
+        seed: evaluation seed in [0, 2**30); the same seed plays the same episodes for every agent. Disjoint from all
+            training seeds, see :func:`held_out_seed`.
+        env: environments from :func:`make_eval_env` to use again (saves compiling); their number replaces ``episodes``.
+
+    Returns:
+        Returns and lengths.
+
+    Raises:
+        ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is unknown.
+    """
+    require(episodes >= 1, "episodes", episodes, "a whole number >= 1")
+    require(observability in (None, "full", "partial"), "observability", observability, "'full' or 'partial'")
+    start = held_out_seed(seed)
+    if env is None:
+        env = make_eval_env(agent.config, episodes, observability)
+    before = env.observability
+    try:
+        if observability is not None:
+            env.set_observability(observability)
+        env.set_seed(start)
+        return _play(agent, env)
+    finally:
+        env.set_observability(before)
+
+
+def _play(agent: Player, env: Any) -> EvalResult:
+    """One episode in each environment."""
+    obs = env.reset()
+    num_envs = env.batch_size[0]
+    state = agent.initial_state(num_envs)
+    returns, lengths = np.zeros(num_envs, np.float32), np.zeros(num_envs, np.int64)
+    playing = np.ones(num_envs, bool)
+    while playing.any():
+        action, _, state = agent.act(obs, state)
+        step, obs = env.step_and_maybe_reset(obs.set("action", action))
+        after = step.get("next")
+        ended = _numpy(after.get("done")) & playing
+        if ended.any():
+            returns[ended] = _numpy(after.get("episode_reward"))[ended]
+            lengths[ended] = _numpy(after.get("step_count"))[ended]
+            playing &= ~ended
+    return EvalResult(returns, lengths)
+
+
+def _numpy(entry: Tensor) -> NDArray[Any]:
+    """An entry [N, 1] as an array [N] on the host."""
+    return entry.view(-1).cpu().numpy()

@@ -1,0 +1,230 @@
+"""The training loop: collect, learn, log, evaluate, save; the same for every memory model, and for none."""
+
+import contextlib
+import dataclasses
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+
+from arcade_torch.agents.agent import Agent
+from arcade_torch.agents.checkpoint import list_checkpoints, load_latest, save_checkpoint
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
+from arcade_torch.agents.files import CsvLog, read_csv, write_json
+from arcade_torch.agents.learner import NonFiniteError
+from arcade_torch.agents.metrics import paper_score
+from arcade_torch.agents.run_folder import RunFolder
+from arcade_torch.agents.trainer import Trainer
+from arcade_torch.envs_jax import resolve_id
+
+Progress = Callable[[Mapping[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How a run ended.
+
+    Attributes:
+        run_dir: its folder.
+        status: ``"finished"`` or ``"interrupted"``.
+        frames: training frames.
+        seconds: time spent collecting and learning.
+        evaluation: greedy evaluation at the end; None if interrupted.
+        train_max_ewm: the paper's score of the training curve; None if interrupted.
+    """
+
+    run_dir: Path
+    status: str
+    frames: int
+    seconds: float
+    evaluation: EvalResult | None = None
+    train_max_ewm: float | None = None
+
+
+def train(
+    config: TrainConfig, run_dir: str | os.PathLike[str], resume: bool = False, progress: Progress | None = None
+) -> TrainResult:
+    """Train an agent in a run folder.
+
+    SIGINT and SIGTERM end the run at the next update with a checkpoint and status ``"interrupted"``; a second SIGINT
+    ends it at once. A killed run goes on from its last checkpoint, to the bit on one machine.
+
+    Args:
+        config: what to train.
+        run_dir: folder of the run; must be empty or absent unless ``resume``.
+        resume: go on with the run in the folder (from the start if it has no checkpoint yet); a finished run returns
+            its result at once, an absent one is started.
+        progress: called after every update with the row of ``metrics.csv`` and ``total_frames``.
+
+    Returns:
+        How it ended.
+
+    Raises:
+        RunFolderError: the folder is taken, holds another run, or cannot be written. Nothing was changed.
+        CheckpointError: ``resume`` found only damaged checkpoints.
+        NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last checkpoint is good.
+        ValueError: the game, the memory model or the network does not exist.
+    """
+    config = dataclasses.replace(config, env=resolve_id(config.env))
+    folder = RunFolder(Path(run_dir))
+    folder.check(config, resume)
+    if (result := folder.finished()) is not None:
+        return _result_from(folder.path, result)
+    with _threads(config.threads):
+        trainer = Trainer(config)
+        try:
+            folder.claim(config)
+            return _Run(config, folder, trainer, progress).go()
+        finally:
+            trainer.close()
+
+
+class _Run:
+    """The loop of one run and what it writes."""
+
+    def __init__(self, config: TrainConfig, folder: RunFolder, trainer: Trainer, progress: Progress | None) -> None:
+        self.config, self.folder, self.trainer, self.progress = config, folder, trainer, progress
+        self.eval_env: Any = None
+        self.saved_at = -1
+
+    def go(self) -> TrainResult:
+        """Run to the end, or to the first signal."""
+        trainer = self.trainer
+        self._start()
+        metrics, evals = self.folder.open_logs(trainer.frames)
+        self._report("running")
+        try:
+            with _stop_signals() as stopped:
+                while not trainer.done and not stopped():
+                    self._update(metrics, evals)
+            self._save()
+            if not trainer.done:
+                self._report("interrupted")
+                return TrainResult(self.folder.path, "interrupted", trainer.frames, trainer.seconds)
+            return self._finish(evals)
+        except NonFiniteError as error:
+            newest = list_checkpoints(self.folder.checkpoints)[:1]
+            kept = f"the last good checkpoint is {newest[0]}" if newest else "there was no checkpoint yet"
+            self._report("failed", error=str(error))
+            raise NonFiniteError(f"{error}; {kept}") from error
+        except BaseException as error:
+            status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            self._report(status, error=f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            metrics.close()
+            evals.close()
+
+    def _start(self) -> None:
+        """From the newest whole checkpoint, or from the beginning."""
+        if list_checkpoints(self.folder.checkpoints):
+            checkpoint = load_latest(self.folder.checkpoints, expect=self.config)
+            assert checkpoint.trainer is not None
+            self.trainer.load(checkpoint.weights, checkpoint.trainer)
+            self.saved_at = checkpoint.frames
+        else:
+            self.trainer.warm_up()
+
+    def _update(self, metrics: CsvLog, evals: CsvLog) -> None:
+        trainer = self.trainer
+        row = trainer.update()
+        metrics.append(row)
+        if self._crossed(self.config.eval_every) and not trainer.done:
+            self._evaluate(evals)
+        if self._crossed(self.config.checkpoint_every):
+            self._save()
+        self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
+        if self.progress is not None:
+            self.progress(row | {"total_frames": trainer.total_frames})
+
+    def _crossed(self, every: int) -> bool:
+        """Whether the last update passed a multiple of ``every`` frames."""
+        before = self.trainer.frames - self.config.pqn.frames_per_update
+        return every > 0 and self.trainer.frames // every > before // every
+
+    def _evaluate(self, evals: CsvLog) -> EvalResult:
+        if self.eval_env is None:
+            self.eval_env = make_eval_env(self.config, self.config.eval_episodes)
+        agent = Agent(self.config, self.trainer.network, self.trainer.frames)
+        result = evaluate(agent, env=self.eval_env)
+        evals.append({"frames": agent.frames, "mean": result.mean, "std": result.std, "n": len(result.returns)})
+        return result
+
+    def _save(self) -> None:
+        trainer = self.trainer
+        if self.saved_at == trainer.frames:
+            return
+        weights = trainer.network.state_dict()
+        save_checkpoint(self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict())
+        self.saved_at = trainer.frames
+
+    def _finish(self, evals: CsvLog) -> TrainResult:
+        began = time.perf_counter()
+        result = self._evaluate(evals)
+        history = read_csv(self.folder.path / "metrics.csv")
+        score = paper_score([int(r["frames"]) for r in history], [float(r["train_return_last"]) for r in history])
+        final = {
+            "status": "finished",
+            "frames": self.trainer.frames,
+            "seconds": self.trainer.seconds,
+            "eval_seconds": time.perf_counter() - began,
+            "mean": result.mean,
+            "std": result.std,
+            "ci": result.ci,
+            "train_max_ewm": score,
+            "returns": result.returns.tolist(),
+            "lengths": result.lengths.tolist(),
+        }
+        write_json(self.folder.path / "eval.json", final)
+        self._report("finished", mean=result.mean)
+        return _result_from(self.folder.path, final)
+
+    def _report(self, status: str, **more: Any) -> None:
+        self.folder.report(self.trainer.frames, self.trainer.total_frames, status, **more)
+
+
+def _result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
+    evaluation = EvalResult(np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64))
+    return TrainResult(path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"])
+
+
+@contextlib.contextmanager
+def _threads(number: int) -> Iterator[None]:
+    """Torch threads for the duration of a run; 0 leaves them alone."""
+    before = torch.get_num_threads()
+    if number:
+        torch.set_num_threads(number)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a request to stop; outside the main thread, signals stay as they are."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked.is_set() and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,146 @@
+"""Numbers about episodes: the paper's training score, and the bookkeeping behind it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+CURVE_POINTS = 1000  # equispaced points on the frame axis
+EWM_SPAN = 100  # in points of the curve (paper score) or in updates (running average)
+
+
+def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
+    """Exponentially weighted mean without bias adjustment: ``y[0] = x[0]``, ``y[t] = y[t-1] + alpha (x[t] - y[t-1])``.
+
+    Args:
+        values: float [P].
+        span: ``alpha = 2 / (span + 1)``.
+
+    Returns:
+        float64 [P].
+
+    Example:
+        >>> ewm([0.0, 1.0], span=3).tolist()
+        [0.0, 0.5]
+    """
+    smooth = np.array(values, dtype=np.float64)
+    alpha = 2.0 / (span + 1.0)
+    for t in range(1, len(smooth)):
+        smooth[t] = smooth[t - 1] + alpha * (smooth[t] - smooth[t - 1])
+    return smooth
+
+
+def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None = None) -> float:
+    """The number the paper reports for a run: the best smoothed training return.
+
+    The training curve is interpolated linearly on 1,000 equispaced points in [0, ``max_frames``] (constant beyond the
+    ends), smoothed by an exponentially weighted mean with span 100 points, turned into its running maximum, and
+    the maximum of that is the score. It contains exploration noise and never goes down; keep it beside a greedy
+    evaluation, not in place of one.
+
+    Args:
+        frames: float [P], increasing; frames seen at each point of the history.
+        returns: float [P], at each point the return of every environment's last finished episode, averaged.
+        max_frames: end of the frame axis; default the last of ``frames``.
+
+    Returns:
+        The score, in units of the undiscounted return.
+
+    Raises:
+        ValueError: the history is empty, its two parts differ in length, or ``frames`` does not increase.
+
+    Source: POPGym Arcade (ICML 2026), plotting of the reference implementation.
+
+    Example:
+        >>> paper_score([0, 1000], [0.5, 0.5])
+        0.5
+    """
+    x, y = np.asarray(frames, dtype=np.float64), np.asarray(returns, dtype=np.float64)
+    if x.ndim != 1 or x.shape != y.shape or len(x) == 0:
+        raise ValueError(f"frames and returns must be two histories of one length >= 1; got {x.shape} and {y.shape}")
+    if np.any(np.diff(x) <= 0):
+        raise ValueError("frames must increase from row to row")
+    grid = np.linspace(0.0, x[-1] if max_frames is None else max_frames, CURVE_POINTS)
+    return float(np.maximum.accumulate(ewm(np.interp(grid, x, y))).max())
+
+
+@dataclass
+class EpisodeStats:
+    """Returns of training episodes, followed from window to window.
+
+    Attributes:
+        running: float64 [N], return so far of the episode each environment is in.
+        last: float64 [N], return of the last finished episode of each environment; 0 before the first.
+        episodes: episodes finished so far.
+        smooth: running average of the finished episodes' returns (span 100 windows); None before the first.
+    """
+
+    running: NDArray[np.float64]
+    last: NDArray[np.float64]
+    episodes: int = 0
+    smooth: float | None = None
+    finished: list[float] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, num_envs: int) -> "EpisodeStats":
+        """Nothing seen yet."""
+        return cls(np.zeros(num_envs), np.zeros(num_envs))
+
+    def update(self, reward: Tensor, done: Tensor) -> float:
+        """Read one window of new steps.
+
+        Args:
+            reward: float32 [N, T].
+            done: bool [N, T].
+
+        Returns:
+            The last finished return of each environment, averaged over the steps and environments of this window: one
+            point of the history :func:`paper_score` reads. ``finished`` holds the returns of this window's episodes.
+        """
+        rewards, ends = reward.cpu().numpy(), done.cpu().numpy()
+        self.finished = []
+        total = 0.0
+        for t in range(rewards.shape[1]):
+            self.running += rewards[:, t]
+            end = ends[:, t]
+            if end.any():
+                self.finished.extend(self.running[end].tolist())
+                self.last = np.where(end, self.running, self.last)
+                self.running = np.where(end, 0.0, self.running)
+            total += float(self.last.mean())
+        self.episodes += len(self.finished)
+        if self.finished:
+            self.smooth = _blend(self.smooth, float(np.mean(self.finished)))
+        return total / len(rewards.T)
+
+    def state_dict(self) -> dict[str, object]:
+        """Plain values for a checkpoint."""
+        return {
+            "running": torch.from_numpy(self.running.copy()),
+            "last": torch.from_numpy(self.last.copy()),
+            "episodes": self.episodes,
+            "smooth": self.smooth,
+        }
+
+    @classmethod
+    def from_state_dict(cls, state: dict[str, object]) -> "EpisodeStats":
+        """The inverse of :meth:`state_dict`."""
+        running, last, episodes, smooth = (state[k] for k in ("running", "last", "episodes", "smooth"))
+        assert isinstance(running, Tensor) and isinstance(last, Tensor) and isinstance(episodes, int)
+        assert smooth is None or isinstance(smooth, float)
+        return cls(running.numpy().copy(), last.numpy().copy(), episodes, smooth)
+
+
+def confidence_95(values: Sequence[float]) -> float:
+    """Half width of the normal 95 % interval of the mean; 0 for fewer than two values."""
+    if len(values) < 2:
+        return 0.0
+    return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+
+
+def _blend(smooth: float | None, value: float) -> float:
+    return value if smooth is None else smooth + 2.0 / (EWM_SPAN + 1.0) * (value - smooth)

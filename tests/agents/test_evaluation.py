@@ -1,0 +1,84 @@
+"""Evaluation plays one whole episode in each fresh environment."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import arcade_torch
+from arcade_torch.agents.config import preset
+from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_eval_env
+
+EPISODES = 6
+
+
+class Clock:
+    """Acts by the number of steps it has seen in this episode, so its recurrent state matters."""
+
+    def initial_state(self, batch_size):
+        return TensorDict({"t": torch.zeros(batch_size, dtype=torch.int64)}, [batch_size])
+
+    def act(self, obs, state):
+        t = torch.where(obs["is_init"].squeeze(-1), 0, state["t"])
+        return (t // 2) % 2 + 2, {}, TensorDict({"t": t + 1}, t.shape)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_eval_env(preset("small", env="CartPoleEasy"), EPISODES)
+
+
+def by_hand(observability):
+    """The same through TorchRL's own stepping."""
+    env = arcade_torch.make("CartPoleEasy", num_envs=EPISODES, observability=observability, seed=held_out_seed(3))
+    env.set_seed(held_out_seed(3), static_seed=True)
+    returns, lengths = [0.0] * EPISODES, [0] * EPISODES
+    done_before = torch.zeros(EPISODES, dtype=torch.bool)
+    td, player = env.reset(), Clock()
+    state = player.initial_state(EPISODES)
+    while not done_before.all():
+        action, _, state = player.act(td, state)
+        step, td = env.step_and_maybe_reset(td.set("action", action))
+        done = step["next", "done"].squeeze(-1)
+        for i in range(EPISODES):
+            if not done_before[i]:
+                returns[i] += step["next", "reward"][i].item()
+                lengths[i] += 1
+        done_before |= done
+    return returns, lengths
+
+
+def test_it_gives_the_first_episode_of_every_environment(env):
+    result = evaluate(Clock(), seed=3, env=env)
+    returns, lengths = by_hand("full")
+    assert result.returns.tolist() == pytest.approx(returns, abs=1e-5)
+    assert result.lengths.tolist() == lengths
+    assert len(set(lengths)) > 1
+
+
+def test_the_same_seed_plays_the_same_episodes_and_another_seed_others(env):
+    first, second, other = (evaluate(Clock(), seed=s, env=env) for s in (3, 3, 4))
+    assert first.lengths.tolist() == second.lengths.tolist() and first.returns.tolist() == second.returns.tolist()
+    assert first.lengths.tolist() != other.lengths.tolist()
+
+
+def test_the_twin_can_be_chosen(env):
+    class Looker(Clock):
+        def act(self, obs, state):
+            self.sums.append(int(obs["pixels"].sum()))
+            return super().act(obs, state)
+
+    seen = {}
+    for twin in ("full", "partial"):
+        player = Looker()
+        player.sums = seen[twin] = []
+        evaluate(player, observability=twin, seed=3, env=env)
+    assert seen["full"] != seen["partial"]
+    assert not env.observability.any(), "the environments were lent"
+
+
+def test_numbers_about_the_returns(env):
+    result = evaluate(Clock(), seed=3, env=env)
+    r = torch.tensor(result.returns)
+    assert result.mean == pytest.approx(r.mean().item())
+    assert result.std == pytest.approx(r.std().item(), abs=1e-6)
+    assert result.ci == pytest.approx(1.96 * r.std().item() / EPISODES**0.5, abs=1e-6)

@@ -1,0 +1,120 @@
+"""The paper's score, episode bookkeeping, schedules, optimiser."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from arcade_torch.agents.metrics import EpisodeStats, confidence_95, ewm, paper_score
+from arcade_torch.agents.optim import clip_gradients, make_optimizer, set_learning_rate
+from arcade_torch.agents.schedules import linear
+
+
+def test_the_ewm_is_the_explicit_weighted_sum():
+    x, alpha = np.random.default_rng(0).normal(size=30), 2 / 11
+    weights = [[(1 - alpha) ** t] + [alpha * (1 - alpha) ** (t - k) for k in range(1, t + 1)] for t in range(30)]
+    expected = [np.dot(w, x[: len(w)]) for w in weights]
+    np.testing.assert_allclose(ewm(x, span=10), expected)
+
+
+def test_the_score_of_a_constant_curve_is_the_constant():
+    assert paper_score([10, 20, 500], [0.3, 0.3, 0.3]) == pytest.approx(0.3)
+
+
+def test_the_score_is_the_best_smoothed_point_not_the_last():
+    frames = np.arange(1, 2001) * 100
+    returns = np.where(frames < 100_000, 1.0, -1.0)
+    assert paper_score(frames, returns) == pytest.approx(1.0)
+    assert paper_score(frames, -returns) == pytest.approx(1.0 - 2 * (1 - 2 / 101) ** 500, abs=1e-3)
+
+
+def test_the_score_of_a_step_matches_the_geometric_series():
+    """Half the axis at 0, half at 1: 500 points of alpha = 2/101 reach 1 - (1 - alpha)^500 of the step."""
+    grid = np.linspace(0, 1000, 1000)
+    returns = (np.arange(1000) >= 500).astype(float)
+    assert paper_score(grid, returns) == pytest.approx(1 - (1 - 2 / 101) ** 500, abs=1e-12)
+
+
+def test_beyond_the_history_the_curve_is_constant():
+    assert paper_score([50, 100], [0.2, 0.2], max_frames=1000) == pytest.approx(0.2)
+    late = paper_score([1, 100], [0.0, 1.0], max_frames=10_000)
+    assert late > 0.99
+
+
+@pytest.mark.parametrize("history", [([], []), ([1, 2], [0.0]), ([2, 1], [0.0, 0.0])])
+def test_a_history_that_is_none_is_refused(history):
+    with pytest.raises(ValueError):
+        paper_score(*history)
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10**6), envs=st.integers(1, 4), steps=st.integers(1, 12), cut=st.integers(0, 12))
+def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
+    g = torch.Generator().manual_seed(seed)
+    reward, done = torch.randn(envs, steps, generator=g), torch.rand(envs, steps, generator=g) < 0.3
+    expected, last = [], np.zeros((envs, steps))
+    for i in range(envs):
+        start, newest = 0, 0.0
+        for t in range(steps):
+            if done[i, t]:
+                newest = float(reward[i, start : t + 1].double().sum())
+                expected.append(newest)
+                start = t + 1
+            last[i, t] = newest
+    stats, seen, means = EpisodeStats.start(envs), [], []
+    for part in (slice(0, min(cut, steps)), slice(min(cut, steps), steps)):
+        if reward[:, part].shape[1]:
+            means.append(stats.update(reward[:, part], done[:, part]) * reward[:, part].shape[1])
+            seen += stats.finished
+        stats = EpisodeStats.from_state_dict(stats.state_dict())
+    np.testing.assert_allclose(sorted(seen), sorted(expected), atol=1e-6)
+    assert stats.episodes == len(expected)
+    assert sum(means) == pytest.approx(last.mean(0).sum(), abs=1e-6)
+
+
+def test_the_interval_is_that_of_the_normal_mean():
+    assert confidence_95([1.0, 3.0]) == pytest.approx(1.96)
+    assert confidence_95([1.0]) == 0.0
+
+
+def test_linear_meets_both_ends_and_stays():
+    assert linear(1.0, 0.05, 0, 100) == 1.0
+    assert linear(1.0, 0.05, 50, 100) == pytest.approx(0.525)
+    assert linear(1.0, 0.05, 100, 100) == linear(1.0, 0.05, 10**9, 100) == 0.05
+    assert linear(1.0, 0.05, 0, 0) == 0.05
+
+
+def radam_by_hand(gradients, lr):
+    """Liu et al. 2020, algorithm 2, on one number."""
+    b1, b2, m, v, x = 0.9, 0.999, 0.0, 0.0, 0.0
+    limit = 2 / (1 - b2) - 1
+    for t, g in enumerate(gradients, 1):
+        m, v = b1 * m + (1 - b1) * g, b2 * v + (1 - b2) * g * g
+        rho = limit - 2 * t * b2**t / (1 - b2**t)
+        step = m / (1 - b1**t)
+        if rho > 5:
+            r = ((rho - 4) * (rho - 2) * limit / ((limit - 4) * (limit - 2) * rho)) ** 0.5
+            step *= r * (1 - b2**t) ** 0.5 / (v**0.5 + 1e-8)
+        x -= lr * step
+    return x
+
+
+def test_the_optimiser_is_rectified_adam_of_the_paper():
+    gradients = [0.3, -1.0, 0.5, 0.7, 0.1, -0.2, 0.9, 0.4, 0.6, -0.8]
+    x = torch.nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    optimizer = make_optimizer([x], 1.0)
+    set_learning_rate(optimizer, 0.01)
+    for g in gradients:
+        x.grad = torch.tensor([g], dtype=torch.float64)
+        optimizer.step()
+    assert x.item() == pytest.approx(radam_by_hand(gradients, 0.01), rel=1e-6)
+
+
+def test_clipping_limits_the_joint_norm_and_reports_the_old_one():
+    a, b = torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(1))
+    a.grad, b.grad = torch.tensor([3.0, 0.0]), torch.tensor([4.0])
+    assert clip_gradients([a, b], 0.5).item() == pytest.approx(5.0)
+    torch.testing.assert_close(torch.cat((a.grad, b.grad)), torch.tensor([0.3, 0.0, 0.4]))
+    assert clip_gradients([a, b], 10.0).item() == pytest.approx(0.5)
+    torch.testing.assert_close(torch.cat((a.grad, b.grad)), torch.tensor([0.3, 0.0, 0.4]))

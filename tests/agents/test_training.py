@@ -1,0 +1,285 @@
+"""Runs: their files, their ends, and going on to the bit."""
+
+import dataclasses
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from arcade_torch.agents import (
+    CheckpointError,
+    NonFiniteError,
+    RunFolderError,
+    evaluate,
+    held_out_seed,
+    load,
+    loop,
+    preset,
+    train,
+)
+from arcade_torch.agents.checkpoint import list_checkpoints
+from arcade_torch.agents.files import read_csv
+from arcade_torch.agents.run_folder import EVAL_COLUMNS, METRIC_COLUMNS
+
+CONFIG = preset("smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=256, checkpoint_every=128)
+WITH_CONTEXT = dataclasses.replace(
+    CONFIG, memory="lru", pqn=dataclasses.replace(CONFIG.pqn, context=3, bootstrap="last", minibatches=8)
+)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    return folder, train(CONFIG, folder)
+
+
+def weights(folder):
+    return load_file(list_checkpoints(folder / "checkpoints")[0] / "weights.safetensors")
+
+
+def assert_same_run(one: Path, other: Path):
+    """Weights, numbers and evaluation are equal to the bit; only times differ."""
+    mine, theirs = weights(one), weights(other)
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    timeless = [c for c in METRIC_COLUMNS if c not in ("seconds", "fps")]
+    rows = [[[row[c] for c in timeless] for row in read_csv(f / "metrics.csv")] for f in (one, other)]
+    assert rows[0] == rows[1]
+    assert (one / "eval.csv").read_text() == (other / "eval.csv").read_text()
+    finals = [json.loads((f / "eval.json").read_text()) for f in (one, other)]
+    assert all(finals[0][k] == finals[1][k] for k in ("returns", "lengths", "mean", "train_max_ewm"))
+
+
+def stop_after(updates, action):
+    """A progress callback that acts once, after some updates."""
+
+    def progress(row):
+        if row["updates"] == updates:
+            action()
+
+    return progress
+
+
+def test_a_run_leaves_its_files(whole):
+    folder, result = whole
+    assert (result.status, result.frames) == ("finished", 640)
+    rows = read_csv(folder / "metrics.csv")
+    assert tuple(rows[0]) == METRIC_COLUMNS and tuple(read_csv(folder / "eval.csv")[0]) == EVAL_COLUMNS
+    assert [int(r["frames"]) for r in rows] == list(range(64, 641, 64))
+    assert [int(r["grad_steps"]) for r in rows] == [8 * i for i in range(1, 11)]
+    assert [int(r["frames"]) for r in read_csv(folder / "eval.csv")] == [256, 512, 640]
+    assert float(rows[0]["epsilon"]) == 1.0 and float(rows[-1]["epsilon"]) == 0.05
+    assert float(rows[-1]["lr"]) < float(rows[0]["lr"])
+    final = json.loads((folder / "eval.json").read_text())
+    assert final["status"] == "finished" and len(final["returns"]) == len(final["lengths"]) == 4
+    assert result.evaluation.mean == pytest.approx(sum(final["returns"]) / 4)
+    progress = json.loads((folder / "progress.json").read_text())
+    assert (progress["frames"], progress["total_frames"], progress["status"]) == (640, 640, "finished")
+    assert len(list_checkpoints(folder / "checkpoints")) == 2
+    saved = json.loads((folder / "config.json").read_text())
+    assert type(CONFIG).from_dict(saved["config"]) == CONFIG and saved["versions"]["torch"]
+
+
+def test_resuming_a_finished_run_returns_its_result_at_once(whole, monkeypatch):
+    folder, result = whole
+    monkeypatch.setattr(loop, "Trainer", None)
+    again = train(CONFIG, folder, resume=True)
+    assert (again.frames, again.train_max_ewm) == (result.frames, result.train_max_ewm)
+    assert again.evaluation.returns.tolist() == result.evaluation.returns.tolist()
+
+
+def test_a_folder_that_is_taken_is_refused_and_left_alone(whole, tmp_path):
+    folder, _ = whole
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    with pytest.raises(RunFolderError, match="resume=True"):
+        train(CONFIG, folder)
+    with pytest.raises(
+        RunFolderError, match=r"another run; differing fields: pqn\.lam \(0\.8 != 0\.5\), seed \(0 != 3\)"
+    ):
+        pqn = dataclasses.replace(CONFIG.pqn, lam=0.5)
+        train(dataclasses.replace(CONFIG, seed=3, pqn=pqn), folder, resume=True)
+    assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(RunFolderError, match="is not empty; choose another folder"):
+        train(CONFIG, tmp_path, resume=True)
+
+
+def test_a_bare_name_is_the_run_of_the_version_it_means(whole, monkeypatch):
+    monkeypatch.setattr(loop, "Trainer", None)
+    assert train(dataclasses.replace(CONFIG, env="CartPoleEasy"), whole[0], resume=True).status == "finished"
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="cannot write to"):
+        train(CONFIG, tmp_path / "file" / "run")
+
+
+def test_an_unknown_game_leaves_no_folder_behind(tmp_path):
+    with pytest.raises(ValueError, match="CartPoleEasy"):
+        train(dataclasses.replace(CONFIG, env="CartPolEasy"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_run_at_an_update_and_it_goes_on_to_the_bit(whole, tmp_path, number):
+    handler = signal.getsignal(number)
+    result = train(CONFIG, tmp_path / "run", progress=stop_after(3, lambda: os.kill(os.getpid(), number)))
+    assert (result.status, result.frames, result.evaluation) == ("interrupted", 192, None)
+    assert json.loads((tmp_path / "run" / "progress.json").read_text())["status"] == "interrupted"
+    assert list_checkpoints(tmp_path / "run" / "checkpoints")[0].name == "frames-000000000192"
+    assert signal.getsignal(number) is handler
+    assert train(CONFIG, tmp_path / "run", resume=True).status == "finished"
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+def test_a_run_with_context_goes_on_to_the_bit(tmp_path):
+    train(WITH_CONTEXT, tmp_path / "whole")
+    stop = stop_after(4, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert train(WITH_CONTEXT, tmp_path / "parts", progress=stop).status == "interrupted"
+    train(WITH_CONTEXT, tmp_path / "parts", resume=True)
+    assert_same_run(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_rows_after_the_checkpoint_are_not_kept_twice(whole, tmp_path):
+    def crash():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        train(CONFIG, tmp_path / "run", progress=stop_after(5, crash))
+    assert json.loads((tmp_path / "run" / "progress.json").read_text())["status"] == "failed"
+    assert len(read_csv(tmp_path / "run" / "metrics.csv")) == 5  # the checkpoint is at 4
+    train(CONFIG, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+def test_a_run_that_died_before_its_first_checkpoint_starts_again(whole, tmp_path):
+    def crash():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        train(CONFIG, tmp_path / "run", progress=stop_after(1, crash))
+    train(CONFIG, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+def test_a_damaged_newest_checkpoint_costs_only_the_way_since_the_one_before(whole, tmp_path):
+    stop = stop_after(6, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    train(CONFIG, tmp_path / "run", progress=stop)
+    newest = list_checkpoints(tmp_path / "run" / "checkpoints")[0]
+    (newest / "trainer.pt").write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="going on from frames-000000000256"):
+        train(CONFIG, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
+    made = []
+    real = loop.Trainer
+
+    def spy(config):
+        made.append(real(config))
+        return made[-1]
+
+    monkeypatch.setattr(loop, "Trainer", spy)
+
+    def poison():
+        next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
+
+    words = r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of 8; the last good checkpoint is .*128"
+    with pytest.raises(NonFiniteError, match=words):
+        train(CONFIG, tmp_path / "run", progress=stop_after(3, poison))
+    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == ["frames-000000000128"]
+    assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
+    assert load(tmp_path / "run").frames == 128
+    assert "loss is nan" in json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
+
+
+KILLED = """
+import sys
+from arcade_torch.agents import TrainConfig, train
+import json
+train(TrainConfig.from_dict(json.loads(sys.argv[1])), sys.argv[2])
+"""
+
+
+def kill_and_resume(folder: Path, rng: random.Random) -> int:
+    """Start a run in another process, kill it at a random moment, go on here; returns how many rows it had left."""
+    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(CONFIG.to_dict()), str(folder)])
+    try:
+        rows, deadline = rng.randint(1, 9), time.monotonic() + 120
+        log = folder / "metrics.csv"
+        while process.poll() is None and not (log.is_file() and log.read_text().count("\n") > rows):
+            assert time.monotonic() < deadline, "the run does not get on"
+            time.sleep(0.002)
+        time.sleep(rng.random() * 0.05)
+    finally:
+        process.kill()
+        process.wait()
+    left = len(read_csv(log))
+    assert train(CONFIG, folder, resume=True).status == "finished"
+    return left
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_killed_run_goes_on_to_the_bit(whole, tmp_path, seed):
+    kill_and_resume(tmp_path / "run", random.Random(seed))
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 14))
+def test_a_run_killed_at_many_moments_goes_on_to_the_bit(whole, tmp_path, seed):
+    kill_and_resume(tmp_path / "run", random.Random(seed))
+    assert_same_run(tmp_path / "run", whole[0])
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(whole, tmp_path):
+    train(CONFIG, tmp_path / "same")
+    assert_same_run(tmp_path / "same", whole[0])
+    train(dataclasses.replace(CONFIG, seed=1), tmp_path / "other")
+    assert any(
+        not torch.equal(w, v)
+        for w, v in zip(weights(tmp_path / "other").values(), weights(whole[0]).values(), strict=True)
+    )
+
+
+def test_an_agent_is_loaded_from_a_run_or_a_checkpoint(whole):
+    folder, result = whole
+    newest, previous = list_checkpoints(folder / "checkpoints")
+    agent = load(folder)
+    assert agent.frames == result.frames and agent.config == CONFIG
+    saved = load_file(newest / "weights.safetensors")
+    assert all(torch.equal(v, saved[k]) for k, v in agent.network.state_dict().items())
+    assert load(newest).frames == 640 and load(previous).frames == 512 and load(folder / "checkpoints").frames == 640
+    again = evaluate(agent, episodes=4)
+    assert again.returns.tolist() == result.evaluation.returns.tolist()
+
+
+def test_loading_nothing_says_what_was_found(tmp_path):
+    with pytest.raises(CheckpointError, match="is not a folder"):
+        load(tmp_path / "absent")
+    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+        load(tmp_path)
+
+
+def test_bad_evaluation_arguments_are_named(whole):
+    agent = load(whole[0])
+    for change, words in (({"episodes": 0}, "episodes"), ({"seed": -1}, "seed"), ({"observability": "half"}, "'full'")):
+        with pytest.raises(ValueError, match=words):
+            evaluate(agent, **change)
+
+
+def test_evaluation_seeds_are_none_of_training():
+    assert held_out_seed(0) > max(preset("paper", seed=2**30 - 1).seed, 0)
+    with pytest.raises(ValueError, match="seed"):
+        held_out_seed(2**30)
