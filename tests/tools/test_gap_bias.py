@@ -1,0 +1,200 @@
+"""Gap and Bias against the paper's aggregates, and the bootstrap against what is known about it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arcade_torch.tools import gap_and_bias
+from arcade_torch.tools.analysis.bootstrap import measured_coverage, percentile_interval, resampled_means
+from arcade_torch.tools.analysis.gap_bias import GapBias
+from arcade_torch.tools.analysis.normalise import normalise, split_id
+from arcade_torch.tools.analysis.scores import Score, read_scores
+
+PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
+
+# agent: MDP, POMDP, Gap, Bias; then POMDP, Gap, Bias without Tetris (spec of the analyses, section 1.3)
+AGGREGATES = {
+    "MLP": (0.672, 0.439, 0.233, 0.0, 0.451, 0.259, 0.0),
+    "LRU": (0.659, 0.594, 0.065, -0.013, 0.659, 0.073, 0.022),
+    "GRU": (0.652, 0.565, 0.088, -0.020, 0.626, 0.098, 0.014),
+    "MinGRU": (0.613, 0.471, 0.142, -0.059, 0.522, 0.158, -0.029),
+    "FART": (0.476, 0.421, 0.055, -0.196, 0.467, 0.061, -0.182),
+    "attention": (0.510, 0.403, 0.107, -0.161, 0.447, 0.119, -0.143),
+    "TTTL": (0.415, 0.408, 0.008, -0.257, 0.452, 0.009, -0.249),
+    "GDN": (0.522, 0.469, 0.054, -0.150, 0.520, 0.060, -0.130),
+}
+
+
+@pytest.fixture(scope="module")
+def paper() -> GapBias:
+    return gap_and_bias(PAPER, draws=10)
+
+
+@pytest.mark.parametrize("agent", AGGREGATES)
+def test_published_tables_give_the_published_aggregates(paper: GapBias, agent: str) -> None:
+    row = paper.row(agent)
+    rest = next(row for row in paper.without["Tetris"] if row.agent == agent)
+    found = (row.mdp, row.pomdp, row.gap, row.bias, rest.pomdp, rest.gap, rest.bias)
+    assert [interval.value for interval in found] == pytest.approx(AGGREGATES[agent], abs=6e-4)
+
+
+def test_the_texts_quoted_differences_come_out(paper: GapBias) -> None:
+    assert paper.row("GDN").pomdp.value == pytest.approx(0.469, abs=5e-4)
+    assert paper.row("MinGRU").pomdp.value == pytest.approx(0.471, abs=5e-4)
+    assert paper.row("GDN").bias.value - paper.row("MinGRU").bias.value == pytest.approx(-0.091, abs=5e-4)
+    assert paper.gap_difference("MinGRU", "GDN").value == pytest.approx(0.089, abs=5e-4)
+    assert len(paper.tasks) == 30 and len(paper.without) == 10
+
+
+def test_means_without_seeds_have_no_interval(paper: GapBias) -> None:
+    assert np.isnan(paper.row("LRU").gap.low)
+    assert not paper.row("LRU").gap.excludes_zero
+
+
+@given(value=st.floats(-1, 1))
+def test_five_games_are_mapped_and_five_are_not(value: float) -> None:
+    signed = ("BattleShipHard-v0", "MineSweeperEasy", "BreakoutMedium", "TetrisEasy-v3", "NavigatorHard")
+    plain = ("CartPoleEasy", "NoisyCartPoleEasy", "AutoEncodeHard", "CountRecallMedium-v0", "SkittlesEasy")
+    assert all(normalise(game, value) == (value + 1) / 2 for game in signed)
+    assert all(normalise(game, value) == value for game in plain)
+
+
+def test_an_alias_is_the_same_game() -> None:
+    assert split_id("NoisyPoleEasy-v0").game == "NoisyCartPole" == split_id("NoisyCartPoleEasy").game
+
+
+def scores(values: dict[tuple[str, str], list[float]], game: str = "CartPoleEasy") -> list[Score]:
+    """Scores of one game: (agent, twin) -> values of its seeds."""
+    return [
+        Score(agent, game, twin, seed, value) for (agent, twin), vs in values.items() for seed, value in enumerate(vs)
+    ]
+
+
+def test_identical_seeds_give_an_interval_without_width() -> None:
+    table = gap_and_bias(
+        scores(
+            {
+                ("mlp", "full"): [0.5] * 5,
+                ("mlp", "partial"): [0.2] * 5,
+                ("lru", "full"): [0.6] * 5,
+                ("lru", "partial"): [0.5] * 5,
+            }
+        ),
+        draws=200,
+    )
+    gap, bias = table.row("lru").gap, table.row("lru").bias
+    assert (gap.low, gap.value, gap.high) == pytest.approx((0.1, 0.1, 0.1))
+    assert (bias.low, bias.value, bias.high) == pytest.approx((0.1, 0.1, 0.1))
+
+
+def test_gap_and_bias_share_the_resample_of_the_mdp_runs() -> None:
+    rng = np.random.default_rng(0)
+    noisy = list(rng.normal(size=5))
+    table = gap_and_bias(
+        scores(
+            {
+                ("mlp", "full"): [0.0] * 5,
+                ("mlp", "partial"): [0.0] * 5,
+                ("lru", "full"): noisy,
+                ("lru", "partial"): [0.0] * 5,
+            }
+        ),
+        draws=500,
+    )
+    row = table.row("lru")  # only the MDP runs vary, so Gap and Bias must be equal draw by draw
+    assert (row.gap.low, row.gap.high) == (row.bias.low, row.bias.high)
+    assert row.gap.high > row.gap.low
+
+
+def test_the_bias_of_the_memory_free_agent_is_exactly_zero() -> None:
+    rng = np.random.default_rng(1)
+    values = {(agent, twin): list(rng.normal(size=4)) for agent in ("gru", "MLP") for twin in ("full", "partial")}
+    table = gap_and_bias(scores(values), draws=100)
+    assert table.baseline == "MLP" and table.rows[0].agent == "MLP"
+    assert (table.rows[0].bias.low, table.rows[0].bias.value, table.rows[0].bias.high) == (0.0, 0.0, 0.0)
+
+
+def test_the_order_of_the_runs_does_not_matter() -> None:
+    rng = np.random.default_rng(2)
+    values = {(agent, twin): list(rng.normal(size=4)) for agent in ("mlp", "lru") for twin in ("full", "partial")}
+    runs = scores(values)
+    shuffled = [runs[index] for index in rng.permutation(len(runs))]
+    assert gap_and_bias(runs, draws=300).row("lru") == gap_and_bias(shuffled, draws=300).row("lru")
+
+
+def test_bootstrap_spread_is_that_of_the_mean_of_resampled_seeds() -> None:
+    cells = [np.array([0.0, 1.0, 4.0]), np.array([2.0, 2.0, 5.0, 7.0])]
+    draws = resampled_means(cells, 40_000, np.random.default_rng(0))
+    variance = sum(cell.var() / len(cell) for cell in cells) / len(cells) ** 2
+    assert draws.mean() == pytest.approx(np.mean([cell.mean() for cell in cells]), abs=0.02)
+    assert draws.var() == pytest.approx(variance, rel=0.03)
+
+
+def test_measured_coverage_is_below_nominal_and_grows_with_seeds() -> None:
+    few, some, many = (measured_coverage((n,), (n,), simulations=600, draws=300) for n in (2, 5, 20))
+    assert 0.5 < few < some < many < 0.98
+    assert 0.82 < some < 0.94
+
+
+def test_coverage_of_a_single_cell_of_five_is_the_known_84_percent() -> None:
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(1500):
+        seeds = rng.standard_normal(5)
+        interval = percentile_interval(float(seeds.mean()), resampled_means([seeds], 400, rng), 0.95)
+        inside.append(interval.low <= 0 <= interval.high)
+    assert np.mean(inside) == pytest.approx(0.84, abs=0.03)
+
+
+def test_tasks_that_an_agent_lacks_are_left_out_and_named() -> None:
+    both = {(agent, twin): [0.1, 0.2] for agent in ("mlp", "lru") for twin in ("full", "partial")}
+    alone = {("mlp", "full"): [0.9, 0.9], ("mlp", "partial"): [0.9, 0.9]}
+    table = gap_and_bias(scores(both) + scores(alone, "SkittlesEasy"), draws=10)
+    assert table.tasks == ("CartPoleEasy",) and table.dropped == ("SkittlesEasy",)
+    assert table.row("mlp").mdp.value == pytest.approx(0.15)
+
+
+def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "runs.csv"
+    lines = ["agent,game,observability,seed,score"]
+    lines += [
+        f"{a},CartPoleEasy,{o},{s},{0.1 * s}" for a in ("mlp", "lru") for o in ("full", "partial") for s in (0, 1)
+    ]
+    file.write_text("\n".join(lines) + "\n")
+    assert len(read_scores(file)) == 8
+    assert gap_and_bias(file, draws=10).row("lru").seeds == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("agent,game\nmlp,x\n", "no column for observability, seed, score"),
+        ("agent,game,observability,seed,score\nmlp,X,full,0,abc\n", "not a number"),
+        ("agent,game,observability,seed,score\nmlp,X,full,0,1\nmlp,X,full,0,2\n", "two scores for mlp"),
+        ("agent,game,observability,seed,score\nlru,X,full,0,1\n", "memory-free agent 'mlp'"),
+        ("agent,game,observability,seed,score\nmlp,X,full,0,1\n", "nothing to compare yet"),
+        ("agent,game,observability,seed,score\nmlp,X,half,0,1\n", "full or partial"),
+        ("agent,game,observability,seed,score\nmlp,X,full,0,nan\n", "is nan"),
+    ],
+)
+def test_bad_tables_are_refused_with_a_reason(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "runs.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        gap_and_bias(file, draws=10)
+
+
+def test_a_bare_name_and_its_version_are_one_game() -> None:
+    twins = [("mlp", "full"), ("mlp", "partial"), ("lru", "full"), ("lru", "partial")]
+    bare = [Score(agent, "TetrisEasy", twin, 0, 0.5) for agent, twin in twins]
+    full = [Score(agent, "TetrisEasy-v1", twin, 1, 0.7) for agent, twin in twins]
+    table = gap_and_bias(bare + full, draws=10)
+    assert table.tasks == ("TetrisEasy-v1",) and table.row("lru").seeds == 2
+
+
+def test_an_unknown_metric_is_refused() -> None:
+    with pytest.raises(ValueError, match="allowed are eval_final, train_max_ewm"):
+        read_scores([], "best")

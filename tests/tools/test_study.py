@@ -1,0 +1,353 @@
+"""Studies: the grid, the engines, and going on after failures and interruptions; runs are fabricated."""
+
+import io
+import json
+import os
+import signal
+import sys
+import textwrap
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from arcade_torch.tools.files import read_csv
+from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores, make_engine
+from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.grid import Study
+from arcade_torch.tools.studies.progress import Display, Speed, Watcher
+from arcade_torch.tools.studies.runner import check_names, study
+from tests.tools.fabricated import small_study, write_run, write_study
+
+
+class Fabricator:
+    """An engine that fabricates runs; may fail some, and may be interrupted after some."""
+
+    def __init__(self, what: Study, fail: str = "", stop_after: int = 99) -> None:
+        self.runs, self.fail, self.stop_after = {run.name: run for run in what.runs()}, fail, stop_after
+        self.done: list[str] = []
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+        for job in jobs:
+            if len(self.done) == self.stop_after:
+                raise KeyboardInterrupt
+            assert job.words[-1] == "--resume"
+            self.done.append(job.name)
+            if self.fail and self.fail in job.name:
+                yield JobResult(job.name, 1, "no luck")
+            else:
+                write_run(Path(job.words[job.words.index("--out") + 1]), self.runs[job.name], 0.5)
+                yield JobResult(job.name, 0)
+
+
+def carry_out(what: Study, root: Path, engine: Fabricator) -> "list[dict[str, str]]":
+    study(what, root, engine, stream=io.StringIO())
+    return read_csv(root / "results.csv")
+
+
+def test_the_grid_holds_every_cell_once_under_a_name_of_its_own() -> None:
+    runs = small_study().runs()
+    assert len(runs) == len({run.name for run in runs}) == 8
+    assert runs[0].name == "MineSweeperEasy__full__mingru__pqn__seed0"
+
+
+def test_growing_the_grid_keeps_the_names() -> None:
+    names = {run.name for run in small_study().runs()}
+    assert names < {run.name for run in small_study(seeds=3, memories=["mingru", "mlp", "gru"]).runs()}
+
+
+def test_a_study_survives_being_written_and_read() -> None:
+    what = small_study(settings={"pqn": {"gamma": 0.9}}, question="why?")
+    assert Study.from_dict(json.loads(json.dumps(what.to_dict()))) == what
+
+
+def test_a_study_is_read_from_toml_and_its_settings_become_options(tmp_path: Path) -> None:
+    file = tmp_path / "one.toml"
+    file.write_text(
+        textwrap.dedent("""
+        games = "CartPoleEasy"
+        memories = ["mlp", "lru"]
+        seeds = 2
+        total_frames = 4096
+        [settings]
+        eval_every = 512
+        [settings.pqn]
+        learning_rate = 1e-3
+        [settings.env_options]
+        wind = true
+        """)
+    )
+    what = Study.load(file)
+    assert what.name == "one" and what.seeds == (0, 1)
+    words = " ".join(what.arguments(what.runs()[0], Path("here")))
+    assert words == (
+        "train --preset paper --env CartPoleEasy --observability full --memory mlp --algorithm pqn --seed 0 "
+        "--total-frames 4096 --eval-every 512 --pqn.learning-rate 0.001 --env-option wind=True --out here"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"games": []}, "games is empty"),
+        ({"seeds": 0}, "at least 1"),
+        ({"seeds": [1, 1]}, "names something twice"),
+        ({"seeds": [-1]}, "0 or more"),
+        ({"observability": ["some"]}, "full, partial"),
+        ({"total_frames": 0}, "total_frames"),
+        ({"name": "a/b"}, "letters, digits"),
+        ({"colour": 1}, "unknown key 'colour'"),
+        ({"settings": {"env": "X"}}, "the grid decides"),
+    ],
+)
+def test_bad_studies_are_refused_with_a_reason(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small_study(**changes)
+
+
+def test_unknown_games_and_memories_are_named_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="MineSweeperEasy"):
+        check_names(small_study(games=["MineSweperEasy"]))
+    with pytest.raises(ValueError, match="did you mean 'mingru'"):
+        study(small_study(memories=["minrgu"]), tmp_path / "s", Fabricator(small_study()))
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_study_writes_one_row_a_run_in_the_order_of_the_grid(tmp_path: Path) -> None:
+    what = small_study()
+    rows = carry_out(what, tmp_path / "s", Fabricator(what))
+    assert [row["run"] for row in rows] == [run.name for run in what.runs()]
+    assert {row["status"] for row in rows} == {"finished"}
+    assert float(rows[0]["eval_mean"]) == 0.5
+
+
+def test_finished_runs_are_skipped_and_interrupted_studies_go_on(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    first, second = Fabricator(what, stop_after=3), Fabricator(what)
+    with pytest.raises(KeyboardInterrupt):
+        carry_out(what, root, first)
+    rows = carry_out(what, root, second)
+    assert first.done + second.done == [run.name for run in what.runs()]
+    assert all(row["status"] == "finished" for row in rows)
+
+
+def test_a_failing_run_does_not_lose_the_others_and_is_tried_again(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    rows = carry_out(what, root, Fabricator(what, fail="partial__mlp"))
+    failed = [row for row in rows if row["status"] == "failed"]
+    assert len(failed) == 2 and failed[0]["error"] == "no luck"
+    again = Fabricator(what)
+    assert all(row["status"] == "finished" for row in carry_out(what, root, again))
+    assert again.done == [row["run"] for row in failed]
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("precious")
+    with pytest.raises(FileExistsError, match="holds no study"):
+        carry_out(small_study(), tmp_path / "other", Fabricator(small_study()))
+    assert os.listdir(tmp_path / "other") == ["thesis.tex"]
+
+
+def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    write_study(root, what)
+    with pytest.raises(FileExistsError, match="total_frames = 2048, not 4096"):
+        carry_out(small_study(total_frames=4096), root, Fabricator(what))
+    with pytest.raises(FileExistsError, match="which this study lacks"):
+        carry_out(small_study(memories=["mlp"]), root, Fabricator(what))
+    larger = small_study(seeds=3)
+    engine = Fabricator(larger)
+    carry_out(larger, root, engine)
+    assert len(engine.done) == 4 and all("seed2" in name for name in engine.done)
+
+
+def test_versions_of_the_first_runs_stay_on_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = StudyFolder(tmp_path / "s")
+    folder.claim(small_study(), "first")
+    before = folder.record()["versions"]
+    monkeypatch.setattr("arcade_torch.tools.studies.folder.versions", lambda: {"torch": "99"})
+    for _ in range(2):
+        folder.claim(small_study(seeds=3), "second")
+    record = folder.record()
+    assert record["versions"] == before and record["also"] == [{"torch": "99"}]
+    assert record["command"] == "second" and len(record["runs"]) == 12
+
+
+def test_two_processes_cannot_work_on_one_study(tmp_path: Path) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    with (tmp_path / ".s.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(FileExistsError, match="another process"):
+            carry_out(small_study(), tmp_path / "s", Fabricator(small_study()))
+
+
+def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
+    return [Job(f"job{i}", (textwrap.dedent(text),), tmp_path / f"job{i}.log") for i, text in enumerate(scripts)]
+
+
+def python_engine(workers: int = 2) -> Processes:
+    return Processes(workers, program=(sys.executable, "-c"), poll_s=0.02)
+
+
+def test_worker_processes_run_side_by_side_and_report_how_they_ended(tmp_path: Path) -> None:
+    wait = f"""
+        import pathlib, time
+        here = pathlib.Path({str(tmp_path)!r})
+        (here / "NAME").touch()
+        while len(list(here.glob("up*"))) < 2: time.sleep(0.02)
+    """
+    texts = [wait.replace("NAME", "up0"), wait.replace("NAME", "up1"), "raise SystemExit('broken: no disk')"]
+    results = {result.name: result for result in python_engine().run(jobs(tmp_path, *texts))}
+    assert [results[f"job{i}"].exit_code for i in range(3)] == [0, 0, 1]
+    assert results["job2"].error == "broken: no disk"
+
+
+def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
+    (result,) = python_engine().run(jobs(tmp_path, "import os; os.kill(os.getpid(), 9)"))
+    assert result.exit_code == -9 and "signal 9" in result.error
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin")
+def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path) -> None:
+    text = f"""
+        import os, pathlib, time
+        time.sleep(0.3)
+        core, = os.sched_getaffinity(0)
+        name = f"core-{{core}}-{{os.environ['OMP_NUM_THREADS']}}"
+        (pathlib.Path({str(tmp_path)!r}) / name).touch()
+    """
+    count = min(2, len(available_cores()))
+    assert all(result.exit_code == 0 for result in python_engine(count).run(jobs(tmp_path, *[text] * count)))
+    assert len(list(tmp_path.glob("core-*-1"))) == count
+
+
+def test_closing_the_engine_asks_workers_to_stop_and_lets_them_save(tmp_path: Path) -> None:
+    text = f"""
+        import pathlib, signal, sys, time
+        here = pathlib.Path({str(tmp_path)!r})
+        def save(*_):
+            (here / "saved").touch(); sys.exit(130)
+        signal.signal(signal.SIGTERM, save)
+        (here / "up").touch()
+        time.sleep(60)
+    """
+    results = python_engine().run(jobs(tmp_path, "pass", text, "pass"))
+    next(results)
+    while not (tmp_path / "up").exists():
+        time.sleep(0.02)
+    results.close()  # type: ignore[attr-defined]
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_worker_that_ignores_the_request_is_killed_after_the_grace_time(tmp_path: Path) -> None:
+    text = f"""
+        import pathlib, signal, time
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        pathlib.Path({str(tmp_path / "up")!r}).touch()
+        time.sleep(60)
+    """
+    engine = Processes(2, program=(sys.executable, "-c"), poll_s=0.02, grace_s=0.3)
+    results = engine.run(jobs(tmp_path, text, "import time; time.sleep(0.5)"))
+    next(results)
+    while not (tmp_path / "up").exists():
+        time.sleep(0.02)
+    start = time.monotonic()
+    results.close()  # type: ignore[attr-defined]
+    assert time.monotonic() - start < 10
+
+
+def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
+    import subprocess
+
+    inner = (
+        "import time, pathlib, signal, sys\n"
+        "from arcade_torch.tools.studies.engines import watch_parent\n"
+        f"signal.signal(signal.SIGTERM, lambda *_: (pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
+        "watch_parent(every_s=0.05)\n"
+        f"pathlib.Path({str(tmp_path / 'up')!r}).touch()\n"
+        "time.sleep(30)\n"
+    )
+    outer = (
+        "import os, subprocess, sys, time\n"
+        "os.environ['ARCADE_TORCH_PARENT'] = str(os.getpid())\n"
+        f"subprocess.Popen([sys.executable, '-c', {inner!r}])\n"
+        "time.sleep(30)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", outer], cwd=Path(__file__).resolve().parents[2])
+    deadline = time.monotonic() + 20
+    while not (tmp_path / "up").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    while not (tmp_path / "saved").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert (tmp_path / "saved").exists()
+
+
+def test_inline_runs_one_after_the_other_and_survives_exceptions(tmp_path: Path) -> None:
+    def run_words(words: Sequence[str]) -> int:
+        if words == ("bad",):
+            raise RuntimeError("broken\nbadly")
+        return 0
+
+    parts = [
+        Job("a", ("good",), tmp_path / "a"),
+        Job("b", ("bad",), tmp_path / "b"),
+        Job("c", ("good",), tmp_path / "c"),
+    ]
+    results = list(Inline(run_words).run(parts))
+    assert [result.exit_code for result in results] == [0, 1, 0]
+    assert results[1].error == "RuntimeError: broken badly"
+
+
+def test_engines_are_made_by_name() -> None:
+    assert isinstance(make_engine("inline"), Inline)
+    assert isinstance(make_engine("processes", 3), Processes)
+    with pytest.raises(ValueError, match="auto, inline, processes"):
+        make_engine("cluster")
+    with pytest.raises(ValueError, match="workers"):
+        make_engine("processes", -1)
+
+
+def test_speed_is_that_of_the_last_seconds() -> None:
+    speed = Speed(window_s=10)
+    assert speed.update(0, 0) == 0
+    assert speed.update(5, 500) == 100
+    assert speed.update(20, 3500) == pytest.approx(200)
+
+
+def test_the_watcher_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
+    what = small_study(seeds=1)
+    folder = StudyFolder(tmp_path / "s")
+    runs = what.runs()
+    write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
+    write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
+    watcher = Watcher({run.name: folder.run(run) for run in runs}, 2048)
+    watcher.ended.add(runs[0].name)
+    seen = watcher.look()
+    assert (seen.frames, seen.total, seen.ended, seen.runs) == (2048 + 1024, 4 * 2048, 1, 4)
+    assert seen.active == {runs[1].name: (1024, 2048)}
+    assert "1/4 runs" in seen.line()
+
+
+def test_the_display_prints_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
+    stream = io.StringIO()
+    with Display(Watcher({}, 1), "toy", every_s=0.01, stream=stream) as display:
+        display.note("hello")
+    assert "toy: hello" in stream.getvalue() and "toy: 0/0 runs" in stream.getvalue()
+
+
+def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    folder = write_study(tmp_path / "s", small_study(seeds=1))
+    run = small_study(seeds=1).runs()[0]
+    write_run(folder.run(run).path, run, 0.5, frames=2048, status="running")
+    stream = Terminal()
+    with Display(Watcher({run.name: folder.run(run)}, 2048), "toy", every_s=0.01, stream=stream):
+        time.sleep(0.1)
+    assert "toy" in stream.getvalue() and "50%" in stream.getvalue()

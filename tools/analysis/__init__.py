@@ -1,0 +1,1 @@
+"""What the memory did: measures over runs and agents, arrays out."""

@@ -1,0 +1,100 @@
+"""Stratified bootstrap of means over tasks, and how often its intervals really hold the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number and its interval; the ends are NaN where one seed alone gives no interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """Three decimals, with the interval if there is one."""
+        ends = "" if np.isnan(self.low) else f" [{self.low:+.3f}, {self.high:+.3f}]"
+        return f"{self.value:+.3f}{ends}"
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether there is an interval and zero lies outside it."""
+        return bool(self.low > 0 or self.high < 0)
+
+
+def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> Array:
+    """Means over tasks with the seeds of each task resampled with replacement.
+
+    Args:
+        cells: for each task the scores of its seeds, float64 [n_seeds].
+        draws: number of resamples D.
+        rng: source of the draws.
+
+    Returns:
+        float64 [D].
+    """
+    total = np.zeros(draws)
+    for cell in cells:
+        total += cell[rng.integers(len(cell), size=(draws, len(cell)))].mean(axis=1)
+    return total / len(cells)
+
+
+def percentile_interval(value: float, draws: Array, confidence: float, known: bool = True) -> Interval:
+    """Percentile interval of bootstrap draws.
+
+    Args:
+        value: the estimate itself.
+        draws: float64 [D].
+        confidence: for example 0.95.
+        known: False where too few seeds stand behind the draws; the ends become NaN.
+    """
+    if not known:
+        return Interval(value, float("nan"), float("nan"))
+    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(value, float(low), float(high))
+
+
+@lru_cache(maxsize=64)
+def measured_coverage(
+    mdp_seeds: tuple[int, ...],
+    pomdp_seeds: tuple[int, ...],
+    confidence: float = 0.95,
+    simulations: int = 2000,
+    draws: int = 500,
+    seed: int = 0,
+) -> float:
+    """Share of simulated studies whose interval for Gap holds the true Gap.
+
+    Seeds are standard Gaussian in the simulation, the same spread in every task. With few seeds the share is well
+    below the nominal confidence; a report says so beside its intervals.
+
+    Args:
+        mdp_seeds: number of seeds of each task's MDP.
+        pomdp_seeds: the same for the POMDPs.
+        confidence: nominal.
+        simulations: simulated studies (fewer for large ones, so that this takes about a second).
+        draws: resamples of each.
+        seed: of the simulation.
+
+    Returns:
+        A share in [0, 1], with a standard error of about 0.01.
+    """
+    rng = np.random.default_rng(seed)
+    cost = draws * sum(mdp_seeds + pomdp_seeds)
+    simulations = max(200, min(simulations, int(4e7 / cost)))
+    truth, gaps = np.zeros(simulations), np.zeros((simulations, draws))
+    for sign, counts in ((1.0, mdp_seeds), (-1.0, pomdp_seeds)):
+        for count in counts:
+            scores = rng.standard_normal((simulations, count))
+            picks = rng.integers(count, size=(simulations, draws * count))
+            means = np.take_along_axis(scores, picks, axis=1).reshape(simulations, draws, count).mean(axis=2)
+            gaps += sign * means / len(counts)
+    ends = np.quantile(gaps, [(1 - confidence) / 2, (1 + confidence) / 2], axis=1)
+    return float(np.mean((ends[0] <= truth) & (truth <= ends[1])))

@@ -1,0 +1,226 @@
+"""Observability Gap and Memory Bias.
+
+``Gap(f) = J(f, MDP) - J(f, POMDP)``: what partial observability costs agent f; small is good.
+``Bias(f) = J(f, MDP) - J(no memory, MDP)``: what memory costs where it is not needed; negative is a cost.
+J is the normalised return, averaged over tasks.
+
+Source: POPGym Arcade (ICML 2026), definitions of Gap and Bias. Intervals: stratified bootstrap over seeds.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from arcade_torch.tools.analysis.bootstrap import (
+    Array,
+    Interval,
+    measured_coverage,
+    percentile_interval,
+    resampled_means,
+)
+from arcade_torch.tools.analysis.normalise import normalise, split_id
+from arcade_torch.tools.analysis.scores import Runs, Score, read_scores
+
+TWINS = ("full", "partial")
+
+
+@dataclass(frozen=True)
+class AgentRow:
+    """One agent of the table.
+
+    Attributes:
+        agent: its name.
+        seeds: smallest number of seeds behind any of its cells.
+        mdp_raw: return on the MDPs, mean over tasks.
+        pomdp_raw: return on the POMDPs.
+        mdp: the same, normalised to [0, 1] task by task.
+        pomdp: the same, normalised.
+        gap: mdp - pomdp.
+        bias: mdp - mdp of the memory-free agent.
+        coverage: measured coverage of the interval of Gap; NaN where there is no interval.
+    """
+
+    agent: str
+    seeds: int
+    mdp_raw: Interval
+    pomdp_raw: Interval
+    mdp: Interval
+    pomdp: Interval
+    gap: Interval
+    bias: Interval
+    coverage: float
+
+
+@dataclass(frozen=True)
+class GapBias:
+    """Table of Gap and Bias.
+
+    Attributes:
+        rows: one an agent, in the order in which agents were met, the memory-free one first.
+        tasks: environment ids over which the means go: those that every agent has on both twins.
+        dropped: environment ids left out because some agent lacks them.
+        metric: what the score of a run is.
+        baseline: the memory-free agent.
+        confidence: nominal confidence of the intervals.
+        draws: bootstrap draws.
+        without: the same rows leaving out one game (all its difficulties), by game; empty for a single game.
+    """
+
+    rows: tuple[AgentRow, ...]
+    tasks: tuple[str, ...]
+    dropped: tuple[str, ...]
+    metric: str
+    baseline: str
+    confidence: float
+    draws: int
+    without: Mapping[str, tuple[AgentRow, ...]] = field(default_factory=dict)
+    _gap_draws: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    _pomdp_draws: Mapping[str, Array] = field(default_factory=dict, repr=False)
+
+    def row(self, agent: str) -> AgentRow:
+        """The row of an agent.
+
+        Raises:
+            ValueError: there is no such agent.
+        """
+        for row in self.rows:
+            if row.agent == agent:
+                return row
+        raise ValueError(f"no agent {agent!r}; there are {', '.join(row.agent for row in self.rows)}")
+
+    def gap_difference(self, first: str, second: str) -> Interval:
+        """Gap(first) - Gap(second) with an interval from the same draws."""
+        return self._difference(self._gap_draws, self.row(first).gap, self.row(second).gap, first, second)
+
+    def pomdp_difference(self, first: str, second: str) -> Interval:
+        """Normalised POMDP return of first minus that of second."""
+        return self._difference(self._pomdp_draws, self.row(first).pomdp, self.row(second).pomdp, first, second)
+
+    def _difference(self, draws: Mapping[str, Array], a: Interval, b: Interval, first: str, second: str) -> Interval:
+        known = not (np.isnan(a.low) or np.isnan(b.low))
+        return percentile_interval(a.value - b.value, draws[first] - draws[second], self.confidence, known)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Plain rows, for a CSV file; games left out stand in column ``without``."""
+        found = [_plain(row, "") for row in self.rows]
+        return found + [_plain(row, game) for game, rows in self.without.items() for row in rows]
+
+
+def gap_and_bias(
+    runs: Runs,
+    *,
+    metric: str = "eval_final",
+    baseline: str = "mlp",
+    draws: int = 10_000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> GapBias:
+    """Observability Gap and Memory Bias of every agent, with bootstrap intervals.
+
+    Seeds are resampled with replacement within each (agent, task, observability). Gap and Bias of one agent use the
+    same resample of its MDP runs, so that their covariance is kept; MDP and POMDP seeds are never paired.
+
+    Args:
+        runs: a study's folder, run folders, a CSV file, or scores; see `read_scores` in the module ``scores``.
+        metric: ``eval_final`` (greedy) or ``train_max_ewm`` (the paper's).
+        baseline: the memory-free agent (any case).
+        draws: bootstrap draws.
+        confidence: of the intervals, in (0, 1).
+        seed: of the draws.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: no agent is complete on any task, the baseline is missing, or an argument is out of range.
+    """
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    if draws < 1:
+        raise ValueError(f"draws must be at least 1, got {draws}")
+    cells = _cells(read_scores(runs, metric))
+    agents = list(dict.fromkeys(agent for agent, _, _ in cells))
+    base = next((agent for agent in agents if agent.lower() == baseline.lower()), None)
+    if base is None:
+        raise ValueError(f"no scores for the memory-free agent {baseline!r}; there are {', '.join(agents) or 'none'}")
+    agents = [base, *(agent for agent in agents if agent != base)]
+    every = list(dict.fromkeys(game for _, game, _ in cells))
+    tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]
+    if not tasks:
+        raise ValueError("no task has finished runs of every agent on both twins: nothing to compare yet")
+    rows, gaps, pomdps = _rows(cells, agents, tasks, draws, confidence, seed)
+    games = list(dict.fromkeys(split_id(task).game for task in tasks))
+    without = {}
+    for game in games if len(games) > 1 else []:
+        rest = [task for task in tasks if split_id(task).game != game]
+        without[game] = _rows(cells, agents, rest, draws, confidence, seed)[0]
+    dropped = tuple(game for game in every if game not in tasks)
+    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, gaps, pomdps)
+
+
+Cells = dict[tuple[str, str, str], Array]
+
+
+def _cells(scores: Sequence[Score]) -> Cells:
+    found: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
+    for score in scores:
+        if score.observability not in TWINS:
+            raise ValueError(f"observability must be full or partial, got {score.observability!r}")
+        if not np.isfinite(score.value):
+            raise ValueError(f"the score of {score.agent} on {score.game}, seed {score.seed}, is {score.value}")
+        found.setdefault((score.agent, score.game, score.observability), []).append((score.seed, score.value))
+    return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
+
+
+def _rows(
+    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, confidence: float, seed: int
+) -> tuple[tuple[AgentRow, ...], dict[str, Array], dict[str, Array]]:
+    raw = {key: cells[key] for key in ((a, t, twin) for a in agents for t in tasks for twin in TWINS)}
+    scaled = {key: normalise(key[1], values) for key, values in raw.items()}
+    resampled = {
+        # the stream of an agent's twin depends on its place alone, and raw and normalised means share it
+        (agent, twin): [
+            resampled_means([source[agent, task, twin] for task in tasks], draws, np.random.default_rng([seed, i, j]))
+            for source in (raw, scaled)
+        ]
+        for i, agent in enumerate(agents)
+        for j, twin in enumerate(TWINS)
+    }
+    base = agents[0]
+    rows, gaps, pomdps = [], {}, {}
+    for agent in agents:
+        means = {twin: [_mean(source, agent, tasks, twin) for source in (raw, scaled)] for twin in TWINS}
+        counts = {twin: tuple(len(raw[agent, task, twin]) for task in tasks) for twin in TWINS}
+        least = min(counts["full"] + counts["partial"])
+        base_least = min(len(raw[base, task, "full"]) for task in tasks)
+        full, partial = resampled[agent, "full"], resampled[agent, "partial"]
+        gaps[agent], pomdps[agent] = full[1] - partial[1], partial[1]
+        bias = means["full"][1] - _mean(scaled, base, tasks, "full")
+        rows.append(
+            AgentRow(
+                agent,
+                least,
+                percentile_interval(means["full"][0], full[0], confidence, least > 1),
+                percentile_interval(means["partial"][0], partial[0], confidence, least > 1),
+                percentile_interval(means["full"][1], full[1], confidence, least > 1),
+                percentile_interval(means["partial"][1], partial[1], confidence, least > 1),
+                percentile_interval(means["full"][1] - means["partial"][1], gaps[agent], confidence, least > 1),
+                percentile_interval(bias, full[1] - resampled[base, "full"][1], confidence, min(least, base_least) > 1),
+                measured_coverage(counts["full"], counts["partial"], confidence) if least > 1 else float("nan"),
+            )
+        )
+    return tuple(rows), gaps, pomdps
+
+
+def _mean(source: Cells, agent: str, tasks: Sequence[str], twin: str) -> float:
+    return float(np.mean([source[agent, task, twin].mean() for task in tasks]))
+
+
+def _plain(row: AgentRow, without: str) -> dict[str, Any]:
+    values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
+    for name in ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias"):
+        interval: Interval = getattr(row, name)
+        values |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return values | {"coverage": row.coverage}

@@ -1,0 +1,1 @@
+"""Benchmarks in which every frame is consumed."""

@@ -1,0 +1,86 @@
+"""``arcade-torch bench envs``."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from arcade_torch.tools.files import write_csv, write_json
+from arcade_torch.tools.tables import show_table
+
+
+@dataclass
+class BenchEnvs:
+    """Frames per second of games at several batch sizes, every frame consumed by a checksum.
+
+    Measures take turns; medians are shown. Beside frames/s stand GB/s and the share of a plain fill and of a plain
+    copy of the same bytes in the same run.
+
+    Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
+    """
+
+    games: tuple[str, ...] = ()
+    """Environment ids; every registered Easy game by default."""
+    sizes: tuple[int, ...] = (128,)
+    """Sides of the frames, 128 or 256."""
+    batches: tuple[int, ...] = (1, 16, 128, 512)
+    """Numbers of envs."""
+    seconds: float = 0.5
+    """For each measure in each repeat."""
+    repeats: int = 5
+    """Turns."""
+    out: Path | None = None
+    """File for the numbers, .csv or .json; overwritten."""
+
+    def run(self) -> int:
+        """Measure, print, save."""
+        if self.out is not None and self.out.suffix not in (".csv", ".json"):
+            raise ValueError(f"--out must end in .csv or .json, got {self.out}")
+        from arcade_torch.envs_jax import registered_ids
+        from arcade_torch.tools.bench.envs import NAMES, as_dicts, bench_envs, machine
+
+        games = self.games or tuple(name for name in registered_ids() if "Easy" in name)
+        about = machine()
+        rows = bench_envs(games, self.sizes, self.batches, self.seconds, self.repeats, lambda text: _tell(text))
+        for game in games:
+            for size in self.sizes:
+                chosen = [row for row in rows if row.game == game and row.obs_size == size]
+                show_table(
+                    f"{game}, {size} px, {about['jax_device']}, {about['cores']} cores",
+                    ("envs", "measure", "frames consumed", "frames/s", "with checksum", "GB/s", "of fill", "of copy"),
+                    [_cells(row, NAMES) for row in chosen],
+                    left=2,
+                )
+        print("frames/s without the checksum's time, and with it; medians of", self.repeats, "turns")
+        print(", ".join(f"{name} {value}" for name, value in about.items() if value))
+        if self.out is not None:
+            _save(self.out, as_dicts(rows), about)
+            print(self.out)
+        return 0
+
+
+COMMAND = BenchEnvs
+
+
+def _tell(text: str) -> None:
+    print(f"measuring {text}", file=sys.stderr, flush=True)
+
+
+def _cells(row: Any, names: dict[str, str]) -> Sequence[str]:
+    drawn = (f"{row.gb_per_s:.2f}", f"{100 * row.share_of_fill:.0f} %", f"{100 * row.share_of_copy:.0f} %")
+    return (
+        str(row.num_envs),
+        names[row.measure],
+        f"{row.frames:,}",
+        f"{row.frames_per_s:,.0f}",
+        f"{row.frames_per_s_with_check:,.0f}",
+        *(drawn if row.measure != "step" else ("", "", "")),
+    )
+
+
+def _save(path: Path, rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
+    if path.suffix == ".json":
+        write_json(path, {"machine": about, "rows": rows})
+    else:
+        write_csv(path, [{**row, **about} for row in rows], [*rows[0], *about])

@@ -1,0 +1,133 @@
+"""``arcade-torch train``."""
+
+import dataclasses
+import json
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from arcade_torch.agents.config import TrainConfig, preset
+from arcade_torch.tools import cli
+from arcade_torch.tools.train_bar import TrainBar
+
+_WHOLE = re.compile(r"\d+(\.\d*)?[eE]\+?\d+")
+
+
+@dataclass
+class Train:
+    """Train one agent into a run folder: settings, logs, checkpoints, final evaluation.
+
+    Options start from a preset (paper, small, demo, smoke); the resolved settings are kept in the folder's config.json.
+
+    Example: arcade-torch train --preset small --env MineSweeperEasy --observability partial --out runs/one
+    """
+
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")]
+    preset: str = "paper"
+    """Settings to start from."""
+    env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE, an option of the game; may be given several times."""
+    network_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE, an option of the network; may be given several times."""
+    out: Path | None = None
+    """Run folder; runs/ENV-OBSERVABILITY-MEMORY-SEED by default."""
+    resume: bool = False
+    """Go on with the run in that folder."""
+    words: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+    def folder(self) -> Path:
+        """The run folder."""
+        config = self.config
+        name = f"{config.env}-{config.observability}-{config.memory}-seed{config.seed}"
+        return self.out if self.out is not None else Path("runs") / name
+
+    def run(self) -> int:
+        """Train."""
+        from arcade_torch.agents import train
+        from arcade_torch.tools.studies.engines import watch_parent
+
+        watch_parent()
+        with TrainBar(str(self.folder())) as bar:
+            result = train(self.config, self.folder(), resume=self.resume, progress=bar.update)
+        if result.status == "interrupted":
+            raise KeyboardInterrupt
+        assert result.evaluation is not None
+        print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
+        print(f"finished: {self.folder()}")
+        return 0
+
+    def how_to_go_on(self) -> str:
+        """What to type after an interruption."""
+        words = [word for word in self.words if word != "--resume"]
+        return f"go on with: {shlex.join(['arcade-torch', 'train', *words, '--resume'])}"
+
+
+COMMAND = Train
+
+
+def parse(words: Sequence[str], prog: str) -> Train:
+    """Read the options; what is not given comes from the preset.
+
+    Args:
+        words: the options.
+        prog: the command, for messages.
+
+    Raises:
+        ValueError: an option or the preset is unknown, or a value is not allowed.
+    """
+    words = [_plain_number(word) for word in words]
+    name = _peek(words, "--preset") or "paper"
+    env = _peek(words, "--env")
+    base = preset(name, **({"env": env} if env else {}))
+    parsed: Train = cli.parse(Train, words, prog, Train(base, name))
+    given = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
+    changes = _changes(base, parsed.config, given, "")
+    for key, pairs in (("env_options", parsed.env_option), ("network_options", parsed.network_option)):
+        if pairs:
+            changes[key] = {**getattr(base, key), **dict(_pair(pair) for pair in pairs)}
+    return dataclasses.replace(parsed, config=preset(name, **changes), words=tuple(words))
+
+
+def _changes(base: Any, parsed: Any, given: set[str], prefix: str) -> dict[str, Any]:
+    """Fields that were given or differ, nested dataclasses as dictionaries."""
+    found: dict[str, Any] = {}
+    for item in dataclasses.fields(base):
+        old, new = getattr(base, item.name), getattr(parsed, item.name)
+        if dataclasses.is_dataclass(old):
+            inner = _changes(old, new, given, f"{prefix}{item.name}.")
+            if inner:
+                found[item.name] = inner
+        elif old != new or prefix + item.name in given:
+            found[item.name] = new
+    return found
+
+
+def _peek(words: Sequence[str], flag: str) -> str | None:
+    for index, word in enumerate(words):
+        if word == flag and index + 1 < len(words):
+            return words[index + 1]
+        if word.startswith(flag + "="):
+            return word.partition("=")[2]
+    return None
+
+
+def _plain_number(word: str) -> str:
+    """Write 2e7 as 20000000, which an option that counts can read."""
+    if _WHOLE.fullmatch(word) and float(word).is_integer():
+        return str(int(float(word)))
+    return word
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ValueError(f"an option is written NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value.lower() if value in ("True", "False") else value)
+    except json.JSONDecodeError:
+        return name, value

@@ -1,0 +1,1 @@
+"""Studies: a grid of runs in one file, run anywhere, resumable run by run."""

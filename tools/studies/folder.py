@@ -1,0 +1,199 @@
+"""The folder of a study, and what stands in the folders of its runs.
+
+::
+
+    study.json    the study, its versions, the command of every run
+    results.csv   one row a run, in the order of the grid
+    runs/NAME/    one run folder each (see `arcade_torch.agents`)
+    logs/NAME.log what the run printed
+    analysis/     numbers and figures made from the runs
+    report.html
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
+from arcade_torch.tools.studies.grid import RunSpec, Study
+from arcade_torch.tools.versions import versions
+
+RESULT_COLUMNS = (
+    "run",
+    "game",
+    "observability",
+    "memory",
+    "algorithm",
+    "seed",
+    "status",
+    "frames",
+    "seconds",
+    "eval_mean",
+    "eval_std",
+    "eval_n",
+    "train_max_ewm",
+    "error",
+)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is: environment steps done and wanted, and its status."""
+
+    frames: int
+    total_frames: int
+    status: str
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Read access to one run's folder; missing files mean "not yet"."""
+
+    path: Path
+
+    def exists(self) -> bool:
+        """Whether a run was ever started here."""
+        return (self.path / "config.json").exists() or (self.path / "progress.json").exists()
+
+    def final(self) -> dict[str, Any] | None:
+        """The content of ``eval.json`` if the run has finished, else None."""
+        file = self.path / "eval.json"
+        values = read_json(file) if file.exists() else None
+        return values if isinstance(values, dict) and values.get("status", "finished") == "finished" else None
+
+    def progress(self) -> Progress | None:
+        """What ``progress.json`` says, or None; a file just being replaced counts as none."""
+        try:
+            values = read_json(self.path / "progress.json")
+            return Progress(int(values["frames"]), int(values["total_frames"]), str(values.get("status", "running")))
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def config(self) -> dict[str, Any]:
+        """The resolved settings of the run, flat or nested as the trainer wrote them."""
+        values = self.record()
+        inner = values.get("config", values)
+        return dict(inner) if isinstance(inner, dict) else {}
+
+    def record(self) -> dict[str, Any]:
+        """All of ``config.json``: settings, versions, command."""
+        return dict(read_json(self.path / "config.json"))
+
+    def table(self, name: str) -> list[dict[str, str]]:
+        """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
+        file = self.path / name
+        return read_csv(file) if file.exists() else []
+
+
+@dataclass(frozen=True)
+class StudyFolder:
+    """A study on disk."""
+
+    root: Path
+
+    def run(self, spec: RunSpec) -> RunFolder:
+        """The folder of one run."""
+        return RunFolder(self.root / "runs" / spec.name)
+
+    def log(self, spec: RunSpec) -> Path:
+        """File with what the run printed."""
+        return self.root / "logs" / f"{spec.name}.log"
+
+    @property
+    def analysis(self) -> Path:
+        """Folder for numbers and figures made from the runs."""
+        return self.root / "analysis"
+
+    def load(self) -> Study:
+        """The study that was run here.
+
+        Raises:
+            FileNotFoundError: this is no study's folder.
+            ValueError: ``study.json`` is damaged.
+        """
+        file = self.root / "study.json"
+        if not file.exists():
+            raise FileNotFoundError(f"{self.root} is not the folder of a study: it has no study.json")
+        values = read_json(file)
+        try:
+            return Study.from_dict(values["study"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{file} does not describe a study: {error}") from error
+
+    def record(self) -> dict[str, Any]:
+        """All of ``study.json``."""
+        return dict(read_json(self.root / "study.json"))
+
+    def claim(self, study: Study, command: str = "") -> None:
+        """Write ``study.json``, or go on where the same study stands already.
+
+        The grid may grow between two invocations; what decides a run's result may not change.
+
+        Raises:
+            FileExistsError: the folder holds other files, or a study with other settings.
+        """
+        file = self.root / "study.json"
+        if file.exists():
+            before = self.load()
+            for key, old in before.fixed().items():
+                if old != study.fixed()[key]:
+                    raise FileExistsError(
+                        f"{self.root} holds study {before.name!r} with {key} = {old!r}, not {study.fixed()[key]!r}: "
+                        "choose another --out"
+                    )
+            names = {run.name for run in study.runs()}
+            gone = [run.name for run in before.runs() if run.name not in names]
+            if gone:
+                raise FileExistsError(f"{self.root} holds run {gone[0]}, which this study lacks: choose another --out")
+        elif self.root.exists() and any(self.root.iterdir()):
+            raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
+        commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
+        first, also = versions(), list[dict[str, str]]()
+        if file.exists():  # what the first runs were made with stays on record
+            old = self.record()
+            first, also = old.get("versions", first), list(old.get("also", []))
+            also += [] if versions() in (first, *also) else [versions()]
+        made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
+        write_json(file, made)
+
+    def write_results(self, study: Study, errors: dict[str, str] | None = None) -> list[dict[str, Any]]:
+        """Write ``results.csv`` from the run folders.
+
+        Args:
+            study: gives the order of the rows.
+            errors: run name -> why it failed in this invocation.
+
+        Returns:
+            The rows.
+        """
+        rows = [self._row(run, (errors or {}).get(run.name, "")) for run in study.runs()]
+        write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
+        return rows
+
+    def _row(self, run: RunSpec, error: str) -> dict[str, Any]:
+        folder = self.run(run)
+        final, progress = folder.final(), folder.progress()
+        row: dict[str, Any] = dict.fromkeys(RESULT_COLUMNS) | {
+            "run": run.name,
+            "game": run.game,
+            "observability": run.observability,
+            "memory": run.memory,
+            "algorithm": run.algorithm,
+            "seed": run.seed,
+            "status": "finished" if final else "failed" if error else "unfinished" if folder.exists() else "waiting",
+            "frames": progress.frames if progress else 0,
+            "error": error,
+        }
+        if final:
+            returns = [float(value) for value in final.get("returns", [])]
+            mean = float(final["mean"]) if "mean" in final else sum(returns) / len(returns)
+            spread = (sum((value - mean) ** 2 for value in returns) / max(1, len(returns) - 1)) ** 0.5
+            row |= {
+                "frames": final.get("frames", row["frames"]),
+                "seconds": final.get("seconds"),
+                "eval_mean": mean,
+                "eval_std": spread if returns else final.get("std"),
+                "eval_n": len(returns) or final.get("n"),
+                "train_max_ewm": final.get("train_max_ewm"),
+            }
+        return row

@@ -1,0 +1,209 @@
+"""What a study asks: a grid of runs, written in one TOML file."""
+
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+OBSERVABILITIES = ("full", "partial")
+_AXES = ("games", "observability", "memories", "algorithms", "seeds")
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One cell of the grid.
+
+    Attributes:
+        game: environment id.
+        observability: ``full`` (MDP) or ``partial`` (POMDP).
+        memory: name of the memory model.
+        algorithm: name of the learner.
+        seed: of everything random in the run.
+    """
+
+    game: str
+    observability: str
+    memory: str
+    algorithm: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of the run's folder: the same for the same cell, whatever else is in the grid."""
+        return f"{self.game}__{self.observability}__{self.memory}__{self.algorithm}__seed{self.seed}"
+
+
+@dataclass(frozen=True)
+class Study:
+    """A grid of trainings: games x observability x memories x algorithms x seeds.
+
+    Attributes:
+        name: of the study; letters, digits, dots, dashes.
+        games: environment ids.
+        memories: memory models; the memory-free control is one of them.
+        seeds: one run a seed.
+        observability: the twins, ``full`` and/or ``partial``.
+        algorithms: learners.
+        preset: settings that all runs start from.
+        total_frames: environment steps of each run; None keeps the preset's.
+        settings: further options of ``arcade-torch train``, for example ``{"pqn": {"gamma": 0.9}}``.
+        baseline: the memory-free agent, against which Bias is measured.
+        question: what the study asks, a sentence for its report.
+    """
+
+    name: str
+    games: tuple[str, ...]
+    memories: tuple[str, ...]
+    seeds: tuple[int, ...]
+    observability: tuple[str, ...] = OBSERVABILITIES
+    algorithms: tuple[str, ...] = ("pqn",)
+    preset: str = "paper"
+    total_frames: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    baseline: str = "mlp"
+    question: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the shape of the grid.
+
+        Raises:
+            ValueError: an axis is empty or repeats itself, or a value is out of range.
+            TypeError: an axis holds something of the wrong type.
+        """
+        if not isinstance(self.name, str) or not re.fullmatch(r"[\w.\-]+", self.name):
+            raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
+        for axis in _AXES:
+            _check_axis(axis, getattr(self, axis), int if axis == "seeds" else str)
+        unknown = [value for value in self.observability if value not in OBSERVABILITIES]
+        if unknown:
+            raise ValueError(f"observability must be among {', '.join(OBSERVABILITIES)}, got {unknown[0]!r}")
+        if self.total_frames is not None and (type(self.total_frames) is not int or self.total_frames < 1):
+            raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
+        clash = sorted(set(flatten(self.settings)) & {"env", "observability", "memory", "algorithm", "seed", "out"})
+        if clash:
+            raise ValueError(f"settings may not hold {clash[0]!r}: the grid decides it")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Study":
+        """Build a study from plain values, as they stand in a TOML or JSON file.
+
+        ``seeds = 3`` means ``[0, 1, 2]``; a single string stands for a list of one.
+
+        Raises:
+            ValueError: a key is unknown or missing, or a value is out of range.
+        """
+        known = [item.name for item in fields(cls)]
+        for key in values:
+            if key not in known:
+                raise ValueError(f"unknown key {key!r} in a study; known are {', '.join(known)}")
+        missing = [key for key in ("name", "games", "memories", "seeds") if key not in values]
+        if missing:
+            raise ValueError(f"a study needs {', '.join(missing)}")
+        ready = dict(values)
+        for axis in _AXES:
+            if axis in ready:
+                ready[axis] = _as_tuple(axis, ready[axis])
+        return cls(**ready)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Study":
+        """Read a study from a TOML file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is not TOML or not a study; names the file.
+        """
+        path = Path(path)
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            values.setdefault("name", path.stem)
+            return cls.from_dict(values)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"no study at {path}: give a TOML file with games, memories and seeds") from None
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for a JSON file; `from_dict` reads them back."""
+        values = asdict(self)
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+
+    def fixed(self) -> dict[str, Any]:
+        """What may not change between two invocations in one folder: everything that decides a run's result."""
+        return {"preset": self.preset, "total_frames": self.total_frames, "settings": flatten(self.settings)}
+
+    def runs(self) -> list[RunSpec]:
+        """All cells; seeds vary slowest, so that an unfinished study holds every agent once before any twice."""
+        cells = product(self.seeds, self.games, self.algorithms, self.memories, self.observability)
+        return [RunSpec(game, twin, memory, algorithm, seed) for seed, game, algorithm, memory, twin in cells]
+
+    def arguments(self, run: RunSpec, out: Path) -> list[str]:
+        """The words after ``arcade-torch`` that train one run of this study."""
+        words = ["train", "--preset", self.preset, "--env", run.game, "--observability", run.observability]
+        words += ["--memory", run.memory, "--algorithm", run.algorithm, "--seed", str(run.seed)]
+        if self.total_frames is not None:
+            words += ["--total-frames", str(self.total_frames)]
+        for key, value in flatten(self.settings).items():
+            words += _flag(key, value)
+        return [*words, "--out", str(out)]
+
+    def command(self, run: RunSpec, out: Path) -> str:
+        """The same as one line for a shell."""
+        return shlex.join(["arcade-torch", *self.arguments(run, out)])
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys.
+
+    Example:
+        >>> flatten({"device": "cpu", "pqn": {"gamma": 0.9}})
+        {'device': 'cpu', 'pqn.gamma': 0.9}
+    """
+    return dict(_flatten(values, prefix))
+
+
+def _flatten(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _flag(key: str, value: Any) -> list[str]:
+    head, dot, last = key.replace("_", "-").rpartition(".")
+    for table in ("env_options", "network_options"):
+        if key.startswith(f"{table}."):
+            return [f"--{table[:-1].replace('_', '-')}", f"{key.removeprefix(f'{table}.')}={value}"]
+    if isinstance(value, bool):
+        return [f"--{head}{dot}{'' if value else 'no-'}{last}"]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [f"--{head}{dot}{last}", *(str(item) for item in values)]
+
+
+def _as_tuple(axis: str, value: Any) -> tuple[Any, ...]:
+    if axis == "seeds" and type(value) is int:
+        if value < 1:
+            raise ValueError(f"seeds = {value}: give the number of seeds (at least 1) or a list")
+        return tuple(range(value))
+    if isinstance(value, str):
+        return (value,)
+    if isinstance(value, Sequence):
+        return tuple(value)
+    raise ValueError(f"{axis} must be a list, got {value!r}")
+
+
+def _check_axis(axis: str, values: tuple[Any, ...], kind: type) -> None:
+    if not values:
+        raise ValueError(f"{axis} is empty: a study needs at least one")
+    for value in values:
+        if type(value) is not kind:
+            raise TypeError(f"{axis} must hold {'whole numbers' if kind is int else 'names'}, got {value!r}")
+    if len(set(values)) != len(values):
+        raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
+    if kind is int and min(values) < 0:
+        raise ValueError(f"seeds must be 0 or more, got {min(values)}")
