@@ -1,0 +1,69 @@
+# One command each: `make demo` shows what memory did, `make test` passes the tests. Every target builds .venv if it is missing.
+#
+#   PYTHON=python3.12 make install     another interpreter (3.11, 3.12 or 3.13)
+#   make test WORKERS=4                more test processes
+#   make demo ARGS="--help"            ARGS goes to the command behind demo, bench, test and test-slow
+
+PYTHON  ?= python3
+WORKERS ?= 2
+ARGS    ?=
+
+VENV := .venv
+RUN  := $(VENV)/bin/python
+PIP  := $(RUN) -m pip install --quiet -c constraints.txt
+# Two test processes share two cores: one thread each is faster than two that fight.
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+.PHONY: help install demo test test-slow lint bench docs clean distclean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make install    build $(VENV) with the versions of constraints.txt"
+	@echo "make demo       a small study of memory, ending in an HTML report"
+	@echo "make test       the tests (make test-slow: the long ones)"
+	@echo "make lint       ruff and mypy"
+	@echo "make bench      frames per second of the environments"
+	@echo "make docs       these pages and the API reference in build/docs"
+	@echo "make clean      remove build output and caches (make distclean: and $(VENV))"
+
+install: $(VENV)/.installed
+
+# The stamp is written last: an interrupted installation is taken up again, a finished one is not repeated.
+$(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' || { \
+	  echo "arcade-torch needs Python 3.11, 3.12 or 3.13, and '$(PYTHON)' is not one: run 'make $(MAKECMDGOALS) PYTHON=python3.12'" >&2; exit 2; }
+	@echo "installing into $(VENV), a minute or more ..."
+	@$(RUN) -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	$(PIP) torch==2.13.0 setuptools wheel
+	$(PIP) --no-build-isolation -e '.[tools,dev]'
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.installed
+	$(PIP) --no-build-isolation -e '.[docs]'
+	@touch $@
+
+demo: install
+	$(VENV)/bin/arcade-torch demo $(ARGS)
+
+test: install
+	$(ONE_THREAD) $(RUN) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+test-slow: install
+	$(ONE_THREAD) $(RUN) -m pytest -m slow $(ARGS)
+
+lint: install
+	$(RUN) -m ruff check .
+	$(RUN) -m mypy
+
+bench: install
+	$(VENV)/bin/arcade-torch bench envs $(ARGS)
+
+docs: $(VENV)/.docs
+	$(RUN) docs/build.py build/docs
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf $(VENV)

@@ -1,0 +1,49 @@
+"""What all tests share: one thread a process, equal random numbers, markers that skip where they cannot run."""
+
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Before torch or JAX is imported: two test processes share the machine.
+for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+# Compilation makes the first example slow, and a red test has to stay red when it is run again.
+settings.register_profile(
+    "arcade",
+    deadline=None,
+    derandomize=True,
+    max_examples=20,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("arcade")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip `gpu` and `ray` tests with a reason where the machine lacks what they need."""
+    needing_gpu = [item for item in items if "gpu" in item.keywords]
+    needing_ray = [item for item in items if "ray" in item.keywords]
+    if needing_gpu and not _has_cuda():
+        for item in needing_gpu:
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+    if needing_ray and importlib.util.find_spec("ray") is None:
+        for item in needing_ray:
+            item.add_marker(pytest.mark.skip(reason="needs the ray extra: pip install 'arcade-torch[ray]'"))
+
+
+def _has_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()
+
+
+@pytest.fixture(autouse=True)
+def _same_random_numbers() -> Iterator[None]:
+    """Seed torch's global generator, so that a test does not depend on the ones that ran before it."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
+    yield

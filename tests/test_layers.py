@@ -1,0 +1,243 @@
+"""The arrows of docs/architecture.md, read from the source: nothing points up, nothing goes in circles."""
+
+import ast
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LINKED = ("envs_jax", "models", "agents", "tools")
+LAYERS = (*LINKED, "bridge")
+OTHERS = ("tests", "examples", "docs")
+
+# What each layer may know of the package, and which of the declared libraries it may see.
+TOOLS_EXTRAS = ("tyro", "rich", "tqdm", "matplotlib", "jinja2", "pygame", "tensorboard", "wandb", "ray")
+MAY_IMPORT = {
+    "envs_jax": {"envs_jax"},
+    "bridge": {"bridge", "envs_jax"},
+    "models": {"models"},
+    "agents": {"agents", "models", "bridge", "envs_jax"},
+    "tools": {"tools", "agents", "models", "bridge", "envs_jax"},
+}
+LIBRARIES = {
+    "envs_jax": {"jax", "jaxlib", "numpy"},
+    "bridge": {"torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy", "gymnasium"},
+    "models": {"torch", "torchrl", "tensordict", "numpy", "triton"},
+    "agents": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors"},
+    "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},
+}
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """All modules of the package by their dotted name."""
+    found = {}
+    for path in sorted((ROOT / "arcade_torch").glob("*.py")):
+        found["arcade_torch" if path.stem == "__init__" else f"arcade_torch.{path.stem}"] = path
+    for folder in LINKED:
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            name = ".".join(("arcade_torch", *parts))
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def layer_of(module: str) -> str:
+    """The layer a module of the package belongs to: one of the four linked folders, or the bridge."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in LINKED else "bridge"
+
+
+def imports(node: ast.AST) -> list[tuple[str, int]]:
+    """Every module that is imported anywhere below `node`, as (dotted name, line)."""
+    found = []
+    for child in ast.walk(node):
+        if isinstance(child, ast.Import):
+            found += [(alias.name, child.lineno) for alias in child.names]
+        elif isinstance(child, ast.ImportFrom):
+            base = "." * child.level + (child.module or "")
+            # `from arcade_torch import models` names the module models, `from arcade_torch import make` a function.
+            submodules = [f"{base}.{alias.name}" for alias in child.names if f"{base}.{alias.name}" in modules()]
+            found += [(name, child.lineno) for name in submodules or [base]]
+    return found
+
+
+def lazily_named(path: Path) -> list[str]:
+    """Modules that stand in a string handed to `import_module`, or in a table of lazy public names."""
+    strings = [node.value for node in ast.walk(tree(path)) if isinstance(node, ast.Constant)]
+    return [text for text in strings if isinstance(text, str) and text in modules()]
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_no_import_points_up(layer: str) -> None:
+    wrong = []
+    for name, path in modules().items():
+        if layer_of(name) != layer:
+            continue
+        named = [*imports(tree(path)), *((text, 0) for text in lazily_named(path))]
+        for target, line in named:
+            if target.split(".")[0] == "arcade_torch" and layer_of(target) not in MAY_IMPORT[layer]:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} ({layer}) imports {target} ({layer_of(target)})")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_a_layer_sees_only_the_libraries_that_are_its_business(layer: str) -> None:
+    allowed = LIBRARIES[layer] | sys.stdlib_module_names | {"arcade_torch"}
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} ({layer}) imports {target}"
+        for name, path in modules().items()
+        if layer_of(name) == layer
+        for target, line in imports(tree(path))
+        if target.split(".")[0] not in allowed
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_imports_of_the_package_are_absolute() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {target}"
+        for path in modules().values()
+        for target, line in imports(tree(path))
+        if target.startswith(".")
+    ]
+    assert not wrong, "write `from arcade_torch.models.scan import ...`:\n" + "\n".join(wrong)
+
+
+def test_nobody_imports_a_code_folder_by_its_bare_name() -> None:
+    everything = [*modules().values(), *(path for folder in OTHERS for path in (ROOT / folder).rglob("*.py"))]
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {target}"
+        for path in everything
+        for target, line in imports(tree(path))
+        if target.split(".")[0] in LINKED
+    ]
+    assert not wrong, "write `from arcade_torch.models.scan import ...`:\n" + "\n".join(wrong)
+
+
+def at_import_time(path: Path) -> list[str]:
+    """Modules of the package that are imported when this one is: not those inside functions or under TYPE_CHECKING."""
+    found: list[str] = []
+    todo: list[ast.stmt] = list(tree(path).body)
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found += [target for target, _ in imports(node) if target in modules()]
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            todo += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            todo += [child for child in ast.walk(node) if isinstance(child, ast.Import | ast.ImportFrom)]
+    return found
+
+
+def test_modules_import_each_other_without_circles() -> None:
+    graph = {name: set(at_import_time(path)) - {name} for name, path in modules().items()}
+    while graph:
+        leaves = {name for name, targets in graph.items() if not targets & graph.keys()}
+        assert leaves, f"a circle among: {', '.join(sorted(graph))}"
+        graph = {name: targets - leaves for name, targets in graph.items() if name not in leaves}
+
+
+@pytest.mark.parametrize("folder", LINKED)
+def test_the_code_folders_are_linked_into_the_package_by_relative_links(folder: str) -> None:
+    link = ROOT / "arcade_torch" / folder
+    assert link.is_symlink(), f"arcade_torch/{folder} has to be a symbolic link to ../{folder}"
+    assert link.readlink() == Path("..") / folder
+
+
+def loaded_after(statement: str) -> set[str]:
+    """Top-level modules in memory after `statement` ran in a fresh interpreter."""
+    code = f"{statement}\nimport sys\nprint(' '.join(sorted({{name.split('.')[0] for name in sys.modules}})))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("statement", "absent"),
+    [
+        ("import arcade_torch", {"torch", "tensordict", "torchrl", "jax", "numpy"}),
+        ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl"}),
+        ("import arcade_torch; arcade_torch.registered_ids()", {"torch", "tensordict", "torchrl"}),
+        ("import arcade_torch.models", {"jax", "jaxlib", "gymnasium"}),
+    ],
+)
+def test_importing_a_layer_loads_nothing_that_it_does_not_need(statement: str, absent: set[str]) -> None:
+    assert not loaded_after(statement) & absent
+
+
+def test_the_public_names_of_the_package_resolve() -> None:
+    import arcade_torch
+
+    for name in arcade_torch.__all__:
+        assert getattr(arcade_torch, name) is not None
+        assert name in dir(arcade_torch)
+    with pytest.raises(AttributeError, match=r"public names: ArcadeCollector"):
+        _ = arcade_torch.no_such_name
+
+
+def calls(path: Path) -> list[tuple[str, ast.Call]]:
+    found = []
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute | ast.Name):
+            found.append((ast.unparse(node.func), node))
+    return found
+
+
+def is_true(call: ast.Call, keyword: str) -> bool:
+    return any(
+        k.arg == keyword and isinstance(k.value, ast.Constant) and k.value.value is True for k in call.keywords
+    )
+
+
+def test_nothing_is_unpickled() -> None:
+    wrong = []
+    for path in modules().values():
+        where = path.relative_to(ROOT)
+        for target, line in imports(tree(path)):
+            if target.split(".")[0] in {"cloudpickle", "dill", "joblib", "shelve", "marshal"}:
+                wrong.append(f"{where}:{line} imports {target}")
+        # `import pickle` alone is no fault: its exceptions are what a corrupt checkpoint raises.
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.ImportFrom) and node.module == "pickle":
+                wrong += [f"{where}:{node.lineno} {a.name}" for a in node.names if not a.name.endswith("Error")]
+        for name, call in calls(path):
+            if name in {"pickle.load", "pickle.loads", "pickle.Unpickler"}:
+                wrong.append(f"{where}:{call.lineno} {name}")
+            if name == "torch.load" and not is_true(call, "weights_only"):
+                wrong.append(f"{where}:{call.lineno} torch.load without weights_only=True")
+            if name in {"np.load", "numpy.load", "jnp.load"} and is_true(call, "allow_pickle"):
+                wrong.append(f"{where}:{call.lineno} {name} with allow_pickle=True")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_files_and_functions_stay_small() -> None:
+    wrong = []
+    for path in modules().values():
+        lines = len(path.read_text(encoding="utf-8").splitlines())
+        if lines > MAX_FILE_LINES:
+            wrong.append(f"{path.relative_to(ROOT)}: {lines} lines, at most {MAX_FILE_LINES}")
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1 - docstring_lines(node)
+                if length > MAX_FUNCTION_LINES:
+                    wrong.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {length} lines")
+    assert not wrong, "\n".join(wrong)
+
+
+def docstring_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """How many lines the docstring takes: documentation does not make a function long."""
+    if ast.get_docstring(function) is None:
+        return 0
+    first = function.body[0]
+    return (first.end_lineno or first.lineno) - first.lineno + 1
