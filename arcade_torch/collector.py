@@ -5,6 +5,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
@@ -97,6 +98,7 @@ class ArcadeCollector(BaseCollector):
         self._compress, self._final_frames = compress, final_frames
         self._generator = torch.Generator(env.device)
         self._generator.manual_seed(int(torch.randint(2**31, ())))
+        self._endings = env.final_states()
         self._random = RandomActor(env.game.num_actions, self._generator)
         self._actor = self._make_actor(policy, store_states)
         self._reads = tuple(getattr(self._actor, "obs_keys", ROOT_KEYS))
@@ -168,6 +170,7 @@ class ArcadeCollector(BaseCollector):
         first_window = self._acted == 0
         window = self._look()
         window.begin(carry_context=not first_window)
+        self._endings.clear()
         first = 0 if first_window else self._context
         began_with = {key: value for key, value in (self._obs or {}).items() if key != "pixels"}
         random = self._frames < self.init_random_frames
@@ -175,6 +178,8 @@ class ArcadeCollector(BaseCollector):
             for step in range(first, window.length):
                 self._advance(window, step, random)
         window.finish(first, began_with)
+        for steps, rows, frames in self._endings.draw():
+            window.write_final_frames(steps, rows, self._compressed(frames))
         self._frames += self._num_envs * self._steps
         self._iter += 1
         return window, self._window_starts.popleft()
@@ -215,8 +220,8 @@ class ArcadeCollector(BaseCollector):
         frames = self._compressed(raw.pixels)
         if step == window.length - 1:
             window.write_tail(frames)
-        if raw.any_done:
-            self._keep_final_frames(window, step, raw)
+        if raw.any_done and self._final_frames != "none":
+            self._keep_final_states(step, raw)
         self._acted += 1
         self._obs = self._root_of(raw, action, ROOT_KEYS if step == window.length - 1 else self._reads)
         self._obs["pixels"] = frames
@@ -243,17 +248,14 @@ class ArcadeCollector(BaseCollector):
             action = self._random.draw(self._num_envs)
         return action, extras, state
 
-    def _keep_final_frames(self, window: Window, step: int, raw: RawStep) -> None:
-        """Draw and store the final frames that are wanted."""
-        if self._final_frames == "none":
-            return
-        outcome, device = raw.step.outcome, self.env.device
-        wanted = to_torch(outcome.done, device)
+    def _keep_final_states(self, step: int, raw: RawStep) -> None:
+        """Keep the final states whose frames are wanted."""
+        outcome = raw.step.outcome
+        wanted = np.asarray(outcome.done)
         if self._final_frames == "truncated":
-            wanted = to_torch(outcome.truncated, device) & ~to_torch(outcome.terminated, device)
-        rows = wanted.nonzero().squeeze(-1)
-        if len(rows):
-            window.write_final_frames(step, rows, self._compressed(self.env.final_frames(rows)))
+            wanted = np.asarray(outcome.truncated) & ~np.asarray(outcome.terminated)
+        if wanted.any():
+            self._endings.add(step, np.flatnonzero(wanted), raw.step)
 
     def _trajectories(self, window: Window) -> torch.Tensor:
         """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them."""

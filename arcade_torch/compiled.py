@@ -35,6 +35,9 @@ class CompiledGame:
     def __init__(self, game: Game[Any] | BatchedGame[Any]) -> None:
         self.batched: BatchedGame[Any] = game if isinstance(game, BatchedGame) else BatchedGame(game)
         self.step = jax.jit(self._step)
+        self.draw = jax.jit(
+            jax.vmap(self.batched.game.render)
+        )  # states [K, ...], partial bool [K] -> uint8 [K, S, S, 3]
 
     def _step(self, batch: Batch, action: jax.Array) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack the numbers."""

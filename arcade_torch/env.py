@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from arcade_torch import specs
 from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
 from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
+from arcade_torch.endings import FinalStates
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
 from arcade_torch.observability import Observability, partial_flags
@@ -20,8 +21,6 @@ from arcade_torch.snapshot import Snapshots
 
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
-# Final frames are drawn in portions of one size, an eighth of the batch but some frames at least: one compiled shape.
-_FINAL_FRAME_SHARE, _FINAL_FRAMES_AT_LEAST = 8, 4
 
 
 class RawStep(NamedTuple):
@@ -103,6 +102,7 @@ class ArcadeEnv(EnvBase):
         self._state_in_td = state_in_td
         keys = jax.device_put(env_keys(0, num_envs), jax_device)
         self._live = _Live(self._batched.init(keys, jax.device_put(flags.numpy(), jax_device)))
+        self._final_states = self.final_states()
         self._snapshots = Snapshots(self._live.batch, self.game.id, torch_device, jax_device)
         self._make_specs(categorical_actions)
         self._set_seed(seed)
@@ -217,31 +217,12 @@ class ArcadeEnv(EnvBase):
             meanwhile()
         frames = to_torch(step.pixels, self.device)  # waits; the argument must live until here
         any_done = bool(np.asarray(step.outcome.done).any())
-        self._live.advance(step.root, step.root._replace(state=step.final_state) if any_done else None)
+        self._live.batch = step.root
         return RawStep(frames, step, any_done)
 
-    def final_frames(self, rows: torch.Tensor) -> torch.Tensor:
-        """Draw the true final frames of episodes that ended in the last fused step.
-
-        Args:
-            rows: int64 [n], envs of the batch; those that did not end give their current frame.
-
-        Returns:
-            uint8 [n, S, S, 3].
-
-        Raises:
-            RuntimeError: No episode ended in the last step.
-        """
-        if self._live.ended is None:
-            raise RuntimeError("no episode ended in the last step: there is no final frame to draw")
-        size = min(self.num_envs, max(_FINAL_FRAMES_AT_LEAST, self.num_envs // _FINAL_FRAME_SHARE))
-        portions = []
-        for portion in rows.to("cpu", torch.int32).split(size):
-            index = np.zeros(size, np.int32)
-            index[: len(portion)] = portion.numpy()
-            frames = to_torch(self._batched.render_rows(self._live.ended, index), self.device)
-            portions.append(frames[: len(portion)])
-        return portions[0] if len(portions) == 1 else torch.cat(portions)
+    def final_states(self) -> FinalStates:
+        """Something to keep the final states of ended episodes in, which draws them when asked."""
+        return FinalStates(self._compiled, self.num_envs, self.device)
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
@@ -301,9 +282,10 @@ class ArcadeEnv(EnvBase):
         last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
         frames = raw.pixels
         if raw.any_done:
-            rows = to_torch(raw.step.outcome.done, self.device).nonzero().squeeze(-1)
+            self._final_states.add(0, np.flatnonzero(raw.step.outcome.done), raw.step)
             frames = raw.pixels.clone()
-            frames[rows] = self.final_frames(rows)
+            for _, rows, final in self._final_states.draw():
+                frames[rows] = final
         numbers = to_torch(raw.step.numbers, self.device)
         step_count, episode_reward = numbers[:, STEP_COUNT].to(torch.int64), numbers[:, EPISODE_REWARD]
         following = self._next(frames, last_action, step_count, episode_reward, raw.step.outcome)
@@ -376,18 +358,13 @@ class ArcadeEnv(EnvBase):
 class _Live:
     """The state of the env, outside of ``nn.Module``, whose attribute assignment is slow."""
 
-    __slots__ = ("batch", "ended", "generation")
+    __slots__ = ("batch", "generation")
 
     def __init__(self, batch: Batch) -> None:
         self.batch = batch
-        self.ended: Batch | None = None  # final states of the last fused step, if some episode ended in it
         self.generation = 0
 
-    def advance(self, batch: Batch, ended: Batch | None) -> None:
-        """Go on after a step."""
-        self.batch, self.ended = batch, ended
-
     def replace(self, batch: Batch) -> None:
-        """Put another state in place."""
-        self.batch, self.ended = batch, None
+        """Put another state in place, which the caller of ``step_raw`` has no frames of."""
+        self.batch = batch
         self.generation += 1

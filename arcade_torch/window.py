@@ -117,16 +117,22 @@ class Window:
                 self.extras[key] = torch.zeros(shape, dtype=value.dtype, device=self.device)
             self.extras[key][:, step] = value
 
-    def write_final_frames(self, step: int, rows: torch.Tensor, frames: torch.Tensor) -> None:
-        """Keep the final frames of the envs in ``rows`` (int64 [n]), whose episodes ended in ``step``."""
-        if step == self.length - 1:
-            self._tail_ended[rows] = True
-            self.pool.pixels[rows] = frames
-        else:
-            self._slots[rows, step] = self.pool.append(frames)
+    def write_final_frames(self, steps: torch.Tensor, rows: torch.Tensor, frames: torch.Tensor) -> None:
+        """Keep final frames, after the tail has been written.
+
+        Args:
+            steps: int64 [n], when the episodes ended.
+            rows: int64 [n], in which envs.
+            frames: uint8 [n, ...], in order of time.
+        """
+        last = steps == self.length - 1
+        count = int((~last).sum())
+        self._slots[rows[:count], steps[:count]] = self.pool.append(frames[:count])
+        self.pool.pixels[rows[count:]] = frames[count:]
+        self._tail_ended[rows[count:]] = True
 
     def write_tail(self, frames: torch.Tensor) -> None:
-        """Keep the frames after the last step, slots 0 to N-1; to be called before that step's final frames are."""
+        """Keep the frames after the last step, slots 0 to N-1."""
         self.pool.pixels[: self.num_envs] = frames
         self._tail_ended.zero_()
         self._slots[:, -1] = torch.arange(self.num_envs, device=self.device)

@@ -72,10 +72,19 @@ def first_sentence(module: str) -> str:
     return (import_module(module).__doc__ or "").strip().split("\n")[0]
 
 
+def resolve_lazy_names(module: str) -> None:
+    """Put the public names that a module imports on first use where pdoc looks for them."""
+    loaded = import_module(module)
+    for name in getattr(loaded, "__all__", ()):
+        setattr(loaded, name, getattr(loaded, name))
+
+
 def build_reference(target: Path) -> None:
     """Write a page for every public module, and one that lists them."""
     found = [module.name for module in pkgutil.walk_packages(arcade_torch.__path__, "arcade_torch.")]
     public = ["arcade_torch", *(name for name in found if not any(part.startswith("_") for part in name.split(".")))]
+    for name in public:
+        resolve_lazy_names(name)
     # Types that a library names in quotes and never exports are shown as they stand.
     warnings.filterwarnings("ignore", message="Error parsing type annotation", category=UserWarning)
     # Where a package has no __all__, pdoc finds its modules by itself as well.

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import Game
 
 Array = jax.Array
@@ -57,3 +58,8 @@ class StubGame(Game[State]):
         rows = [state.clock.count, serial, serial >> 8, serial >> 16, state.dice[0], state.dice[1], state.total]
         column = jnp.stack([jnp.asarray(row).astype(jnp.uint8) for row in rows] + [jnp.uint8(7)])
         return jnp.broadcast_to(column[:, None, None], (8, 8, 3))
+
+
+# Shared by all test modules, so that each is compiled once. In the second all envs end at once, in every fifth step.
+GAME = CompiledGame(StubGame())
+LOCKSTEP = CompiledGame(StubGame(risk=0.0, max_steps=5))

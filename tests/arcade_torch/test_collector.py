@@ -15,11 +15,9 @@ from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.frames import FramePool, next_pixels, shift_next
-from tests.arcade_torch.stub import StubGame
+from tests.arcade_torch.stub import GAME, LOCKSTEP
 
 N, T = 6, 8
-GAME = CompiledGame(StubGame())
-LOCKSTEP = CompiledGame(StubGame(risk=0.0, max_steps=5))
 
 
 def stub_env(game: CompiledGame = GAME, seed: int = 3, **options: Any) -> ArcadeEnv:
@@ -69,14 +67,14 @@ def tensors(batch: TensorDictBase) -> TensorDictBase:
 # -- the same data as TorchRL's ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("game", [GAME, LOCKSTEP])
-def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: CompiledGame) -> None:
-    windows, steps = 5, 200  # 1000 steps an env
+@pytest.mark.parametrize(("game", "steps"), [(GAME, 200), (LOCKSTEP, 24)])  # 1000 and 120 steps an env
+def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: CompiledGame, steps: int) -> None:
+    windows = 5
     options = {"frames_per_batch": N * steps, "total_frames": N * steps * windows}
     stock = torch.cat(list(Collector(stub_env(game), scripted, **options)), 1)
     ours = torch.cat(list(stub_collector(scripted, game, return_same_td=False, **options)), 1)
     rollout = stub_env(game).rollout(steps * windows, scripted, break_when_any_done=False)
-    assert ours["next", "done"].sum() > 500
+    assert ours["next", "done"].sum() > N * steps // 2
     assert ours.names == stock.names == [None, "time"]
     assert_same(ours, stock)
     assert_same(ours.exclude("collector"), rollout)

@@ -7,12 +7,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.factory import make
-from tests.arcade_torch.stub import StubGame
-
-GAME = CompiledGame(StubGame())
+from tests.arcade_torch.stub import GAME
 
 
 @pytest.mark.parametrize(
@@ -83,13 +80,6 @@ def test_a_tensordict_of_another_batch_size_is_refused() -> None:
     for step in (env.step, env.step_and_maybe_reset):
         with pytest.raises(RuntimeError, match="batch_size"):
             step(td.clone())
-
-
-def test_final_frames_without_an_end_are_refused() -> None:
-    env = ArcadeEnv(GAME, 3)
-    env.reset()
-    with pytest.raises(RuntimeError, match="no episode ended in the last step"):
-        env.final_frames(torch.tensor([0]))
 
 
 def broken(change: Any) -> TensorDict:

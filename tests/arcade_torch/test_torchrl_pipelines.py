@@ -17,12 +17,10 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from arcade_torch.collector import ArcadeCollector
-from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
-from tests.arcade_torch.stub import StubGame
+from tests.arcade_torch.stub import GAME
 
-N, T = 4, 16
-GAME = CompiledGame(StubGame())
+N, T = 6, 16
 
 
 def stub_env(**options: Any) -> ArcadeEnv:
@@ -125,7 +123,7 @@ def test_transforms_work_on_the_stock_path() -> None:
 
 
 def test_batches_go_into_a_memory_mapped_replay_buffer(tmp_path: Any) -> None:
-    buffer = ReplayBuffer(storage=LazyMemmapStorage(8, scratch_dir=tmp_path), batch_size=2)
+    buffer = ReplayBuffer(storage=LazyMemmapStorage(2 * N, scratch_dir=tmp_path), batch_size=2)
     for batch in ArcadeCollector(stub_env(), None, N * T, 2 * N * T):
         buffer.extend(batch)
         expected = batch.clone()

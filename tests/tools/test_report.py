@@ -110,7 +110,9 @@ def table(mlp: list[float], lru: list[float]) -> Any:
 
 def test_the_headline_claims_only_what_the_interval_allows() -> None:
     clear = words.gap_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "lru")
-    assert "memory narrows the observability gap by 0.70" in clear
+    assert ": over these three seeds memory narrows the observability gap by 0.70" in clear
+    many = words.gap_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "lru")
+    assert ": memory narrows the observability gap by 0.70" in many
     worse = words.gap_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "lru")
     assert "memory widens the observability gap by 0.70" in worse
     vague = words.gap_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "lru")

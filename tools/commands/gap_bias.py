@@ -53,7 +53,7 @@ class GapBiasCommand:
             for row in table.rows
         ]
         show_table(
-            f"gap and bias over {len(table.tasks)} tasks ({table.metric})",
+            f"gap and bias over {len(table.tasks)} task{'s' * (len(table.tasks) > 1)} ({table.metric})",
             ("agent", "seeds", "MDP raw", "POMDP raw", "MDP", "POMDP", "gap", "bias"),
             rows,
             caption(table.confidence, {row.seeds: row.coverage for row in table.rows}),

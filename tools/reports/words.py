@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias
 
+TRUSTED_COVERAGE = 0.85
+"""Below this measured coverage a difference is reported of the seeds that were run, not of the agent."""
+
 
 def number_words(count: int) -> str:
     """Small numbers as words.
@@ -40,7 +43,9 @@ def gap_sentence(table: GapBias, agent: str) -> str:
     seeds = number_words(min(base.seeds, row.seeds))
     if narrowed.excludes_zero:
         verb = "narrows" if narrowed.value > 0 else "widens"
-        return f"{facts}: memory {verb} the observability gap by {abs(narrowed.value):.2f}{_size(narrowed)}."
+        weak = min(base.coverage, row.coverage) < TRUSTED_COVERAGE
+        where = f"over these {seeds} seeds memory" if weak else "memory"
+        return f"{facts}: {where} {verb} the observability gap by {abs(narrowed.value):.2f}{_size(narrowed)}."
     direction = "smaller" if narrowed.value > 0 else "larger"
     return (
         f"{facts}: with memory the gap is {abs(narrowed.value):.2f} {direction}, but the interval{ends(narrowed)} "
