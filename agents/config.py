@@ -126,8 +126,10 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``paper``: the paper's settings and network; 10 M frames for CartPole, NoisyCartPole and AutoEncode, 20 M else.
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the last step of a
       window is trained in the next, no skip connection around the memory, the games' law of the published numbers.
-    * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core.
-    * ``demo``: ``small`` on MineSweeperEasy for 350 k frames.
+    * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core. Time
+      limits end like terminations: what comes after them is no part of the score, and short runs learn better so
+      (greedy return on POMDP MineSweeperEasy, MinGRU, two seeds each: 0.42 against 0.35 with ``"bootstrap"``).
+    * ``demo``: ``small`` on MineSweeperEasy for 400 k frames.
     * ``smoke``: ``small`` cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -216,6 +218,7 @@ _SMALL_PQN = PQNConfig(
     max_grad_norm=1.0,
     epsilon_share=0.4,
     warmup_steps=150,
+    time_limit="terminal",
 )
 _SMALL = TrainConfig(
     memory="mingru",
@@ -235,7 +238,7 @@ _PRESETS: dict[str, TrainConfig] = {
     ),
     "small": _SMALL,
     "demo": dataclasses.replace(
-        _SMALL, env="MineSweeperEasy", total_frames=350_000, eval_every=70_000, checkpoint_every=35_000
+        _SMALL, env="MineSweeperEasy", total_frames=400_000, eval_every=80_000, checkpoint_every=40_000
     ),
     "smoke": dataclasses.replace(
         _SMALL,

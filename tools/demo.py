@@ -10,7 +10,7 @@ from arcade_torch.tools.studies.progress import clock
 GAME = "MineSweeperEasy"
 
 
-def demo_study(frames: int = 350_000, seeds: int = 2) -> Study:
+def demo_study(frames: int = 400_000, seeds: int = 2) -> Study:
     """The demo's study: one game, both twins, one memory model and the memory-free control.
 
     Args:
@@ -25,7 +25,7 @@ def demo_study(frames: int = 350_000, seeds: int = 2) -> Study:
     return Study(
         name="demo",
         games=(GAME,),
-        memories=("mingru", "mlp"),
+        memories=("lru", "mlp"),
         seeds=tuple(range(seeds)),
         preset="demo",
         total_frames=frames,
