@@ -53,6 +53,7 @@ test-slow: install
 
 lint: install
 	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check --quiet .
 	$(RUN) -m mypy
 
 bench: install

@@ -9,7 +9,17 @@ Example:
     (128, 128, 3)
 """
 
-from arcade_torch.envs_jax import cartpole, minesweeper  # noqa: F401  (importing a game registers it)
+from arcade_torch.envs_jax import (  # noqa: F401  (importing a game registers it)
+    autoencode,
+    battleship,
+    breakout,
+    cartpole,
+    countrecall,
+    minesweeper,
+    navigator,
+    skittles,
+    tetris,
+)
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, env_keys
 from arcade_torch.envs_jax.game import ACTION_NAMES, NUM_ACTIONS, OBS_SIZES, Game
 from arcade_torch.envs_jax.registry import make, option_names, register, registered_ids, resolve_id

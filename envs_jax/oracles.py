@@ -12,12 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from arcade_torch.envs_jax.autoencode import AutoEncode
+from arcade_torch.envs_jax.autoencode.oracle import AutoEncodeFrames, AutoEncodeState
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
+from arcade_torch.envs_jax.battleship import BattleShip
+from arcade_torch.envs_jax.battleship.oracle import BattleShipFrames, BattleShipState
+from arcade_torch.envs_jax.breakout import Breakout
+from arcade_torch.envs_jax.breakout.oracle import BreakoutFrames, BreakoutState
 from arcade_torch.envs_jax.cartpole import CartPole
 from arcade_torch.envs_jax.cartpole.oracle import CartPoleFrames, CartPoleState
+from arcade_torch.envs_jax.countrecall import CountRecall
+from arcade_torch.envs_jax.countrecall.oracle import CountRecallFrames, CountRecallState
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Game, check_choice
 from arcade_torch.envs_jax.minesweeper import MineSweeper
 from arcade_torch.envs_jax.minesweeper.oracle import MineSweeperFrames, MineSweeperState
+from arcade_torch.envs_jax.navigator import Navigator
+from arcade_torch.envs_jax.navigator.oracle import NavigatorFrames, NavigatorState
+from arcade_torch.envs_jax.skittles import Skittles
+from arcade_torch.envs_jax.skittles.oracle import SkittlesFrames, SkittlesState
+from arcade_torch.envs_jax.tetris import Tetris
+from arcade_torch.envs_jax.tetris.oracle import TetrisFrames, TetrisState
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]
@@ -53,8 +67,15 @@ class RandomPlayer:
 
 
 _ORACLES: dict[type[Game[Any]], dict[str, Callable[[Any], Player]]] = {
+    AutoEncode: {"state": AutoEncodeState, "frames": AutoEncodeFrames},
+    CountRecall: {"state": CountRecallState, "frames": CountRecallFrames},
+    Breakout: {"state": BreakoutState, "frames": BreakoutFrames},
+    BattleShip: {"state": BattleShipState, "frames": BattleShipFrames},
+    Navigator: {"state": NavigatorState, "frames": NavigatorFrames},
     CartPole: {"state": CartPoleState, "frames": CartPoleFrames},
     MineSweeper: {"state": MineSweeperState, "frames": MineSweeperFrames},
+    Skittles: {"state": SkittlesState, "frames": SkittlesFrames},
+    Tetris: {"state": TetrisState, "frames": TetrisFrames},
 }
 
 

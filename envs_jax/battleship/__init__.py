@@ -1,0 +1,63 @@
+"""BattleShip: hunt hidden ships with a cursor."""
+
+from typing import Any
+
+from arcade_torch.envs_jax.battleship import rules as law
+from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
+from arcade_torch.envs_jax.battleship.picture import Screen
+from arcade_torch.envs_jax.battleship.rules import BattleShipState
+from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.registry import register
+
+
+class BattleShip(Game[BattleShipState]):
+    """Hit every cell of four hidden ships, of lengths 2, 3, 3 and 4, in a square sea.
+
+    Actions 0 to 3 move the cursor by one cell, 4 fires at the cell under it: a ship cell pays ``1 / 12``, water pays
+    nothing, and a cell that was shot at before costs ``2 / cells``. The game ends with the last ship cell, or with
+    ``cells / 2`` such repeats; ``2 * cells`` steps truncate it. Ships lie straight along either axis, may touch, and
+    are placed one after the other, each uniform over the places left. Returns lie in [-1, 1].
+
+    The MDP twin marks every shot, a cross for a hit and a ring for a miss; the POMDP twin shows the mark under the
+    cursor alone. The number of hits is shown in both.
+
+    Args:
+        level: Numbers of the difficulty.
+        id: Versioned id.
+        obs_size: 128 or 256.
+        rules: ``"reference"`` judges the repeats one shot late; the lowest return is then one repeat lower.
+
+    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: the end by repeats is not one shot late, the
+    cursor starts on any cell, a mark has one colour in both twins and at all times.
+    """
+
+    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
+        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        self.max_steps = level.max_steps
+        self.return_range = (-2 / level.cells * (level.max_repeats + (rules == "reference")), 1.0)
+        self.screen = Screen(obs_size, level)
+
+    def reset(self, key: Array) -> BattleShipState:
+        """See :meth:`Game.reset`."""
+        return law.reset(key, self.level)
+
+    def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
+        """See :meth:`Game.step`."""
+        return law.step(state, action, self.level, self.rules)
+
+    def render(self, state: BattleShipState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)
+
+
+def _factory(level: Level) -> Any:
+    """A factory with the signature that the registry reads the options from."""
+
+    def build(*, id: str, obs_size: int, rules: Rules) -> BattleShip:
+        return BattleShip(level, id=id, obs_size=obs_size, rules=rules)
+
+    return build
+
+
+for _name, _level in LEVELS.items():
+    register(f"{_name}-v0", _factory(_level))

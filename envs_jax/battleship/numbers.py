@@ -1,0 +1,39 @@
+"""The numbers of BattleShip."""
+
+from dataclasses import dataclass
+
+SHIPS = (2, 3, 3, 4)  # lengths, in the order of placement
+SHIP_CELLS = sum(SHIPS)  # hitting one pays 1 / SHIP_CELLS
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty.
+
+    Attributes:
+        side: Cells per side of the sea.
+    """
+
+    side: int
+
+    @property
+    def cells(self) -> int:
+        """Cells of the sea."""
+        return self.side**2
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit in steps."""
+        return 2 * self.cells
+
+    @property
+    def max_repeats(self) -> int:
+        """Shots at cells shot at before that end the game; each pays ``-2 / cells``."""
+        return self.cells // 2
+
+
+LEVELS = {
+    "BattleShipEasy": Level(8),
+    "BattleShipMedium": Level(10),
+    "BattleShipHard": Level(12),
+}

@@ -1,0 +1,123 @@
+"""The law of BattleShip: a cursor fires at cells of a sea that hides ships; boards are indexed [x, y].
+
+Source: POPGym Arcade (ICML 2026), environment appendix.
+"""
+
+from functools import reduce
+from operator import or_
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.battleship.numbers import SHIP_CELLS, SHIPS, Level
+from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.game import FIRE, Array, Rules
+
+
+class BattleShipState(NamedTuple):
+    """A sea, what has been shot at, a cursor, and three counters."""
+
+    x: Array  # int32, column of the cursor
+    y: Array  # int32, row of the cursor
+    board: Array  # int8 [side, side], 1 where a ship lies
+    guesses: Array  # int8 [side, side], 1 where a shot fell
+    hits: Array  # int32, ship cells hit; the number on the screen
+    repeats: Array  # int32, shots at cells shot at before
+    timestep: Array  # int32, steps taken
+
+
+def free_places(occupied: Array, length: int) -> Array:
+    """Where a ship fits: bool [2, side, side], its first cell if it lies along x, then along y.
+
+    Args:
+        occupied: bool [side, side], cells that are taken; touching them is allowed.
+        length: Cells of the ship.
+    """
+    side = occupied.shape[0]
+    padded = jnp.pad(occupied, (0, length - 1), constant_values=True)
+    along_x = reduce(or_, (padded[k : k + side, :side] for k in range(length)))
+    along_y = reduce(or_, (padded[:side, k : k + side] for k in range(length)))
+    return ~jnp.stack([along_x, along_y])
+
+
+def place_ship(draw: Array, occupied: Array, length: int) -> Array:
+    """Put a ship at one of the places where it fits.
+
+    Args:
+        draw: uint32, which of the places, counted round: a uniform draw picks each with equal chance (the remainder
+            favours some by less than one in ten million).
+        occupied: bool [side, side], cells that are taken.
+        length: Cells of the ship.
+
+    Returns:
+        bool [side, side], the cells of the new ship.
+    """
+    side = occupied.shape[0]
+    places = free_places(occupied, length).reshape(2 * side, side)
+    in_line = places.sum(1)
+    line, cell = jnp.arange(2 * side), jnp.arange(side)
+    # First the line that holds the chosen place, then the place in it: far cheaper than ranking all places.
+    before = jnp.sum(jnp.where(line < line[:, None], in_line, 0), 1)
+    rest = (draw % in_line.sum().astype(jnp.uint32)).astype(jnp.int32) - before
+    chosen = (rest >= 0) & (rest < in_line)
+    open_cells = (places & chosen[:, None]).any(0)
+    rank = jnp.sum((cell < cell[:, None]) & open_cells, 1)
+    y = jnp.sum(jnp.where(open_cells & (rank == jnp.sum(jnp.where(chosen, rest, 0))), cell, 0))
+    first = jnp.sum(jnp.where(chosen, line, 0))
+    x, lies_along_y = first % side, first >= side
+    columns, rows = cell[:, None] - x, cell - y
+    end_x, end_y = jnp.where(lies_along_y, 1, length), jnp.where(lies_along_y, length, 1)
+    return (columns >= 0) & (columns < end_x) & (rows >= 0) & (rows < end_y)
+
+
+def draw_board(key: Array, level: Level) -> Array:
+    """Ships one after the other, each uniform over the places left to it: int8 [side, side]."""
+    draws = jax.random.bits(key, (len(SHIPS),))
+    occupied = jnp.zeros((level.side, level.side), bool)
+    for draw, length in zip(draws, SHIPS, strict=True):
+        occupied |= place_ship(draw, occupied, length)
+    return occupied.astype(jnp.int8)
+
+
+def reset(key: Array, level: Level) -> BattleShipState:
+    """Ships anywhere without overlap, the cursor on any cell, nothing shot at."""
+    for_ships, for_cursor = jax.random.split(key)
+    x, y = jax.random.randint(for_cursor, (2,), 0, level.side, dtype=jnp.int32)
+    board, zero = draw_board(for_ships, level), jnp.int32(0)
+    return BattleShipState(x, y, board, jnp.zeros_like(board), zero, zero, zero)
+
+
+def step(
+    state: BattleShipState, action: Array, level: Level, rules: Rules
+) -> tuple[BattleShipState, Array, Array, Array]:
+    """Move the cursor, or fire at the cell under it.
+
+    By default the game ends when all ship cells are hit or the repeats reach their limit, and is cut at the time limit.
+    With ``rules="reference"`` a shot judges the repeats before it, one shot late, and a move never looks at them.
+
+    Returns:
+        New state, reward, terminated, truncated.
+    """
+    x, y = move_cursor(state.x, state.y, action, level.side)
+
+    fire = action == FIRE
+    here = cell_mask(state.x, state.y, level.side)
+    shot_before = jnp.any(here & (state.guesses == 1))
+    hit = fire & ~shot_before & jnp.any(here & (state.board == 1))
+    again = fire & shot_before
+
+    new = BattleShipState(
+        x,
+        y,
+        state.board,
+        jnp.where(here & fire, jnp.int8(1), state.guesses),
+        state.hits + hit,
+        state.repeats + again,
+        state.timestep + 1,
+    )
+    reward = jnp.where(hit, 1.0 / SHIP_CELLS, jnp.where(again, -2.0 / level.cells, 0.0))
+    late = fire & (state.repeats >= level.max_repeats)
+    bored = late if rules == "reference" else new.repeats >= level.max_repeats
+    won = new.hits >= SHIP_CELLS
+    return new, reward.astype(jnp.float32), won | bored, new.timestep >= level.max_steps

@@ -1,0 +1,38 @@
+"""The numbers of Breakout."""
+
+from dataclasses import dataclass
+
+ROWS, COLUMNS = 20, 10
+WALL_TOP = 1  # row of the uppermost bricks
+WALL_ROWS = 6
+BRICKS = WALL_ROWS * COLUMNS
+PADDLE_ROW = ROWS - 1
+START_ROW = 13  # of the ball
+START_COLUMN = 5  # of the paddle's left end, where that leaves all of it on the board
+MAX_STEPS = 2000
+
+_WEIGHTS = (15, 13, 11, 9, 7, 5)
+BRICK_REWARD = tuple(weight / (sum(_WEIGHTS) * COLUMNS) for weight in _WEIGHTS)  # by row; all bricks sum to 1
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty.
+
+    Attributes:
+        paddle: Width of the paddle in columns.
+    """
+
+    paddle: int
+
+    @property
+    def right(self) -> int:
+        """Rightmost column the paddle's left end can be in."""
+        return COLUMNS - self.paddle
+
+
+LEVELS = {
+    "BreakoutEasy": Level(6),
+    "BreakoutMedium": Level(5),
+    "BreakoutHard": Level(4),
+}

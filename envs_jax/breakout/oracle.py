@@ -1,0 +1,79 @@
+"""Scripted players of Breakout: one follows the ball, one follows where it must be."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from arcade_torch.envs_jax.breakout import rules as law
+from arcade_torch.envs_jax.breakout.numbers import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Level
+from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
+from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
+
+
+def follow(ball_x: Any, pos: Any, level: Level) -> npt.NDArray[np.int32]:
+    """The move that brings the paddle's middle under the ball: int32 [N]."""
+    goal = np.clip(np.asarray(ball_x) - level.paddle // 2, 0, level.right)
+    return np.where(goal > pos, RIGHT, np.where(goal < pos, LEFT, UP)).astype(np.int32)
+
+
+class BreakoutState:
+    """Sees the ball and keeps the paddle under it, which clears the wall."""
+
+    def __init__(self, game: Any) -> None:
+        self.level = game.level
+
+    def act(self, seen: Any, is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
+        return follow(seen.ball_x, seen.pos, self.level)
+
+
+class BreakoutFrames:
+    """Sees the POMDP's frames: carries the ball on by the known law while it is hidden.
+
+    Bricks and paddle are always seen. The ball is seen on its way up, the first of it in the first frame, so that two
+    frames tell all there is to know.
+    """
+
+    def __init__(self, game: Any) -> None:
+        self.level, self.board = game.level, game.screen.board
+        self.belief: Any = None  # a BreakoutState with numpy leaves
+        self.action = np.zeros(0, np.int32)
+
+        def carry_on(state: law.BreakoutState, action: jax.Array) -> law.BreakoutState:
+            return law.step(state, action, game.level, game.rules)[0]
+
+        self._carry_on = jax.jit(jax.vmap(carry_on))
+
+    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
+        codes = self.board.read(seen, ROWS, COLUMNS)
+        kinds, marks = codes % KINDS, codes // KINDS
+        ball = (marks == BALL).reshape(len(seen), -1)
+        shown, cell = ball.any(1), ball.argmax(1)
+        x, y = cell % COLUMNS, cell // COLUMNS
+        pos = (kinds[:, PADDLE_ROW] > 0).argmax(1)
+        bricks = kinds[:, WALL_TOP : WALL_TOP + WALL_ROWS] > 0
+
+        if self.belief is None or len(self.action) != len(seen):
+            zero = np.zeros(len(seen), np.int32)
+            self.belief = law.BreakoutState._make([zero, zero, zero, zero, zero, zero, bricks, zero > 0, zero, zero])
+        else:
+            self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
+        belief = self.belief
+        # At first sight the ball is taken to make for the nearer wall; the second tells.
+        guess = np.where(x * 2 >= COLUMNS, law.UP_RIGHT, law.UP_LEFT)
+        wrong = shown & ((x != belief.ball_x) | (y != belief.ball_y))
+        turned = np.where(is_init, guess, np.where(wrong, belief.ball_dir ^ law.SIDEWAYS, belief.ball_dir))
+        self.belief = belief._replace(
+            ball_x=np.where(shown, x, belief.ball_x).astype(np.int32),
+            ball_y=np.where(shown, y, belief.ball_y).astype(np.int32),
+            ball_dir=turned.astype(np.int32),
+            pos=pos.astype(np.int32),
+            bricks=bricks,
+            strike=belief.strike & ~is_init,
+        )
+        self.action = follow(self.belief.ball_x, pos, self.level)
+        return self.action

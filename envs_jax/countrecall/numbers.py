@@ -1,0 +1,30 @@
+"""The numbers of CountRecall."""
+
+from dataclasses import dataclass
+
+MOVE_BUDGET = 100  # counter moves that fit in an episode: one step a card is spent on confirming it
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty.
+
+    Attributes:
+        cards: Turns of an episode; a right answer pays ``1 / cards``.
+        suits: How many suits there are.
+    """
+
+    cards: int
+    suits: int
+
+    @property
+    def most(self) -> int:
+        """Cards of the most frequent suit, an upper bound of every answer."""
+        return -(-self.cards // self.suits)
+
+
+LEVELS = {
+    "CountRecallEasy": Level(26, 2),
+    "CountRecallMedium": Level(52, 2),
+    "CountRecallHard": Level(78, 4),
+}

@@ -1,0 +1,64 @@
+"""The law of CountRecall: in every turn say how often a suit has been dealt before.
+
+Source: POPGym Arcade (ICML 2026), environment appendix.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.cards import deal
+from arcade_torch.envs_jax.countrecall.numbers import Level
+from arcade_torch.envs_jax.game import DOWN, FIRE, UP, Array, Rules
+
+
+class CountRecallState(NamedTuple):
+    """Two packs of cards, a counter, and how far the player is."""
+
+    cards: Array  # int8 [cards], suits in the order they are dealt
+    queries: Array  # int8 [cards], suit asked for in each turn
+    timestep: Array  # int32, turns confirmed; card and query `timestep` are on the table while there are any
+    answer: Array  # int32, what the counter shows
+    score: Array  # int32, right answers
+    moves: Array  # int32, steps taken
+
+
+def reset(key: Array, level: Level) -> CountRecallState:
+    """Two independent uniformly random orders of a pack with suits as even as can be; the counter at 0."""
+    cards, queries = deal(key, 2, level.cards, level.suits)
+    zero = jnp.int32(0)
+    return CountRecallState(cards, queries, zero, zero, zero, zero)
+
+
+def step(
+    state: CountRecallState, action: Array, level: Level, max_steps: int, rules: Rules
+) -> tuple[CountRecallState, Array, Array, Array]:
+    """Move the counter, or confirm what it shows.
+
+    The card on the table does not count yet: the right answer of the first turn is 0. By default the counter stays
+    between 0 and the size of the largest suit; with ``rules="reference"`` it goes anywhere.
+
+    Returns:
+        New state, reward, terminated, truncated.
+    """
+    answer = state.answer + (action == UP) - (action == DOWN)
+    if rules == "default":
+        answer = jnp.clip(answer, 0, level.most)
+
+    confirm = action == FIRE
+    index = jnp.arange(level.cards)
+    now = index == state.timestep
+    query = jnp.where(now, state.queries, 0).sum()
+    dealt = ((index < state.timestep) & (state.cards == query)).sum()
+    right = confirm & now.any() & (answer == dealt)
+
+    new = CountRecallState(
+        state.cards,
+        state.queries,
+        state.timestep + confirm,
+        answer,
+        state.score + right,
+        state.moves + 1,
+    )
+    reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
+    return new, reward, new.timestep >= level.cards, new.moves >= max_steps

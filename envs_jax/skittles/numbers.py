@@ -1,0 +1,32 @@
+"""The numbers of Skittles."""
+
+from dataclasses import dataclass
+
+CELLS = 10  # rows and columns of the grid
+MAX_STEPS = 100  # time limit; each step pays 1 / MAX_STEPS
+COLOURS = 7  # blocks take turns through as many colours
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty: the lane, where blocks fall and the agent may stand.
+
+    Attributes:
+        width: Columns of the lane.
+        first: Its leftmost column.
+    """
+
+    width: int
+    first: int
+
+    @property
+    def last(self) -> int:
+        """Rightmost column of the lane."""
+        return self.first + self.width - 1
+
+
+LEVELS = {
+    "SkittlesEasy": Level(8, 1),
+    "SkittlesMedium": Level(7, 2),
+    "SkittlesHard": Level(6, 2),
+}

@@ -1,0 +1,59 @@
+"""The screen of Skittles: coloured blocks and a white agent on black, without grid lines."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from arcade_torch.envs_jax.game import Array
+from arcade_torch.envs_jax.render import (
+    TileGrid,
+    blank,
+    grid_layout,
+    lined_board,
+    number_slot,
+    titled_background,
+)
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    BLUE,
+    CANARY,
+    GREEN,
+    ORANGE,
+    RED,
+    SKY,
+    SPRING_GREEN,
+    ULTRAVIOLET,
+    WHITE,
+    YELLOW,
+)
+from arcade_torch.envs_jax.skittles.numbers import CELLS, MAX_STEPS
+from arcade_torch.envs_jax.skittles.rules import SkittlesState, shown
+
+BLOCKS = (RED, ORANGE, YELLOW, GREEN, BLUE, SKY, ULTRAVIOLET)
+AGENT = 1 + len(BLOCKS)  # tile codes: empty, then the blocks by colour, then the agent
+
+
+class Screen:
+    """Everything on the screen of Skittles.
+
+    Args:
+        size: Side of the picture, 128 or 256.
+    """
+
+    board: TileGrid
+
+    def __init__(self, size: int) -> None:
+        layout = grid_layout(size, CELLS)
+        tiles = [blank(layout.tile, layout.tile, colour) for colour in (BLACK, *BLOCKS, WHITE)]
+        background = titled_background(size, "SKITTLES", BLACK, CANARY)
+        self.background, self.board = lined_board(background, layout, tiles, BLACK)
+        self.score = number_slot(size, MAX_STEPS, BLACK, SPRING_GREEN)
+
+    def draw(self, state: SkittlesState, partial: Array | bool) -> Array:
+        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows each block in about half of the frames."""
+        visible = shown(state) | ~jnp.asarray(partial)
+        columns = np.arange(CELLS)
+        here = (columns == state.column[:, None]) & visible[:, None]
+        codes = jnp.where(here, 1 + state.colour[:, None], 0)
+        agent = (columns[:, None] == CELLS - 1) & (columns == state.x)
+        frame = self.score.draw(jnp.asarray(self.background), state.time)
+        return self.board.draw(frame, jnp.where(agent, AGENT, codes))
