@@ -121,7 +121,7 @@ def test_long_random_rollouts_keep_the_contract(id, rules):
     assert frames.dtype == np.uint8 and frames.shape == (64, 128, 128, 3)
     assert all(len(np.unique(frame)) > 2 for frame in np.asarray(frames)), "a blank frame"
     if game.game.max_steps < 130:
-        assert len(returns) > 64, "every env ought to have finished an episode"
+        assert len(returns) >= 64, "every env ought to have finished an episode"
     assert all(low - 1e-5 <= value <= high + 1e-5 for value in returns)
     assert longest <= game.game.max_steps + (rules == "reference")
 
