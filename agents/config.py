@@ -129,7 +129,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core. Time
       limits end like terminations: what comes after them is no part of the score, and short runs learn better so
       (greedy return on POMDP MineSweeperEasy, MinGRU, two seeds each: 0.42 against 0.35 with ``"bootstrap"``).
-    * ``demo``: ``small`` on MineSweeperEasy for 500 k frames.
+    * ``demo``: ``small`` on MineSweeperEasy for 400 k frames.
     * ``smoke``: ``small`` cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -238,12 +238,7 @@ _PRESETS: dict[str, TrainConfig] = {
     ),
     "small": _SMALL,
     "demo": dataclasses.replace(
-        _SMALL,
-        env="MineSweeperEasy",
-        total_frames=500_000,
-        eval_every=100_000,
-        eval_episodes=256,
-        checkpoint_every=50_000,
+        _SMALL, env="MineSweeperEasy", total_frames=400_000, eval_every=80_000, checkpoint_every=40_000
     ),
     "smoke": dataclasses.replace(
         _SMALL,

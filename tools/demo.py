@@ -10,7 +10,7 @@ from arcade_torch.tools.studies.progress import clock
 GAME = "MineSweeperEasy"
 
 
-def demo_study(frames: int = 500_000, seeds: int = 2) -> Study:
+def demo_study(frames: int = 400_000, seeds: int = 2) -> Study:
     """The demo's study: one game, both twins, one memory model and the memory-free control.
 
     Args:

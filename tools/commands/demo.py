@@ -15,7 +15,7 @@ class Demo:
     Example: arcade-torch demo --frames 60000 --seeds 1 --out runs/taste
     """
 
-    frames: int = 500_000
+    frames: int = 400_000
     """Environment steps of each run; below about 200000 the agents learn little."""
     seeds: int = 2
     """Runs of each agent and twin."""
