@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.battleship.numbers import SHIPS
 from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
-from arcade_torch.envs_jax.minesweeper.oracle import read_board, towards
+from arcade_torch.envs_jax.minesweeper.oracle import towards
 
 Board = npt.NDArray[Any]
 UNKNOWN, WATER, SHIP = -1, 0, 1
@@ -56,7 +56,7 @@ class BattleShipFrames:
         if len(self.known) != len(seen):
             self.known = np.full((len(seen), side, side), UNKNOWN)
         self.known[is_init] = UNKNOWN
-        codes = read_board(seen, self.screen.board, side).swapaxes(1, 2)  # [N, column, row]
+        codes = self.screen.board.read(seen, side, side).swapaxes(1, 2)  # [N, column, row]
         cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
         x, y = cursor // side, cursor % side
         mark = codes[envs, x, y] - KINDS

@@ -81,7 +81,7 @@ class MineSweeperFrames:
         if len(self.known) != len(seen):
             self.known = np.full((len(seen), side, side), -1)
         self.known[is_init] = -1
-        codes = read_board(seen, self.screen.board, side)  # [N, row, column]
+        codes = self.screen.board.read(seen, side, side)  # [N, row, column]
         cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
         y, x = cursor // side, cursor % side
         number = codes[envs, y, x] - KINDS - 1
@@ -94,23 +94,6 @@ class MineSweeperFrames:
         cost = np.where(risk < 0.02, 0.0, risk) + 1e-3 * distance
         goal = cost.reshape(len(seen), -1).argmin(1)
         return towards(x, y, goal % side, goal // side)
-
-
-def read_board(frames: npt.NDArray[np.uint8], board: Any, side: int) -> npt.NDArray[np.int64]:
-    """Which tile each cell shows, by comparing pixels with the atlas: int64 [N, rows, columns].
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        board: The :class:`~arcade_torch.envs_jax.render.TileGrid` drawn on them.
-        side: Cells per side.
-    """
-    pitch = board.atlas.shape[1]
-    area = frames[:, board.y : board.y + side * pitch, board.x : board.x + side * pitch]
-    tiles = area.reshape(len(frames), side, pitch, side, pitch, 3).swapaxes(2, 3).reshape(len(frames), side, side, -1)
-    codes = np.full(tiles.shape[:3], -1)
-    for code, picture in enumerate(board.atlas.reshape(len(board.atlas), -1)):
-        codes[(tiles == picture).all(-1)] = code
-    return codes
 
 
 def block_sum(values: Board) -> Board:

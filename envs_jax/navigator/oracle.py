@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import FIRE
-from arcade_torch.envs_jax.minesweeper.oracle import read_board
 from arcade_torch.envs_jax.navigator.picture import KINDS
 from arcade_torch.envs_jax.navigator.rules import TNT, TREASURE
 
@@ -80,7 +79,7 @@ class NavigatorFrames(_Walker):
 
     def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        codes = read_board(seen, self.screen.board, self.side).swapaxes(1, 2)  # [N, x, y]
+        codes = self.screen.board.read(seen, self.side, self.side).swapaxes(1, 2)  # [N, x, y]
         self.remember(codes % KINDS, is_init)
         place = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
         return self.walk(place // self.side, place % self.side)

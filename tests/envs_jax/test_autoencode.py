@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.cards import deal
 from arcade_torch.envs_jax.cartpole.oracle import read_slot
-from arcade_torch.envs_jax.minesweeper.oracle import read_board
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import BLACK, RED, SMOKE
 from arcade_torch.envs_jax.render.suits import suit_mask, suit_pictures
@@ -46,7 +45,7 @@ def run(game, state, actions):
 
 def read_history(frames, screen, rows=9):
     """Codes of the history, int [N, rows * 9]."""
-    return read_board(frames[:, :, : screen.history.x + 9 * screen.history.atlas.shape[1]], screen.history, 9)[
+    return screen.history.read(frames[:, :, : screen.history.x + 9 * screen.history.atlas.shape[1]], 9, 9)[
         :, :rows
     ].reshape(len(frames), -1)
 

@@ -15,7 +15,6 @@ from arcade_torch.envs_jax.battleship.numbers import SHIPS
 from arcade_torch.envs_jax.battleship.oracle import ship_scores
 from arcade_torch.envs_jax.battleship.picture import COVERED, HIT, KINDS, MISS
 from arcade_torch.envs_jax.battleship.rules import place_ship
-from arcade_torch.envs_jax.minesweeper.oracle import read_board
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.render.palette import BRASS, NICKEL, RED
 
@@ -225,7 +224,7 @@ def test_all_marks_and_the_cursor_can_be_read_back(id, size):
     state = jax.tree.map(np.asarray, batch.state)
     for partial in (False, True):
         frames = np.asarray(compiled.render(batch._replace(partial=jnp.full(8, partial))))
-        codes = read_board(frames, game.screen.board, side)
+        codes = game.screen.board.read(frames, side, side)
         expected = np.where(guesses == 1, np.where(state.board == 1, HIT, MISS), COVERED)
         if partial:
             elsewhere = np.ones(expected.shape, bool)
@@ -240,7 +239,7 @@ def test_a_mark_appears_in_both_twins_in_the_frame_after_its_shot():
     before = sea(game, ships=[(2, 3)], x=2, y=3)
     after = step(game, before, FIRE)[0]
     for partial in (False, True):
-        codes = [read_board(draw(game, state, partial)[None], game.screen.board, 8)[0] for state in (before, after)]
+        codes = [game.screen.board.read(draw(game, state, partial)[None], 8, 8)[0] for state in (before, after)]
         assert (codes[0][3, 2], codes[1][3, 2]) == (KINDS, KINDS + HIT)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import env_keys, make
-from arcade_torch.envs_jax.minesweeper.oracle import mine_chances, read_board
+from arcade_torch.envs_jax.minesweeper.oracle import mine_chances
 from arcade_torch.envs_jax.minesweeper.picture import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_MINE, SWEPT
 
@@ -164,7 +164,7 @@ def test_template_matching_recovers_every_number_at_every_size(id, size):
     for action in random_actions(60, 24, seed=8):
         states.append(compiled.step(states[-1], action)[0])
     for batch in states[:: len(states) // 4]:
-        codes = read_board(np.asarray(compiled.render(batch)), game.screen.board, side)
+        codes = game.screen.board.read(np.asarray(compiled.render(batch)), side, side)
         state = jax.tree.map(np.asarray, batch.state)
         expected = np.where(state.grid == SWEPT, 1 + state.neighbours, 0)
         expected[np.arange(24), state.x, state.y] += KINDS
@@ -178,7 +178,7 @@ def test_the_pomdp_shows_the_number_under_the_cursor_alone(id):
     grid = np.full((game.level.side,) * 2, SWEPT, np.int8)
     neighbours = (np.arange(grid.size) % 9).reshape(grid.shape)
     state = one(game, x=2, y=1, grid=grid, neighbours=neighbours)
-    codes = read_board(draw(game, state, True)[None], game.screen.board, game.level.side)[0]
+    codes = game.screen.board.read(draw(game, state, True)[None], game.level.side, game.level.side)[0]
     assert codes[1, 2] == KINDS + 1 + neighbours[2, 1]
     assert (np.delete(codes.ravel(), game.level.side + 2) == 0).all()
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from arcade_torch.envs_jax import env_keys, make
-from arcade_torch.envs_jax.minesweeper.oracle import read_board
 from arcade_torch.envs_jax.navigator.oracle import FAR, path_lengths
 from arcade_torch.envs_jax.navigator.picture import KINDS
 from arcade_torch.envs_jax.navigator.rules import FREE, TNT, TREASURE, draw_distinct
@@ -234,7 +233,7 @@ def test_map_and_agent_can_be_read_back(id, size):
             frames = np.asarray(compiled.render(batch._replace(partial=jnp.full(8, partial))))
             expected = (board if not (partial and timestep) else 0 * board).astype(int)
             expected[np.arange(8), agent] += KINDS
-            codes = read_board(frames, game.screen.board, side)
+            codes = game.screen.board.read(frames, side, side)
             assert np.array_equal(codes, expected.reshape(8, side, side).swapaxes(1, 2))
 
 
