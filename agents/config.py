@@ -127,8 +127,8 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the last step of a
       window is trained in the next, no skip connection around the memory, the games' law of the published numbers.
     * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core. Time
-      limits end like terminations: what comes after them is no part of the score, and short runs learn better so
-      (greedy return on POMDP MineSweeperEasy, MinGRU, two seeds each: 0.42 against 0.35 with ``"bootstrap"``).
+      limits end like terminations: what comes after them is no part of the score. Which of the two learns better in
+      runs this short is not settled.
     * ``demo``: ``small`` on MineSweeperEasy for 400 k frames.
     * ``smoke``: ``small`` cut down until a run takes seconds; it learns nothing.
 
