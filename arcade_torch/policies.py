@@ -10,7 +10,7 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
 Extras = dict[NestedKey, torch.Tensor]
-ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward")
+ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward", "task")  # task: if there are several
 
 
 @runtime_checkable
@@ -28,8 +28,8 @@ class Actor(Protocol):
         """Choose actions.
 
         Args:
-            obs: TensorDict [N], the root: pixels, last_action, is_init, step_count, episode_reward. Where ``is_init``
-                is true the actor has to begin from a fresh state.
+            obs: TensorDict [N], the root: pixels, last_action, is_init, step_count, episode_reward, and task where
+                several games are played. Where ``is_init`` is true the actor has to begin from a fresh state.
             state: TensorDict [N], the state that the last call returned. Not to be changed in place.
 
         Returns:
@@ -100,7 +100,7 @@ class ModuleActor:
                 default = primer.default_value.get(key, 0.0) if hasattr(primer.default_value, "get") else 0.0
                 shape = spec.shape[len(primer.primers.shape) :]
                 zeros = torch.zeros((batch_size, *shape), dtype=spec.dtype, device=self._device)
-                state[key] = zeros + (default() if callable(default) else default)
+                state[key] = (zeros + (default() if callable(default) else default)).to(spec.dtype)
         self._check_primed(state)
         self._first = state
         return state.clone()

@@ -1,13 +1,13 @@
 """What a memory model is: two methods, and the shared half of ours."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-__all__ = ["Memory", "MemoryContract", "ReplayableMemory", "replay"]
+__all__ = ["Memory", "MemoryContract", "ReplayableMemory", "replay", "replay_by_steps"]
 
 
 @runtime_checkable
@@ -63,6 +63,13 @@ def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) ->
     """
     if isinstance(memory, ReplayableMemory):
         return memory.replay(x, stored, is_init)
+    return replay_by_steps(memory, x, stored, is_init)
+
+
+def replay_by_steps(
+    memory: Callable[..., tuple[Tensor, TensorDict]], x: Tensor, stored: TensorDict, is_init: Tensor
+) -> tuple[Tensor, TensorDict]:
+    """The same, one call a step (slow): what :func:`replay` falls back to, and the oracle of ``replay`` methods."""
     state, carried_on = stored[:, 0], torch.zeros_like(is_init[:, :1])
     outputs, states = [], []
     for t in range(x.shape[1]):
@@ -75,9 +82,11 @@ def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) ->
 
 
 class Memory(nn.Module):
-    """Base of the memory models of this package whose state is one tensor ``"h"``.
+    """Base of the memory models of this package: sizes, initial state, and clear errors.
 
-    A model says what shape its state has (``state_shape``, None for none) and implements :meth:`run`.
+    A model whose state is one tensor ``"h"``, of which it can afford one per step, says what shape that has
+    (``state_shape``, None for no state) and implements :meth:`run`. Others override :meth:`state_leaves`, ``forward``
+    and ``replay``.
 
     Args:
         input_size: D, features per step.
@@ -88,6 +97,9 @@ class Memory(nn.Module):
     """
 
     state_shape: tuple[int, ...] | None = None
+    averages_values = False
+    """Whether every output is a function of the input and of a weighted mean over the episode's steps, as in softmax
+    and linear attention; ``check_memory`` then has one more law."""
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()
@@ -109,15 +121,19 @@ class Memory(nn.Module):
         """
         raise NotImplementedError
 
+    def state_leaves(self) -> dict[str, tuple[tuple[int, ...], torch.dtype | None]]:
+        """Shape, without the batch, and dtype (None: that of the parameters) of every tensor in the state."""
+        return {} if self.state_shape is None else {"h": (self.state_shape, None)}
+
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See :class:`MemoryContract`."""
-        self._check(x, is_init)
+        self._check(x, state, is_init)
         y, h = self.run(x, state["h"], is_init)
         return y, TensorDict({"h": h[:, -1]}, batch_size=[x.shape[0]])
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See :class:`ReplayableMemory`."""
-        self._check(x, is_init)
+        self._check(x, stored, is_init, batch_ndim=2)
         y, h = self.run(x, stored["h"], is_init)
         return y, TensorDict({"h": h}, batch_size=x.shape[:2])
 
@@ -128,22 +144,37 @@ class Memory(nn.Module):
             batch_size: B, or a whole batch shape.
 
         Returns:
-            TensorDict [batch_size] with ``"h"`` of shape [batch_size, *state_shape].
+            TensorDict [batch_size] with the tensors of :meth:`state_leaves`.
         """
         batch = [batch_size] if isinstance(batch_size, int) else list(batch_size)
-        if self.state_shape is None:
-            return TensorDict({}, batch_size=batch)
         like = next(self.parameters())
-        h = torch.zeros(*batch, *self.state_shape, dtype=like.dtype, device=like.device)
-        return TensorDict({"h": h}, batch_size=batch)
+        leaves = {
+            name: torch.zeros(*batch, *shape, dtype=dtype or like.dtype, device=like.device)
+            for name, (shape, dtype) in self.state_leaves().items()
+        }
+        return TensorDict(leaves, batch_size=batch)
 
-    def _check(self, x: Tensor, is_init: Tensor) -> None:
+    def _check(self, x: Tensor, state: TensorDict, is_init: Tensor, batch_ndim: int = 1) -> None:
+        """Raise ValueError unless shapes and types are those of ``forward`` (``batch_ndim`` 1) or ``replay`` (2)."""
         if x.ndim != 3 or x.shape[-1] != self.input_size:
             raise ValueError(f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)")
-        if is_init.shape != x.shape[:2]:
+        if x.shape[1] == 0:
+            raise ValueError(f"x must have at least one step, got {list(x.shape)}")
+        dtype = next(self.parameters()).dtype
+        if x.dtype != dtype and not (x.is_floating_point() and torch.is_autocast_enabled(x.device.type)):
+            raise ValueError(f"x is {x.dtype} but the parameters are {dtype}: cast one of them with .to()")
+        if not isinstance(is_init, Tensor) or is_init.dtype != torch.bool or is_init.shape != x.shape[:2]:
+            given = f"{is_init.dtype} {list(is_init.shape)}" if isinstance(is_init, Tensor) else repr(is_init)
             raise ValueError(
-                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {list(is_init.shape)}; "
-                "[B, T, 1] needs squeeze(-1)"
+                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {given}; [B, T, 1] needs squeeze(-1)"
+            )
+        batch, wanted = x.shape[:batch_ndim], self.state_leaves()
+        shapes = {name: (*batch, *shape) for name, (shape, _) in wanted.items()}
+        if set(state.keys()) != set(wanted) or any(state[name].shape != shape for name, shape in shapes.items()):
+            got = {name: list(leaf.shape) for name, leaf in state.items()}
+            raise ValueError(
+                f"the state of {type(self).__name__} must be { {k: list(v) for k, v in shapes.items()} }, got {got}: "
+                "it belongs to another model or batch size; begin with initial_state(batch_size)"
             )
 
     def extra_repr(self) -> str:

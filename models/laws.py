@@ -12,6 +12,8 @@ from arcade_torch.models.base import ReplayableMemory, replay
 
 __all__ = ["MemoryLawError", "check_memory"]
 
+GUARD = 1e-4  # what a small number in a denominator may cost the law of averages
+
 
 class MemoryLawError(AssertionError):
     """A memory model breaks one of the laws.
@@ -35,7 +37,9 @@ def check_memory(
 
     Args:
         module: has ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
-            ``initial_state(batch_size)``; ``replay`` is checked too where there is one.
+            ``initial_state(batch_size)``; ``replay`` is checked too where there is one. A module with
+            ``averages_values = True`` says that its outputs depend on the past through a weighted mean only, as in
+            attention, and has to keep one law more: the same input at every step gives the same output at every step.
         input_size: D; None reads ``module.input_size``.
         tolerance: largest absolute difference allowed between two ways to compute the same outputs of order 1.
         seed: of the random inputs.
@@ -69,6 +73,8 @@ def check_memory(
         ]
         if isinstance(module, ReplayableMemory):
             laws.append(("replay loads stored states", _replay_loads))
+        if getattr(module, "averages_values", False):
+            laws.append(("an average of equal values is that value", _averages))
         if gradients:
             laws.append(("gradients are right", _gradients))
         return {name: law(subject, name) for name, law in laws}
@@ -97,10 +103,12 @@ class _Subject:
     def initial(self, batch: int) -> TensorDict:
         return self.module.initial_state(batch)  # type: ignore[operator]
 
-    def compare(self, law: str, found: str, cause: str, *pairs: tuple[Tensor, Tensor]) -> float:
+    def compare(
+        self, law: str, found: str, cause: str, *pairs: tuple[Tensor, Tensor], tolerance: float | None = None
+    ) -> float:
         """Largest difference of the pairs; raises if above the tolerance or not a number."""
         worst = max((float((p - q).abs().max()) for p, q in pairs if p.numel()), default=0.0)
-        if not worst <= self.tolerance:
+        if not worst <= (self.tolerance if tolerance is None else tolerance):
             raise MemoryLawError(law, f"{found} (largest difference {worst:.2g})", cause, worst)
         return worst
 
@@ -273,6 +281,23 @@ def _replay_loads(s: _Subject, law: str) -> float:
         "each step",
         (y, stepped),
         *_pairs(states, stepped_states),
+    )
+
+
+@torch.no_grad()
+def _averages(s: _Subject, law: str) -> float:
+    steps = 12
+    x = s.random(3, 1).expand(-1, steps, -1)
+    flags = torch.zeros(3, steps, dtype=torch.bool, device=x.device)
+    flags[0, 5] = True
+    y, _ = s.module(x, s.initial(3), flags)
+    return s.compare(
+        law,
+        f"{steps} equal inputs from the start of an episode do not give {steps} equal outputs",
+        "weights that do not sum to one: a normaliser that is not accumulated with the values (the last key alone, or "
+        "one that is not reset with them)",
+        (y, y[:, :1].expand_as(y)),
+        tolerance=max(s.tolerance, GUARD),
     )
 
 

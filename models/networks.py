@@ -10,10 +10,14 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
+from arcade_torch.models.feedforward import FeedForward
 from arcade_torch.models.heads import make_head
 from arcade_torch.models.stack import MemoryBlock
 
-__all__ = ["PRESETS", "MemoryNetwork", "NetworkPreset", "make_network"]
+__all__ = ["FEED_FORWARD", "PRESETS", "MemoryNetwork", "NetworkPreset", "make_network", "preset_of"]
+
+FEED_FORWARD = "feedforward"
+"""In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see :class:`FeedForward`)."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,10 @@ class NetworkPreset:
     """"residual" or "none", see :class:`MemoryBlock`"""
     head: str = "reference"
     """see :func:`make_head`"""
+    actor_critic_head: str = "actor_critic"
+    """head of the two towers of :func:`make_actor_critic`"""
+    feedforward_size: int = 256
+    """width of the layers that stand in for the memory block of a feed-forward network"""
     use_last_action: bool = True
     """append the one-hot last action to the features"""
     zero_action_on_reset: bool = False
@@ -45,10 +53,25 @@ PRESETS = {
         hidden_size=128,
         layers=1,
         head="linear",
+        actor_critic_head="linear",
+        feedforward_size=128,
         zero_action_on_reset=True,
         memory_options={"mingru": {"slow_gates": True}},
     ),
 }
+
+
+def preset_of(name: str) -> NetworkPreset:
+    """The preset of a name.
+
+    Raises:
+        ValueError: unknown name; the message has the nearest match and the list.
+    """
+    if name not in PRESETS:
+        near = difflib.get_close_matches(str(name), PRESETS, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(f"unknown network {name!r}: {hint}known are {', '.join(PRESETS)}")
+    return PRESETS[name]
 
 
 def make_network(
@@ -66,7 +89,8 @@ def make_network(
     Args:
         preset: "paper" (1,428,613 parameters plus two cells) or "small" (225,733 with MinGRU; learns the easiest games
             in minutes on one CPU core).
-        memory: a name (:func:`memory_names`) or a factory ``(input_size, hidden_size, **options) -> nn.Module``.
+        memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) -> nn.Module``, or
+            "feedforward": no memory block and no last action, the paper's memory-free agent (704,901 parameters).
         obs_size: side of the frames in pixels.
         num_outputs: A; one per action for Q-values or logits, 1 for a state value.
         num_actions: number of actions, for the one-hot last action.
@@ -91,34 +115,40 @@ def make_network(
         >>> out.shape
         torch.Size([2, 7, 5])
     """
-    if preset not in PRESETS:
-        near = difflib.get_close_matches(str(preset), PRESETS, n=1)
-        raise ValueError(
-            f"unknown network {preset!r}: {f'did you mean {near[0]!r}? ' if near else ''}known are {', '.join(PRESETS)}"
-        )
-    unknown = set(options) - set(NetworkPreset.__dataclass_fields__)
-    if unknown:
+    chosen = preset_of(preset)
+    if unknown := set(options) - set(NetworkPreset.__dataclass_fields__):
         allowed = ", ".join(NetworkPreset.__dataclass_fields__)
         raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
-    chosen = replace(PRESETS[preset], **options)
-    of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
+    chosen = replace(chosen, **options)
+    if memory == FEED_FORWARD:
+        return _feed_forward(chosen, obs_size, num_outputs)
     encoder = chosen.encoder(obs_size)
-    block = MemoryBlock(
-        encoder.feature_size + (num_actions if chosen.use_last_action else 0),
+    actions = num_actions if chosen.use_last_action else 0
+    block = _block(chosen, encoder.feature_size + actions, memory, memory_options or {})
+    head = make_head(chosen.head, chosen.hidden_size, num_outputs)
+    return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=chosen.zero_action_on_reset)
+
+
+def _block(
+    chosen: NetworkPreset, input_size: int, memory: str | Callable[..., nn.Module], options: dict[str, Any]
+) -> MemoryBlock:
+    of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
+    return MemoryBlock(
+        input_size,
         chosen.hidden_size,
         memory,
         layers=chosen.layers,
         skip=chosen.skip,  # type: ignore[arg-type]
-        memory_options=of_preset | (memory_options or {}),
+        memory_options=of_preset | options,
     )
-    head = make_head(chosen.head, chosen.hidden_size, num_outputs)
-    return MemoryNetwork(
-        encoder,
-        block,
-        head,
-        num_actions=num_actions if chosen.use_last_action else 0,
-        zero_action_on_reset=chosen.zero_action_on_reset,
-    )
+
+
+def _feed_forward(chosen: NetworkPreset, obs_size: int, num_outputs: int) -> "MemoryNetwork":
+    """The published memory-free network; its two layers take the place of a deep head's as well."""
+    encoder = chosen.encoder(obs_size)
+    block = FeedForward(encoder.feature_size, chosen.feedforward_size)
+    head = make_head("linear" if chosen.head == "linear" else "plain", chosen.feedforward_size, num_outputs)
+    return MemoryNetwork(encoder, block, head, num_actions=0)
 
 
 class MemoryNetwork(nn.Module):

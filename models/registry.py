@@ -6,24 +6,37 @@ from typing import Any
 
 from torch import nn
 
+from arcade_torch.models.attention import Attention
+from arcade_torch.models.fart import LinearTransformer
+from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
 from arcade_torch.models.lru import LRU
 from arcade_torch.models.mingru import MinGRU
 from arcade_torch.models.stateless import Stateless
+from arcade_torch.models.ttt import TTTLinear
 
 __all__ = ["make_memory", "memory_names", "register_memory"]
 
 MemoryFactory = Callable[..., nn.Module]
 
-_FACTORIES: dict[str, MemoryFactory] = {"lru": LRU, "mingru": MinGRU, "gru": GRU, "mlp": Stateless}
+_FACTORIES: dict[str, MemoryFactory] = {
+    "lru": LRU,
+    "mingru": MinGRU,
+    "gru": GRU,
+    "mlp": Stateless,
+    "fart": LinearTransformer,
+    "attention": Attention,
+    "gdn": GatedDeltaNet,
+    "ttt": TTTLinear,
+}
 
 
 def memory_names() -> list[str]:
     """All names that :func:`make_memory` knows, in the order of registration.
 
     Example:
-        >>> memory_names()[:4]
-        ['lru', 'mingru', 'gru', 'mlp']
+        >>> memory_names()[:8]
+        ['lru', 'mingru', 'gru', 'mlp', 'fart', 'attention', 'gdn', 'ttt']
     """
     return list(_FACTORIES)
 

@@ -27,9 +27,10 @@ class Stateless(Memory):
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """Apply the layer to each step; returns ([B, T, H], the given state)."""
-        self._check(x, is_init)
+        self._check(x, state, is_init)
         return nn.functional.leaky_relu(self.linear(x)), state
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """Apply the layer to each step; returns ([B, T, H], the given states)."""
-        return self.forward(x, stored, is_init)
+        self._check(x, stored, is_init, batch_ndim=2)
+        return nn.functional.leaky_relu(self.linear(x)), stored

@@ -7,6 +7,7 @@ from torch import nn
 
 from arcade_torch.models.laws import MemoryLawError, check_memory
 from arcade_torch.models.mingru import MinGRU
+from arcade_torch.models.registry import make_memory
 
 
 class LeakyAverage(nn.Module):
@@ -95,6 +96,71 @@ def test_the_size_of_the_discrepancy_is_reported():
     with pytest.raises(MemoryLawError, match="largest difference") as caught:
         check_memory(LeakyAverage("late flag"))
     assert 1e-3 < caught.value.discrepancy < 100
+
+
+class TreeMinGRU(MinGRU):
+    """Combines (state, gate) pairs as a tree, as if the operator were associative; one step at a time it is right."""
+
+    def run(self, x, h0, is_init):
+        gate, candidate = self.gate_and_candidate(x).chunk(2, dim=-1)
+        pairs = [(h0, torch.zeros_like(h0), torch.zeros_like(is_init[:, :1]))]
+        pairs += zip(candidate.tanh().unbind(1), gate.sigmoid().unbind(1), is_init.unsqueeze(-1).unbind(1), strict=True)
+        states = [self.combined(pairs[: t + 2])[0] for t in range(x.shape[1])]
+        y = torch.stack(states, 1)
+        return y, y
+
+    def combined(self, pairs):
+        if len(pairs) == 1:
+            return pairs[0]
+        half = len(pairs) // 2
+        (s, _, i), (z, g, j) = self.combined(pairs[:half]), self.combined(pairs[half:])
+        return (1 - g) * torch.where(j, 0, s) + g * z, g, i | j
+
+
+def test_an_operator_that_is_not_associative_is_caught_when_it_is_run_as_a_tree():
+    with pytest.raises(MemoryLawError, match="not associative") as caught:
+        check_memory(TreeMinGRU(3, 4))
+    assert caught.value.law == "scan equals step by step" and caught.value.discrepancy > 1e-3
+
+
+class LateReset(nn.Module):
+    """Resets one step late, and does so alike in every split, because the flag is part of the state."""
+
+    input_size = 3
+
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(3, 4)
+
+    def initial_state(self, batch_size):
+        like = self.linear.weight
+        return TensorDict({"h": like.new_zeros(batch_size, 4), "flag": like.new_zeros(batch_size, 1)}, [batch_size])
+
+    def forward(self, x, state, is_init):
+        h, late, outputs = state["h"], state["flag"].bool(), []
+        for t in range(x.shape[1]):
+            h = 0.9 * torch.where(late, 0, h) + self.linear(x[:, t]).tanh()
+            late = is_init[:, t : t + 1]
+            outputs.append(h)
+        state = TensorDict({"h": h, "flag": late.to(h.dtype)}, batch_size=[len(x)])
+        return torch.stack(outputs, 1), state
+
+
+def test_a_reset_that_is_consistently_one_step_late_is_caught():
+    with pytest.raises(MemoryLawError, match="start flag does not restore") as caught:
+        check_memory(LateReset())
+    assert caught.value.law == "packed equals apart"
+
+
+def test_a_linear_transformer_without_a_running_normaliser_is_caught():
+    with pytest.raises(MemoryLawError, match="normaliser that is not accumulated") as caught:
+        check_memory(make_memory("fart", 3, 4, legacy_normaliser=True))
+    assert caught.value.law == "an average of equal values is that value" and caught.value.discrepancy > 0.1
+
+
+def test_a_model_that_does_not_claim_to_average_is_not_held_to_it():
+    assert "an average of equal values is that value" not in check_memory(make_memory("gdn", 3, 4))
+    assert "an average of equal values is that value" in check_memory(make_memory("attention", 3, 4))
 
 
 class ForgetfulReplay(MinGRU):

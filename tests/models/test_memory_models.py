@@ -1,5 +1,8 @@
 """Every registered memory model keeps the laws; sizes are the published ones."""
 
+import itertools
+import time
+
 import pytest
 import torch
 from torch import nn
@@ -16,7 +19,17 @@ MODELS = [
     ("mingru", {"candidate": "linear", "slow_gates": True}),
     ("gru", {}),
     ("mlp", {}),
+    ("fart", {}),
+    ("attention", {}),
+    ("attention", {"window": 3}),
+    ("attention", {"window": 1}),
+    ("gdn", {}),
+    ("gdn", {"gate_alpha": False, "beta_range": 1.0}),
+    ("gdn", {"legacy_left": True}),
+    ("ttt", {}),
 ]
+NAMES = memory_names()
+LENGTHS = [1, 2, 3, 7, 128, 132, 1000]
 
 
 @pytest.mark.parametrize(("name", "options"), MODELS)
@@ -25,34 +38,160 @@ def test_every_model_keeps_the_laws(name, options, sizes):
     check_memory(make_memory(name, *sizes, **options))
 
 
-@pytest.mark.parametrize("name", memory_names())
+@pytest.mark.parametrize("name", NAMES)
 def test_every_model_satisfies_the_protocols(name):
     memory = make_memory(name, 3, 4)
     assert isinstance(memory, MemoryContract) and isinstance(memory, ReplayableMemory)
 
 
 @pytest.mark.parametrize(
-    ("name", "count"), [("lru", 1_050_624), ("gru", 1_574_400), ("mingru", 525_312), ("mlp", 262_656)]
+    ("name", "count"),
+    [
+        ("lru", 1_050_624),
+        ("gru", 1_574_400),
+        ("mingru", 525_312),
+        ("mlp", 262_656),
+        ("attention", 786_944),
+        ("fart", 47_616),
+        ("gdn", 48_642),
+        ("ttt", 48_658),  # our own variant, unpublished
+    ],
 )
 def test_parameter_counts_at_width_512_are_the_published_ones(name, count):
     assert sum(p.numel() for p in make_memory(name, 512, 512).parameters()) == count
 
 
-@pytest.mark.parametrize("name", memory_names())
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_dtype_follows_the_parameters(name, dtype):
     memory = make_memory(name, 3, 4).to(dtype)
     state = memory.initial_state(2)
     y, after = memory(torch.randn(2, 5, 3, dtype=dtype), state, torch.zeros(2, 5, dtype=torch.bool))
     assert y.dtype == dtype
-    assert all(v.dtype == dtype for td in (state, after) for v in td.values())
+    assert all(v.dtype == dtype for td in (state, after) for v in td.values() if v.is_floating_point())
+
+
+def problem(name, batch, steps, dtype, resets=0.03):
+    """A model of width 6, inputs, a state that some steps have led to, and start flags."""
+    memory = make_memory(name, 6, 6).to(dtype)
+    x, flags = torch.randn(batch, steps + 5, 6, dtype=dtype), torch.rand(batch, steps) < resets
+    with torch.no_grad():
+        _, state = memory(x[:, steps:], memory.initial_state(batch), torch.zeros(batch, 5, dtype=torch.bool))
+    return memory, x[:, :steps], state, flags
+
+
+def assert_near(ours, theirs, dtype):
+    """Equal to 1e-5 in float32 and 1e-12 in float64 of the largest number."""
+    scale = float(theirs.abs().max().clamp_min(1e-3))
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    torch.testing.assert_close(ours.double() / scale, theirs.double() / scale, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("steps", LENGTHS)
+@torch.no_grad()
+def test_one_call_equals_many_at_every_length_and_split(name, dtype, steps):
+    memory, x, state, flags = problem(name, 2, steps, dtype)
+    y, after = memory(x, state, flags)
+    one_by_one = list(range(steps)) if steps < 200 else []
+    for cuts in ([steps // 2], [steps // 3, steps // 2 + 1], [1, steps - 1], one_by_one):
+        borders = sorted({0, steps, *(c for c in cuts if 0 < c < steps)})
+        parts, carried = [], state
+        for begin, end in itertools.pairwise(borders):
+            part, carried = memory(x[:, begin:end], carried, flags[:, begin:end])
+            parts.append(part)
+        assert_near(torch.cat(parts, 1), y, dtype)
+        for key, leaf in after.items():
+            assert_near(carried[key].to(dtype), leaf.to(dtype), dtype)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("start", [1, 40, 100])
+def test_what_was_before_a_start_has_exactly_no_influence(name, start):
+    memory, x, state, flags = problem(name, 2, 132, torch.float32, resets=0.0)
+    flags[:, start] = True
+    leaves = [leaf.requires_grad_() for leaf in state.values() if leaf.is_floating_point()]
+    x = x.clone().requires_grad_()
+    y, after = memory(x, state, flags)
+    gradients = torch.autograd.grad(
+        y[:, start:].square().sum(), [x, *leaves], allow_unused=True, materialize_grads=True
+    )
+    assert (gradients[0][:, :start] == 0).all() and all((gradient == 0).all() for gradient in gradients[1:])
+    _, other, other_state, _ = problem(name, 2, 132, torch.float32)
+    changed, changed_after = memory(torch.cat([50 * other[:, :start], x[:, start:]], 1), other_state, flags)
+    assert torch.equal(changed[:, start:], y[:, start:])
+    assert all(torch.equal(changed_after[key], leaf) for key, leaf in after.items())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_batch_of_parameters_under_vmap_equals_one_model_after_another(name):
+    models = [make_memory(name, 3, 6).double() for _ in range(3)]
+    x, flags = torch.randn(2, 7, 3, dtype=torch.float64), torch.rand(2, 7) < 0.3
+    parameters, _ = torch.func.stack_module_state(models)
+
+    def outputs(parameters):
+        return torch.func.functional_call(models[0], parameters, (x, models[0].initial_state(2), flags))[0]
+
+    y = torch.vmap(outputs)(parameters)
+    gradients = torch.autograd.grad(y.square().sum(), list(parameters.values()))
+    for i, model in enumerate(models):
+        alone, _ = model(x, model.initial_state(2), flags)
+        torch.testing.assert_close(y[i], alone)
+        for ours, plain in zip(
+            gradients, torch.autograd.grad(alone.square().sum(), list(model.parameters())), strict=True
+        ):
+            torch.testing.assert_close(ours[i], plain)
+
+
+def compiled_equals_eager(name, backend):
+    torch._dynamo.reset()
+    memory, x, state, flags = problem(name, 2, 6, torch.float32, resets=0.3)
+
+    def loss(x, state, flags):
+        y, after = memory(x, state, flags)
+        return y.square().mean(), after
+
+    results = [function(x, state, flags) for function in (torch.compile(loss, fullgraph=True, backend=backend), loss)]
+    torch.testing.assert_close(results[0][0], results[1][0])
+    for key, leaf in results[1][1].items():
+        torch.testing.assert_close(results[0][1][key], leaf)
+    gradients = [torch.autograd.grad(value, list(memory.parameters())) for value, _ in results]
+    torch.testing.assert_close(*gradients)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_model_is_traced_into_one_graph(name):
+    compiled_equals_eager(name, "eager")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_model_compiles_into_one_graph_forward_and_backward(name, backend):
+    compiled_equals_eager(name, backend)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_no_model_takes_more_than_three_times_as_long_as_the_lru(name):
+    def seconds(memory):
+        began = time.process_time()
+        memory(x, memory.initial_state(16), flags)[0].square().mean().backward()
+        return time.process_time() - began
+
+    x, flags = torch.randn(16, 132, 512), torch.rand(16, 132) < 0.02
+    pair = [make_memory(name, 512, 512), make_memory("lru", 512, 512)]
+    times = [[seconds(memory) for memory in pair] for _ in range(8)][1:]
+    ours, lru = (min(column) for column in zip(*times, strict=True))
+    assert ours < 3 * lru
 
 
 def test_states_are_zeros_and_complex_ones_are_real_pairs():
     assert make_memory("lru", 3, 4).initial_state(2)["h"].shape == (2, 4, 2)
     assert make_memory("gru", 3, 4).initial_state((2, 7))["h"].shape == (2, 7, 4)
     assert make_memory("mlp", 3, 4).initial_state(2).is_empty()
-    assert all((make_memory(name, 3, 4).initial_state(2) == 0).all() for name in ("lru", "gru", "mingru"))
+    assert all((make_memory(name, 3, 4).initial_state(2) == 0).all() for name in NAMES)
 
 
 def test_mingru_is_the_papers_equation():
@@ -131,7 +270,7 @@ def test_names_are_registered_once_and_must_be_identifiers():
         register_memory("tests_number", 3)
 
 
-@pytest.mark.parametrize("name", memory_names())
+@pytest.mark.parametrize("name", NAMES)
 def test_wrong_inputs_get_one_clear_line(name):
     memory = make_memory(name, 3, 4)
     flags = torch.zeros(2, 5, dtype=torch.bool)
@@ -139,6 +278,20 @@ def test_wrong_inputs_get_one_clear_line(name):
         memory(torch.zeros(2, 5, 7), memory.initial_state(2), flags)
     with pytest.raises(ValueError, match="squeeze"):
         memory(torch.zeros(2, 5, 3), memory.initial_state(2), flags.unsqueeze(-1))
+    with pytest.raises(ValueError, match=r"is_init must be bool \[B, T\] = \[2, 5\], got None"):
+        memory(torch.zeros(2, 5, 3), memory.initial_state(2), None)
+    with pytest.raises(ValueError, match=r"is_init must be bool .* got torch.float32 \[2, 5\]"):
+        memory(torch.zeros(2, 5, 3), memory.initial_state(2), flags.float())
+    with pytest.raises(ValueError, match=r"x is torch.float64 but the parameters are torch.float32"):
+        memory(torch.zeros(2, 5, 3, dtype=torch.float64), memory.initial_state(2), flags)
+    with pytest.raises(ValueError, match="at least one step"):
+        memory(torch.zeros(2, 0, 3), memory.initial_state(2), flags[:, :0])
+    other = make_memory("lru" if name != "lru" else "gru", 3, 4).initial_state(2)
+    with pytest.raises(ValueError, match=r"the state of \w+ must be .* another model or batch size"):
+        memory(torch.zeros(2, 5, 3), other, flags)
+    if name != "mlp":
+        with pytest.raises(ValueError, match=r"another model or batch size; begin with initial_state"):
+            memory(torch.zeros(2, 5, 3), memory.initial_state(3), flags)
     with pytest.raises(ValueError, match="positive"):
         make_memory(name, 0, 4)
 

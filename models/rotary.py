@@ -1,0 +1,50 @@
+"""Rotary position embedding: turns pairs of channels by angles that grow with the position (RoPE)."""
+
+import math
+
+import torch
+from torch import Tensor
+
+__all__ = ["angles", "rotate"]
+
+LOG_BASE = math.log(10_000.0)
+
+
+def angles(position: Tensor, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Cosine and sine of the angle of every channel pair at every position.
+
+    Args:
+        position: int64 [...], in steps.
+        width: number of channels; the last one of an odd number is left alone.
+        dtype: of the result; angles are float64 until the cosine is taken, so that two far positions differ by as
+            much as two near ones.
+
+    Returns:
+        (cosine, sine), each [..., width // 2].
+
+    Source: Su et al. (2021), arXiv 2104.09864, eq. 15.
+    """
+    pairs = width // 2
+    frequency = torch.exp(
+        torch.arange(pairs, dtype=torch.float64, device=position.device) * (-LOG_BASE / max(pairs, 1))
+    )
+    angle = position.to(torch.float64).unsqueeze(-1) * frequency
+    return angle.cos().to(dtype), angle.sin().to(dtype)
+
+
+def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
+    """Turn channel pairs (2i, 2i + 1).
+
+    Args:
+        x: [..., W].
+        cosine: [..., W // 2], see :func:`angles`.
+        sine: like ``cosine``.
+
+    Returns:
+        [..., W]: first the first channels of all pairs, then the second ones, then what is left over. The order does
+        not matter to a product of two rotated vectors, which is all that rotated vectors are for.
+    """
+    turned = 2 * cosine.shape[-1]
+    first, second = x[..., 0:turned:2], x[..., 1:turned:2]
+    parts = [first * cosine - second * sine, first * sine + second * cosine]
+    return torch.cat(parts if turned == x.shape[-1] else [*parts, x[..., turned:]], dim=-1)

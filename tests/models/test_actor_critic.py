@@ -1,0 +1,104 @@
+"""Actor and critic, the feed-forward network, heads: published sizes, separate towers, what an output means."""
+
+import pytest
+import torch
+from torch import nn
+
+from arcade_torch.models import make_network
+from arcade_torch.models.actor_critic import make_actor_critic
+from arcade_torch.models.feedforward import FeedForward
+from arcade_torch.models.heads import make_head
+
+
+def count(module):
+    return sum(p.numel() for p in module.parameters())
+
+
+def inputs(batch=2, steps=5, size=32):
+    pixels = torch.randint(0, 256, (batch, steps, size, size, 3), dtype=torch.uint8)
+    return pixels, torch.randint(0, 5, (batch, steps)), torch.rand(batch, steps) < 0.3
+
+
+def test_the_feed_forward_network_has_the_published_size_and_no_last_action():
+    network = make_network("paper", "feedforward")
+    assert count(network) == 704_901
+    assert [type(m) for m in network.block.layers] == [nn.Linear, nn.LayerNorm, nn.LeakyReLU] * 2
+    assert isinstance(network.head, nn.Linear)
+    pixels, last_action, is_init = inputs(1, 2, 128)
+    state = network.initial_state(1)
+    with torch.no_grad():
+        one, after = network(pixels, last_action, is_init, state)
+        other, _ = network(pixels, (last_action + 1) % 5, ~is_init, state)
+    assert torch.equal(one, other) and after.is_empty() and state.is_empty()
+
+
+def test_the_feed_forward_network_looks_at_each_frame_alone():
+    network = make_network("small", "feedforward")
+    pixels, last_action, is_init = inputs(2, 4)
+    out, _ = network(pixels, last_action, is_init, network.initial_state(2))
+    alone = [
+        network(pixels[:, t : t + 1], last_action[:, :1], is_init[:, :1], network.initial_state(2))[0] for t in (3, 1)
+    ]
+    torch.testing.assert_close(torch.cat(alone, 1), out[:, [3, 1]])
+    assert FeedForward(7, 3).initial_state([2, 4]).batch_size == (2, 4)
+
+
+def test_the_papers_towers_have_the_published_layers():
+    network = make_actor_critic("paper", "mlp")
+    middle = [nn.Linear, nn.Linear, nn.LayerNorm, nn.LeakyReLU, nn.Linear]
+    assert [type(m) for m in network.actor.head] == [type(m) for m in network.critic.head] == middle
+    head = (512 * 256 + 256) + (256 * 256 + 256) + 2 * 256
+    body = 505_472 + (517 * 512 + 512) + 2 * (262_656 + 512 * 512 + 512)
+    assert count(network.actor) == body + head + 256 * 5 + 5
+    assert count(network.critic) == body + head + 256 + 1
+    published = make_actor_critic("paper", "mlp", use_last_action=False)
+    assert count(published.actor) == count(network.actor) - 5 * 512
+    assert count(make_actor_critic("paper", "feedforward")) == 2 * 704_901 - 4 * 257
+
+
+def test_the_towers_share_no_weight_and_begin_differently():
+    network = make_actor_critic("small", "gru")
+    mine, theirs = network.actor.state_dict(), network.critic.state_dict()
+    names = [name for name in mine if mine[name].shape == theirs[name].shape and "weight" in name]
+    assert names and all(not torch.equal(mine[name], theirs[name]) for name in names)
+
+
+@pytest.mark.parametrize("memory", ["gru", "lru", "mlp", "feedforward"])
+def test_each_tower_alone_gives_its_half_of_the_output(memory):
+    network = make_actor_critic("small", memory)
+    pixels, last_action, is_init = inputs(3, 6)
+    state = network.initial_state(3)
+    with torch.no_grad():
+        out, after = network(pixels, last_action, is_init, state)
+        logits, value = network.split(out)
+        alone, mine = network.actor(pixels, last_action, is_init, state["actor"])
+        single, theirs = network.critic(pixels, last_action, is_init, state["critic"])
+    torch.testing.assert_close(logits, alone)
+    torch.testing.assert_close(value, single.squeeze(-1))
+    for name, expected in (("actor", mine), ("critic", theirs)):
+        for key in expected.keys(True, True):
+            torch.testing.assert_close(after[name][key], expected[key])
+
+
+def test_an_output_is_read_by_name():
+    network = make_actor_critic("small", "mlp")
+    out = torch.randn(2, 3, 6)
+    assert network.select(out, "logits").shape == (2, 3, 5) and network.select(out, "value").shape == (2, 3, 1)
+    torch.testing.assert_close(network.select(out, "probs").sum(-1), torch.ones(2, 3))
+    with pytest.raises(ValueError, match="offers logits, probs, value, not 'q'"):
+        network.select(out, "q")
+
+
+def test_calibration_reaches_both_towers():
+    network = make_actor_critic("small", "mlp")
+    network.calibrate(inputs(4, 3, 128)[0])
+    assert torch.equal(network.actor.encoder.mean, network.critic.encoder.mean) and network.actor.encoder.mean.any()
+
+
+def test_wrong_names_get_one_clear_line():
+    with pytest.raises(ValueError, match="mean 'small'"):
+        make_actor_critic("smal")
+    with pytest.raises(TypeError, match=r"width.*allowed are encoder"):
+        make_actor_critic("small", "gru", width=3)
+    with pytest.raises(ValueError, match="actor_critic"):
+        make_head("none", 4, 5)

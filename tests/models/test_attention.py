@@ -1,0 +1,133 @@
+"""Sliding-window attention: blocks equal the plain loop and the textbook; the window, the cache and positions."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from arcade_torch.models import MemoryLawError, check_memory, make_memory
+from arcade_torch.models.attention import window_attention, window_attention_loop
+from arcade_torch.models.rotary import angles, rotate
+
+F64 = torch.float64
+
+
+def flags(batch, length, *starts):
+    out = torch.zeros(batch, length, dtype=torch.bool)
+    out[:, list(starts)] = True
+    return out
+
+
+@given(
+    length=st.integers(1, 40),
+    window=st.integers(1, 20),
+    block=st.integers(1, 41),
+    width=st.integers(1, 6),
+    seed=st.integers(0, 2**16),
+)
+@settings(max_examples=50, deadline=None)
+def test_every_block_size_equals_the_loop_values_and_gradients(length, window, block, width, seed):
+    torch.manual_seed(seed)
+    query = torch.randn(2, length, width, dtype=F64, requires_grad=True)
+    key, value = (torch.randn(2, window - 1 + length, width, dtype=F64, requires_grad=True) for _ in "kv")
+    episode = torch.cat([torch.randint(-1, 1, (2, window - 1)), (torch.rand(2, length) < 0.2).cumsum(1)], 1)
+    y = window_attention(query, key, value, episode, window, block=block)
+    loop = window_attention_loop(query, key, value, episode, window)
+    torch.testing.assert_close(y, loop, rtol=1e-12, atol=1e-12)
+    weight = torch.randn_like(y)
+    for ours, plain in zip(
+        torch.autograd.grad(y, (query, key, value), weight),
+        torch.autograd.grad(loop, (query, key, value), weight),
+        strict=True,
+    ):
+        torch.testing.assert_close(ours, plain, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (F64, 1e-12)])
+@pytest.mark.parametrize("length", [1, 2, 3, 7, 128, 132, 1000])
+def test_odd_and_long_sequences_equal_the_loop(dtype, tolerance, length):
+    query, key, value = (torch.randn(2, length + 127 * past, 16, dtype=dtype) for past in (0, 1, 1))
+    episode = torch.cat([torch.zeros(2, 127, dtype=torch.int64), (torch.rand(2, length) < 0.01).cumsum(1)], 1)
+    y, loop = (form(query, key, value, episode, 128) for form in (window_attention, window_attention_loop))
+    torch.testing.assert_close(y, loop, rtol=0, atol=tolerance * float(loop.abs().max()))
+
+
+def test_it_is_the_textbook_equation_with_complex_rotations():
+    memory = make_memory("attention", 3, 6, window=4).double()
+    x, is_init = torch.randn(1, 9, 3, dtype=F64), flags(1, 9, 0, 6)
+    y, _ = memory(x, memory.initial_state(1), is_init)
+    q, k, v = (layer(x[0]) for layer in (memory.query, memory.key, memory.value))
+    speed = 10_000.0 ** (-torch.arange(3, dtype=F64) / 3)
+    for t in range(9):
+        first = max(6 if t >= 6 else 0, t - 3)
+        turned = [torch.polar(torch.ones_like(speed), i * speed) for i in range(t + 1)]
+        q_t = torch.view_as_complex(q[t].view(3, 2)) * turned[t]
+        scores = [
+            (q_t * (torch.view_as_complex(k[j].view(3, 2)) * turned[j]).conj()).sum().real / 6**0.5
+            for j in range(first, t + 1)
+        ]
+        expected = torch.softmax(torch.stack(scores), 0) @ v[first : t + 1]
+        torch.testing.assert_close(y[0, t], expected)
+
+
+@pytest.mark.parametrize("window", [1, 2, 5])
+def test_a_step_is_seen_for_exactly_the_window(window):
+    memory = make_memory("attention", 3, 4, window=window)
+    x = torch.randn(1, 12, 3)
+    changed = x.clone()
+    changed[:, 4] += 1
+    (y, _), (other, _) = (memory(v, memory.initial_state(1), flags(1, 12)) for v in (x, changed))
+    differs = (y != other).any(-1)[0]
+    assert differs.nonzero().flatten().tolist() == list(range(4, 4 + window))
+
+
+def test_only_the_distance_of_two_steps_matters():
+    q, k = torch.randn(2, 7, dtype=F64)
+    products = []
+    for shift in (0, 1, 1000, 100_000):
+        place = torch.tensor([shift + 5, shift])
+        cosine, sine = angles(place, 7, F64)
+        products.append(rotate(q, cosine[0], sine[0]) @ rotate(k, cosine[1], sine[1]))
+    torch.testing.assert_close(torch.stack(products), products[0].expand(4), rtol=0, atol=1e-9)
+    assert (rotate(q, *(a[0] for a in angles(torch.tensor([3]), 7, F64))) @ k - q @ k).abs() > 1e-3
+
+
+def test_the_state_is_the_window_newest_last_and_empty_slots_hold_zeros():
+    memory = make_memory("attention", 3, 4, window=5)
+    x = torch.randn(1, 8, 3)
+    _, state = memory(x, memory.initial_state(1), flags(1, 8, 5))
+    assert state["valid"].tolist() == [[False, False, True, True, True]]
+    assert torch.equal(state["key"][:, 2:], memory.key(x)[:, 5:]) and (state["key"][:, :2] == 0).all()
+    torch.testing.assert_close(state["value"][:, 2:], memory.value(x)[:, 5:])
+    assert {key: tuple(leaf.shape) for key, leaf in make_memory("attention", 512, 512).initial_state(1).items()} == {
+        "key": (1, 128, 512),
+        "value": (1, 128, 512),
+        "valid": (1, 128),
+    }
+
+
+def test_an_empty_window_for_every_chunk_is_an_option_and_breaks_the_law_of_several_calls():
+    memory = make_memory("attention", 3, 4, window=6, carry_cache=False)
+    x = torch.randn(2, 9, 3)
+    _, state = memory(x, memory.initial_state(2), flags(2, 9))
+    chunk, _ = memory(x, state, flags(2, 9))
+    fresh, _ = memory(x, memory.initial_state(2), flags(2, 9))
+    assert torch.equal(chunk, fresh)
+    acted, _ = memory(x[:, :1], state, flags(2, 1))
+    assert (acted - fresh[:, :1]).abs().max() > 1e-3
+    with pytest.raises(MemoryLawError, match="step by step"):
+        check_memory(memory)
+
+
+def test_mask_and_weights_stay_small_for_long_sequences():
+    memory = make_memory("attention", 4, 4, window=32)
+    sizes = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: (sizes.append(x.numel()), x)[1], lambda x: x):
+        memory(torch.randn(1, 1000, 4), memory.initial_state(1), flags(1, 1000))
+    assert max(sizes) <= 1024 * (32 + 128)
+
+
+@pytest.mark.parametrize("window", [0, -3])
+def test_a_window_without_the_current_step_is_refused(window):
+    with pytest.raises(ValueError, match=f"at least 1 step .*got {window}"):
+        make_memory("attention", 3, 4, window=window)

@@ -1,0 +1,39 @@
+"""`arcade-torch list memories` says what every model costs, and the counts are exact."""
+
+import pytest
+
+from arcade_torch.models import make_memory, memory_names
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench.memories import memory_cost, time_memories
+
+
+def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["list", "memories"]) == 0
+    out = capsys.readouterr().out
+    assert all(f" {name} " in out for name in memory_names())
+    assert "512 wide" in out and "128 wide" in out
+    for number in ("1,050,624", "131,200", "524,416", "48,642", "1,572,864"):
+        assert number in out
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "size_in_bytes", "products"),
+    [
+        ("mlp", 0, 0, 8 * 8),
+        ("mingru", 8, 32, 2 * 8 * 8),
+        ("gru", 8, 32, 6 * 8 * 8),
+        ("lru", 16, 64, 4 * 8 * 8),
+        ("fart", 12, 48, 3 * 8 * 3 + 3 * 4 + 3 * 4 + 3 * 8),
+        ("attention", 128 * 17, 128 * 8 * 8 + 128, 3 * 8 * 8 + 2 * 128 * 8),
+    ],
+)
+def test_costs_are_those_counted_by_hand(name: str, numbers: int, size_in_bytes: int, products: int) -> None:
+    cost = memory_cost(make_memory(name, 8, 8), 8)
+    assert (cost.state_numbers, cost.state_bytes, cost.products) == (numbers, size_in_bytes, products)
+
+
+def test_times_are_positive_and_learning_a_batch_takes_longer_than_acting_it() -> None:
+    times = time_memories(["gru", "mlp"], 8, seconds=0.01, repeats=1)
+    assert set(times) == {"gru", "mlp"}
+    assert all(time.acting > 0 and time.learning > 0 for time in times.values())
+    assert times["gru"].learning > times["mlp"].learning
