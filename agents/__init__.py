@@ -13,51 +13,69 @@ from typing import TYPE_CHECKING, Any
 
 _PUBLIC = {
     "Agent": "agent",
+    "CategoricalActor": "actor",
     "CheckpointError": "checkpoint",
+    "DQNConfig": "dqn",
+    "DQNLoss": "dqn",
     "EpsilonGreedyActor": "actor",
     "EvalResult": "evaluation",
     "NonFiniteError": "learner",
+    "PPOConfig": "ppo",
+    "PPOLoss": "ppo",
     "PQNConfig": "pqn",
     "PQNLoss": "pqn",
     "RunFolderError": "run_folder",
+    "SequenceReplay": "replay",
     "TrainConfig": "config",
     "TrainResult": "loop",
     "evaluate": "evaluation",
+    "gae": "targets",
     "held_out_seed": "evaluation",
     "load": "loading",
     "paper_score": "metrics",
-    "preset": "config",
-    "preset_names": "config",
+    "preset": "presets",
+    "preset_names": "presets",
     "q_lambda_return": "targets",
     "train": "loop",
 }
 
 if TYPE_CHECKING:
-    from arcade_torch.agents.actor import EpsilonGreedyActor
+    from arcade_torch.agents.actor import CategoricalActor, EpsilonGreedyActor
     from arcade_torch.agents.agent import Agent
     from arcade_torch.agents.checkpoint import CheckpointError
-    from arcade_torch.agents.config import TrainConfig, preset, preset_names
+    from arcade_torch.agents.config import TrainConfig
+    from arcade_torch.agents.dqn import DQNConfig, DQNLoss
     from arcade_torch.agents.evaluation import EvalResult, evaluate, held_out_seed
     from arcade_torch.agents.learner import NonFiniteError
     from arcade_torch.agents.loading import load
     from arcade_torch.agents.loop import TrainResult, train
     from arcade_torch.agents.metrics import paper_score
+    from arcade_torch.agents.ppo import PPOConfig, PPOLoss
     from arcade_torch.agents.pqn import PQNConfig, PQNLoss
+    from arcade_torch.agents.presets import preset, preset_names
+    from arcade_torch.agents.replay import SequenceReplay
     from arcade_torch.agents.run_folder import RunFolderError
-    from arcade_torch.agents.targets import q_lambda_return
+    from arcade_torch.agents.targets import gae, q_lambda_return
 
 __all__ = [
     "Agent",
+    "CategoricalActor",
     "CheckpointError",
+    "DQNConfig",
+    "DQNLoss",
     "EpsilonGreedyActor",
     "EvalResult",
     "NonFiniteError",
+    "PPOConfig",
+    "PPOLoss",
     "PQNConfig",
     "PQNLoss",
     "RunFolderError",
+    "SequenceReplay",
     "TrainConfig",
     "TrainResult",
     "evaluate",
+    "gae",
     "held_out_seed",
     "load",
     "paper_score",

@@ -1,10 +1,10 @@
-"""Epsilon-greedy acting with a recurrent Q-network."""
+"""Acting: epsilon-greedy with a recurrent Q-network, or by sampling a recurrent policy."""
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents.protocols import QNetwork
+from arcade_torch.agents.protocols import ActorCritic, QNetwork
 
 
 class EpsilonGreedyActor:
@@ -20,6 +20,8 @@ class EpsilonGreedyActor:
         generator: source of the draws, on the device of the observations; needed unless ``greedy``.
         greedy: never explore, whatever ``epsilon`` says.
         record_q: also return the Q-values, as the extra ``q_value`` float32 [N, A].
+
+    ``actor.uniform = True`` makes every action random until it is taken back, as epsilon 1 does.
 
     Raises:
         ValueError: ``epsilon`` lies outside [0, 1], or exploring was asked for without a generator.
@@ -38,7 +40,7 @@ class EpsilonGreedyActor:
         if generator is None and not greedy:
             raise ValueError("an exploring actor needs a torch.Generator; pass generator=, or greedy=True")
         self.network, self.epsilon, self.generator = network, epsilon, generator
-        self.greedy, self.record_q = greedy, record_q
+        self.greedy, self.record_q, self.uniform = greedy, record_q, False
 
     def initial_state(self, batch_size: int) -> TensorDictBase:
         """Recurrent state before the first observation, TensorDict [N]."""
@@ -55,10 +57,7 @@ class EpsilonGreedyActor:
         Returns:
             ``(action int64 [N], extras, new state)``.
         """
-        pixels, last_action, is_init = obs.get("pixels"), obs.get("last_action"), obs.get("is_init")
-        steps = pixels.shape[0], 1
-        q, state = self.network(pixels.unsqueeze(1), last_action.reshape(steps), is_init.reshape(steps), state)
-        q = q.squeeze(1)
+        q, state = _one_step(self.network, obs, state)
         action = q.argmax(-1)
         if not self.greedy:
             action = self._explore(action, q.shape[-1])
@@ -69,4 +68,62 @@ class EpsilonGreedyActor:
         shape, device = action.shape, action.device
         coin = torch.rand(shape, generator=self.generator, device=device)
         other = torch.randint(num_actions, shape, generator=self.generator, device=device)
-        return torch.where(coin < self.epsilon, other, action)
+        return torch.where(coin < (1.0 if self.uniform else self.epsilon), other, action)
+
+
+class CategoricalActor:
+    """The policy of an actor-critic network: a draw from its softmax, or its most likely action.
+
+    Follows the ``Actor`` protocol of ``ArcadeCollector``. Draws come from a generator of its own.
+
+    Args:
+        network: an ``ActorCriticNetwork``, or any module with its ``forward``, ``split`` and ``initial_state``.
+        generator: source of the draws, on the device of the observations; needed unless ``greedy``.
+        greedy: take the most likely action; of equal ones the lowest number.
+
+    ``actor.uniform = True`` makes every action uniformly random until it is taken back; the recorded log-probabilities
+    are then still those of the policy.
+
+    Raises:
+        ValueError: sampling was asked for without a generator.
+    """
+
+    def __init__(self, network: ActorCritic, generator: torch.Generator | None = None, greedy: bool = False) -> None:
+        if generator is None and not greedy:
+            raise ValueError("a sampling actor needs a torch.Generator; pass generator=, or greedy=True")
+        self.network, self.generator, self.greedy, self.uniform = network, generator, greedy, False
+
+    def initial_state(self, batch_size: int) -> TensorDictBase:
+        """Recurrent state before the first observation, TensorDict [N]."""
+        return self.network.initial_state(batch_size)
+
+    @torch.no_grad()
+    def act(self, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, dict[str, Tensor], TensorDictBase]:
+        """Choose one action for every environment.
+
+        Args:
+            obs: root entries ``pixels`` [N, ...], ``last_action`` int64 [N], ``is_init`` bool [N, 1].
+            state: recurrent state, TensorDict [N].
+
+        Returns:
+            ``(action int64 [N], extras, new state)`` with the extras ``state_value`` float32 [N] and, if greedy,
+            ``logits`` float32 [N, A], else ``action_log_prob`` float32 [N].
+        """
+        out, state = _one_step(self.network, obs, state)
+        logits, value = self.network.split(out)
+        if self.greedy:
+            return logits.argmax(-1), {"logits": logits, "state_value": value}, state
+        log_prob = logits.log_softmax(-1)
+        # The largest of log p plus Gumbel noise is a draw from p; NaN gives some action, and is found while learning.
+        noise = torch.empty_like(log_prob).exponential_(generator=self.generator).log()
+        action = (torch.zeros_like(log_prob) if self.uniform else log_prob).sub(noise).argmax(-1)
+        taken = log_prob.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        return action, {"action_log_prob": taken, "state_value": value}, state
+
+
+def _one_step(network: QNetwork, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+    """Outputs [N, A] of a network for one observation of every environment, and the state after it."""
+    pixels, last_action, is_init = obs.get("pixels"), obs.get("last_action"), obs.get("is_init")
+    steps = pixels.shape[0], 1
+    out, state = network(pixels.unsqueeze(1), last_action.reshape(steps), is_init.reshape(steps), state)
+    return out.squeeze(1), state

@@ -7,15 +7,16 @@
     checkpoints/frames-000000204800/trainer.pt             optimiser, counters, generators, environments, memory
     checkpoints/frames-000000204800/meta.json              format, config, frames, checksums; written last
 
+A learner with a replay keeps it beside, in ``replay/`` of the run: the trainer's state names its files.
 Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights_only=True``.
 """
 
-import hashlib
 import json
 import os
 import pickle
 import shutil
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.files import checksum as _checksum
 from arcade_torch.agents.files import write_atomic
 from arcade_torch.agents.plain import from_plain, to_plain
 
@@ -137,13 +139,19 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
     return Checkpoint(config, frames, weights, trainer, path)
 
 
-def load_latest(folder: Path, expect: TrainConfig | None = None, weights_only: bool = False) -> Checkpoint:
+def load_latest(
+    folder: Path,
+    expect: TrainConfig | None = None,
+    weights_only: bool = False,
+    use: Callable[[Checkpoint], None] | None = None,
+) -> Checkpoint:
     """Load the newest checkpoint that is whole, falling back to the one before it with a warning.
 
     Args:
         folder: ``checkpoints/`` of a run.
         expect: see :func:`load_checkpoint`; a checkpoint of another run is an error, never skipped.
         weights_only: see :func:`load_checkpoint`.
+        use: called with the checkpoint; one for which it raises ``CheckpointError`` counts as damaged.
 
     Returns:
         The checkpoint.
@@ -163,6 +171,12 @@ def load_latest(folder: Path, expect: TrainConfig | None = None, weights_only: b
             continue
         if expect is not None and (fields := differing_fields(found.config, expect)):
             raise CheckpointError(f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}")
+        try:
+            if use is not None:
+                use(found)
+        except CheckpointError as error:
+            problems.append(str(error))
+            continue
         if problems:
             warnings.warn(f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2)
         return found
@@ -189,8 +203,3 @@ def _read_meta(path: Path) -> dict[str, Any]:
         found = meta.get("format") if isinstance(meta, dict) else None
         raise CheckpointError(f"checkpoint {path} has format {found!r}; this version reads format {FORMAT}")
     return meta
-
-
-def _checksum(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -55,6 +55,23 @@ def held_out_seed(seed: int) -> int:
     return SEED_LIMIT + seed
 
 
+def twins(observability: Literal["full", "partial", "mixed"], num_envs: int) -> Literal["full", "partial"] | Tensor:
+    """What ``arcade_torch.make`` takes for an ``observability`` of :class:`TrainConfig`.
+
+    Args:
+        observability: ``"full"``, ``"partial"`` or ``"mixed"``.
+        num_envs: N.
+
+    Returns:
+        The word, or for ``"mixed"`` bool [N]: MDPs first, then (the larger half) POMDPs.
+
+    Example:
+        >>> twins("mixed", 4)
+        tensor([False, False,  True,  True])
+    """
+    return torch.arange(num_envs) >= num_envs // 2 if observability == "mixed" else observability
+
+
 def make_eval_env(config: TrainConfig, episodes: int, observability: Literal["full", "partial"] | None = None) -> Any:
     """The environments an evaluation of this config plays in, one an episode.
 
@@ -69,7 +86,7 @@ def make_eval_env(config: TrainConfig, episodes: int, observability: Literal["fu
     return arcade_torch.make(
         config.env,
         num_envs=episodes,
-        observability=observability or config.observability,
+        observability=twins(observability or config.observability, episodes),
         obs_size=config.obs_size,
         seed=held_out_seed(0),
         device=config.device,
@@ -92,8 +109,8 @@ def evaluate(
 
     Args:
         agent: an ``Agent``; with ``env`` given, anything with ``initial_state`` and ``act``.
-        observability: twin to play; default the one the agent was trained on. With ``env`` given, its own is put back
-            afterwards.
+        observability: twin to play; default the one the agent was trained on (of a mixed training, half the episodes
+            each). With ``env`` given, its own is put back afterwards.
         episodes: number of environments, and of episodes.
         seed: evaluation seed in [0, 2**30); the same seed plays the same episodes for every agent. Disjoint from all
             training seeds, see :func:`held_out_seed`.

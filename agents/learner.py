@@ -1,43 +1,25 @@
-"""One update of PQN: minibatches of whole sequences, several epochs, and a guard against numbers that are none."""
+"""One update of any learner: minibatches of whole sequences, and a guard against numbers that are none."""
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
+from arcade_torch.agents.learner_config import LearnerConfig
 from arcade_torch.agents.optim import clip_gradients, make_optimizer, set_learning_rate
-from arcade_torch.agents.pqn import PQNConfig, PQNLoss
-from arcade_torch.agents.schedules import linear
-from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.agents.window import Window
 
 
 class NonFiniteError(RuntimeError):
     """A quantity of the training became NaN or infinite."""
 
 
-@dataclass(frozen=True)
-class UpdateMetrics:
-    """Means over the gradient steps of one update.
-
-    Attributes:
-        loss: the PQN loss.
-        q_mean: Q-value of the actions taken.
-        td_error: mean absolute distance to the target.
-        grad_norm: norm of the gradients before clipping.
-        lr: step size at the last gradient step.
-    """
-
-    loss: float
-    q_mean: float
-    td_error: float
-    grad_norm: float
-    lr: float
-
-
-class PQNLearner:
-    """Network, loss and optimiser.
+class Learner(ABC):
+    """Network, loss and optimiser; a learner says where minibatches come from and what their loss is.
 
     Args:
         network: what to train.
@@ -46,65 +28,86 @@ class PQNLearner:
         generator: CPU generator of the minibatch order.
     """
 
+    OPTIMIZER: ClassVar[Literal["radam", "adam"]] = "radam"
+
     def __init__(
-        self, network: MemoryNetwork, config: PQNConfig, total_frames: int, generator: torch.Generator
+        self, network: nn.Module, config: LearnerConfig, total_frames: int, generator: torch.Generator
     ) -> None:
-        self.network, self.config, self.total_frames, self.generator = network, config, total_frames, generator
-        self.loss = PQNLoss.from_config(network, config)
+        self.network, self.total_frames, self.generator = network, total_frames, generator
+        self.numbers = config
         self.parameters = [p for p in network.parameters() if p.requires_grad]
-        self.optimizer = make_optimizer(self.parameters, config.learning_rate)
+        self.optimizer = make_optimizer(self.parameters, config.learning_rate, self.OPTIMIZER)
         self.grad_steps = 0
 
-    def learning_rate(self, frames: float) -> float:
-        """Step size after ``frames`` frames."""
-        c = self.config
-        return linear(c.learning_rate, c.learning_rate_end, frames, c.learning_rate_share * self.total_frames)
+    @abstractmethod
+    def minibatches(self, batch: TensorDictBase) -> Iterator[Window]:
+        """What to train on after a window was collected, in the order of use; nothing before learning starts.
 
-    def learn(self, batch: TensorDictBase, frames: int) -> UpdateMetrics:
-        """Train on one window of sequences.
+        Args:
+            batch: sequences [num_envs].
+        """
+
+    @abstractmethod
+    def objective(self, window: Window) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of a minibatch, and detached scalars by their column of ``metrics.csv``, always the same ones."""
+
+    def learn(self, batch: TensorDictBase, frames: int) -> dict[str, float]:
+        """Learn from one window of sequences.
 
         Args:
             batch: sequences [num_envs].
             frames: frames counted before this window.
 
         Returns:
-            Means over the gradient steps.
+            Means over the gradient steps, by column of ``metrics.csv``; those of the loss are absent before learning
+            starts.
 
         Raises:
             NonFiniteError: a reward, the loss, the gradient or a weight is not finite; names the gradient step.
         """
-        config = self.config
-        window = self.loss.read(batch)
+        if not bool(batch.get(("next", "reward")).isfinite().all()):
+            raise NonFiniteError("a reward is not finite")
+        numbers = self.numbers
         records: list[Tensor] = []
-        steps = config.grad_steps_per_update
-        for step, rows in enumerate(self._minibatches(window.action.shape[0])):
-            set_learning_rate(self.optimizer, self.learning_rate(frames + config.frames_per_update * step / steps))
-            out = self.loss.compute(window.rows(rows))
+        names: list[str] = []
+        rate, steps = numbers.learning_rate_at(frames, self.total_frames), numbers.grad_steps_per_update
+        for step, window in enumerate(self.minibatches(batch)):
+            rate = numbers.learning_rate_at(frames + numbers.frames_per_update * step / steps, self.total_frames)
+            set_learning_rate(self.optimizer, rate)
+            loss, metrics = self.objective(window)
             self.optimizer.zero_grad()
-            out.loss.backward()
-            norm = clip_gradients(self.parameters, config.max_grad_norm)
+            loss.backward()
+            norm = clip_gradients(self.parameters, numbers.max_grad_norm)
             self.optimizer.step()
-            error = (out.chosen - out.target).abs().mean()
-            records.append(torch.stack((out.loss.detach(), norm, out.chosen.mean(), error)))
-        self.grad_steps += steps
+            names = ["loss", "grad_norm", *metrics]
+            records.append(torch.stack((loss.detach(), norm, *metrics.values())))
+        if not records:
+            return {"lr": rate}
+        self.grad_steps += len(records)
         table = torch.stack(records).cpu()
-        self._guard(window.reward, table)
-        loss, norm_mean, q_mean, td_error = table.mean(0).tolist()
-        return UpdateMetrics(loss, q_mean, td_error, norm_mean, self.optimizer.param_groups[0]["lr"])
+        self._guard(table)
+        return dict(zip(names, table.mean(0).tolist(), strict=True)) | {"lr": rate}
 
-    def _minibatches(self, num_rows: int) -> list[list[int]]:
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the weights and the generator that the coming updates depend on."""
+        return {"optimizer": self.optimizer.state_dict(), "grad_steps": self.grad_steps}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go back to a saved moment; the weights are loaded elsewhere."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.grad_steps = state["grad_steps"]
+
+    def row_numbers(self, num_rows: int) -> list[list[int]]:
         """Row numbers of every minibatch of every epoch, in the order they are used."""
-        size = num_rows // self.config.minibatches
+        size = num_rows // self.numbers.minibatches
         batches: list[list[int]] = []
-        for _ in range(self.config.epochs):
+        for _ in range(self.numbers.epochs):
             order = torch.randperm(num_rows, generator=self.generator).tolist()
             batches += [order[i : i + size] for i in range(0, num_rows, size)]
         return batches
 
-    def _guard(self, reward: Tensor, table: Tensor) -> None:
+    def _guard(self, table: Tensor) -> None:
         """Look once an update, so that no gradient step waits for the device."""
-        if not bool(reward.isfinite().all()):
-            raise NonFiniteError("a reward is not finite")
         for step, (loss, norm, *_) in enumerate(table.tolist()):
             for name, value in (("loss", loss), ("gradient norm", norm)):
                 if not math.isfinite(value):

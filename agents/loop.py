@@ -1,4 +1,4 @@
-"""The training loop: collect, learn, log, evaluate, save; the same for every memory model, and for none."""
+"""The training loop: collect, learn, log, evaluate, save; the same for every algorithm, memory model, and for none."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from arcade_torch.agents.agent import Agent
-from arcade_torch.agents.checkpoint import list_checkpoints, load_latest, save_checkpoint
+from arcade_torch.agents.checkpoint import Checkpoint, list_checkpoints, load_latest, save_checkpoint
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
 from arcade_torch.agents.files import CsvLog, read_csv, write_json
@@ -80,7 +80,7 @@ def train(
     if (result := folder.finished()) is not None:
         return _result_from(folder.path, result)
     with _threads(config.threads):
-        trainer = Trainer(config)
+        trainer = Trainer(config, folder.replay)
         try:
             folder.claim(config)
             return _Run(config, folder, trainer, progress).go()
@@ -127,12 +127,14 @@ class _Run:
     def _start(self) -> None:
         """From the newest whole checkpoint, or from the beginning."""
         if list_checkpoints(self.folder.checkpoints):
-            checkpoint = load_latest(self.folder.checkpoints, expect=self.config)
-            assert checkpoint.trainer is not None
-            self.trainer.load(checkpoint.weights, checkpoint.trainer)
-            self.saved_at = checkpoint.frames
+            found = load_latest(self.folder.checkpoints, expect=self.config, use=self._go_on_from)
+            self.saved_at = found.frames
         else:
             self.trainer.warm_up()
+
+    def _go_on_from(self, checkpoint: Checkpoint) -> None:
+        assert checkpoint.trainer is not None
+        self.trainer.load(checkpoint.weights, checkpoint.trainer)
 
     def _update(self, metrics: CsvLog, evals: CsvLog) -> None:
         trainer = self.trainer
@@ -148,7 +150,7 @@ class _Run:
 
     def _crossed(self, every: int) -> bool:
         """Whether the last update passed a multiple of ``every`` frames."""
-        before = self.trainer.frames - self.config.pqn.frames_per_update
+        before = self.trainer.frames - self.config.learner.frames_per_update
         return every > 0 and self.trainer.frames // every > before // every
 
     def _evaluate(self, evals: CsvLog) -> EvalResult:

@@ -1,4 +1,4 @@
-"""What the agents ask of others: a recurrent Q-network, and something that plays."""
+"""What the agents ask of others: a recurrent network of Q-values, or of logits and a value, and a player."""
 
 from typing import Protocol
 
@@ -31,6 +31,22 @@ class QNetwork(Protocol):
 
     def initial_state(self, batch_size: int, /) -> TensorDictBase:
         """State before the first observation, TensorDict [B]."""
+        ...
+
+
+class ActorCritic(QNetwork, Protocol):
+    """The part of ``ActorCriticNetwork`` that PPO uses: outputs are A logits and a value, the critic can run alone.
+
+    The state has the entries "actor" and "critic"; ``critic`` reads the second and gives float [B, T, 1].
+    """
+
+    @property
+    def critic(self) -> QNetwork:
+        """The tower of the value."""
+        ...
+
+    def split(self, out: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Output float [..., A + 1] as (logits [..., A], value [...])."""
         ...
 
 

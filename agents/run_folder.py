@@ -22,6 +22,12 @@ METRIC_COLUMNS = (
     "q_mean",
     "td_error",
     "grad_norm",
+    "policy_loss",
+    "value_loss",
+    "entropy",
+    "kl",
+    "clip_share",
+    "replay_frames",
     "epsilon",
     "lr",
     "train_return",
@@ -29,7 +35,8 @@ METRIC_COLUMNS = (
     "train_return_last",
     "episodes",
 )
-"""Columns of ``metrics.csv``. ``seconds`` is time spent collecting and learning. ``train_return`` is the mean return of
+"""Columns of ``metrics.csv``; a cell that means nothing for an algorithm is empty. ``seconds`` is time spent
+collecting and learning. ``train_return`` is the mean return of
 the episodes that ended in the window (empty if none), ``train_return_ewm`` its running average, and
 ``train_return_last`` the last finished return of every environment averaged over the window, which is what the paper's
 score reads."""
@@ -51,6 +58,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoints = path / "checkpoints"
+        self.replay = path / "replay"
         self._reported = 0.0
 
     def check(self, config: TrainConfig, resume: bool) -> None:

@@ -1,4 +1,4 @@
-"""The lambda-return of Q-learning: one pure function, no network, no environment."""
+"""Returns and advantages: pure functions, no network, no environment."""
 
 from typing import Literal
 
@@ -52,15 +52,70 @@ def q_lambda_return(
         >>> q_lambda_return(ones, ones, no, no, gamma=0.5, lam=1.0)
         tensor([[1.8750, 1.7500, 1.5000]])
     """
-    _check(reward, next_value, terminated, truncated, gamma, lam, time_limit)
-    done = terminated | truncated
-    if time_limit == "terminal":
-        terminated = done
-    trace = torch.where(done, 0.0, gamma * lam).to(reward.dtype)
-    trace[:, -1] = 0.0
-    value = torch.where(terminated, 0.0, next_value)
+    _check((reward, next_value, terminated, truncated), gamma, lam, time_limit)
+    value, trace = _bootstrap(reward, next_value, terminated, truncated, gamma * lam, time_limit)
     base = reward + (gamma - trace) * value
     return _solve_backward(base, trace)
+
+
+def gae(
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit = "bootstrap",
+) -> Tensor:
+    r"""Generalised advantage estimate over a window.
+
+    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``, in which the value
+    ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a termination::
+
+        A[t] = delta[t]                                at an end and at the last step
+        A[t] = delta[t] + gamma * lam * A[t + 1]       elsewhere
+
+    ``A + v`` is the value target: the lambda-return, where ``v'[t]`` and ``v[t + 1]`` agree.
+
+    Args:
+        reward: float [B, T], reward received on leaving observation ``t``.
+        value: float [B, T], value of observation ``t``.
+        next_value: float [B, T], value of the true next observation: the final frame where an episode was cut. Values
+            at terminated steps are ignored, whatever they are.
+        terminated: bool [B, T], the task's own end; removes the bootstrap and cuts the recursion.
+        truncated: bool [B, T], cut by a limit; keeps the bootstrap, cuts the recursion.
+        gamma: discount per step, in [0, 1].
+        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the value.
+        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a termination, as the published
+            implementation does.
+
+    Returns:
+        float [B, T], in the dtype of ``reward``.
+
+    Raises:
+        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+
+    Source: Schulman et al., arXiv 1506.02438, equation 16.
+
+    Example:
+        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> gae(ones, ones, ones, no, no, gamma=0.5, lam=1.0)
+        tensor([[0.8750, 0.7500, 0.5000]])
+    """
+    _check((reward, value, next_value, terminated, truncated), gamma, lam, time_limit)
+    after, trace = _bootstrap(reward, next_value, terminated, truncated, gamma * lam, time_limit)
+    return _solve_backward(reward + gamma * after - value, trace)
+
+
+def _bootstrap(
+    reward: Tensor, next_value: Tensor, terminated: Tensor, truncated: Tensor, decay: float, time_limit: TimeLimit
+) -> tuple[Tensor, Tensor]:
+    """What a step may count on: the next value, 0 behind an end, and the trace, 0 at every end and at the last step."""
+    done = terminated | truncated
+    trace = torch.where(done, 0.0, decay).to(reward.dtype)
+    trace[:, -1] = 0.0
+    return torch.where(done if time_limit == "terminal" else terminated, 0.0, next_value), trace
 
 
 def _solve_backward(base: Tensor, trace: Tensor) -> Tensor:
@@ -75,18 +130,10 @@ def _solve_backward(base: Tensor, trace: Tensor) -> Tensor:
     return base
 
 
-def _check(
-    reward: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    gamma: float,
-    lam: float,
-    time_limit: str,
-) -> None:
-    shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated)}
-    if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
-        raise ValueError(f"reward, next_value, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
+def _check(parts: tuple[Tensor, ...], gamma: float, lam: float, time_limit: str) -> None:
+    shapes = {tuple(x.shape) for x in parts}
+    if len(shapes) != 1 or parts[0].ndim != 2 or parts[0].shape[1] == 0:
+        raise ValueError(f"rewards, values, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
     if not 0.0 <= gamma <= 1.0 or not 0.0 <= lam <= 1.0:
         raise ValueError(f"gamma and lambda must lie in [0, 1]; got gamma={gamma}, lambda={lam}")
     if time_limit not in ("bootstrap", "terminal"):

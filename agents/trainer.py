@@ -1,6 +1,7 @@
-"""One PQN run in memory: environments, actor, learner, and the state that makes it resumable."""
+"""One run in memory: environments, actor, learner, and the state that makes it resumable."""
 
 import time
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,34 +11,36 @@ from torch import Tensor
 import arcade_torch
 from arcade_torch.agents.actor import EpsilonGreedyActor
 from arcade_torch.agents.agent import build_network
+from arcade_torch.agents.algorithms import ALGORITHMS
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.learner import NonFiniteError, PQNLearner
+from arcade_torch.agents.evaluation import twins
+from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.metrics import EpisodeStats
-from arcade_torch.agents.schedules import linear
 
 _CALIBRATION_FRAMES = 3200
 
 
 class Trainer:
-    """Collects and learns, one update at a time.
+    """Collects and learns, one update at a time; the same for every algorithm and memory.
 
     Args:
         config: of the run.
+        replay_folder: where a replay writes, made when first needed; None for a temporary folder.
     """
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
         self.config = config
-        pqn = config.pqn
+        numbers, algorithm = config.learner, ALGORITHMS[config.algorithm]
         self.network = build_network(config)
-        self.total_frames = config.num_updates * pqn.frames_per_update
+        self.total_frames = config.num_updates * numbers.frames_per_update
         self.explore = torch.Generator(config.device).manual_seed(config.seed)
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
-        self.actor = EpsilonGreedyActor(self.network, 1.0, self.explore)
-        self.learner = PQNLearner(self.network, pqn, self.total_frames, self.shuffle)
+        self.actor = algorithm.make_actor(self.network, self.explore)
+        self.learner = algorithm.make_learner(self.network, config, self.total_frames, self.shuffle, replay_folder)
         self.env = arcade_torch.make(
             config.env,
-            num_envs=pqn.num_envs,
-            observability=config.observability,
+            num_envs=numbers.num_envs,
+            observability=twins(config.observability, numbers.num_envs),
             obs_size=config.obs_size,
             seed=config.seed,
             device=config.device,
@@ -47,13 +50,13 @@ class Trainer:
         self.collector = arcade_torch.ArcadeCollector(
             self.env,
             self.actor,
-            frames_per_batch=pqn.frames_per_update,
+            frames_per_batch=numbers.frames_per_update,
             total_frames=-1,
-            context=pqn.context,
+            context=numbers.prefix,
             compress=self.network.compress,
-            final_frames="truncated" if pqn.time_limit == "bootstrap" else "none",
+            final_frames="truncated" if numbers.time_limit == "bootstrap" else "none",
         )
-        self.stats = EpisodeStats.start(pqn.num_envs)
+        self.stats = EpisodeStats.start(numbers.num_envs)
         self.frames = self.updates = 0
         self.seconds = 0.0
 
@@ -62,21 +65,22 @@ class Trainer:
         """Whether all updates were made."""
         return self.updates >= self.config.num_updates
 
-    def epsilon(self) -> float:
-        """Exploration at the present frame count."""
-        pqn = self.config.pqn
-        return linear(pqn.epsilon_start, pqn.epsilon_end, self.frames, pqn.epsilon_share * self.total_frames)
+    def epsilon(self) -> float | None:
+        """Exploration at the present frame count; None where the policy itself is sampled."""
+        return self.config.learner.epsilon_at(self.frames, self.total_frames)
 
     def warm_up(self) -> None:
         """Random play before training: fills the context and calibrates the input scaling; not counted as frames."""
-        pqn = self.config.pqn
-        windows = -(-max(0, pqn.warmup_steps - pqn.context) // pqn.num_steps)  # the first one fills the context too
-        self.actor.epsilon = 1.0
+        numbers = self.config.learner
+        steps = max(0, numbers.warmup_steps - numbers.prefix)  # the first window fills the context too
+        windows = -(-steps // numbers.num_steps)
         seen: list[Tensor] = []
+        self.actor.uniform = True
         for _ in range(windows):
             frames = self._new_steps(self.collector.collect().get("pixels")).flatten(0, 1)
             stride = max(1, frames.shape[0] * windows // _CALIBRATION_FRAMES)
             seen.append(frames[::stride].clone())
+        self.actor.uniform = False
         if seen:
             self.network.calibrate(torch.cat(seen))
 
@@ -90,14 +94,16 @@ class Trainer:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
         """
         began = time.perf_counter()
-        self.actor.epsilon = epsilon = self.epsilon()
+        epsilon = self.epsilon()
+        if isinstance(self.actor, EpsilonGreedyActor) and epsilon is not None:
+            self.actor.epsilon = epsilon
         batch = self.collector.collect()
         last = self._follow_episodes(batch)
         try:
             metrics = self.learner.learn(batch, self.frames)
         except NonFiniteError as error:
             raise NonFiniteError(f"update {self.updates + 1} (after {self.frames} frames): {error}") from error
-        self.frames += self.config.pqn.frames_per_update
+        self.frames += self.config.learner.frames_per_update
         self.updates += 1
         took = time.perf_counter() - began
         self.seconds += took
@@ -107,13 +113,9 @@ class Trainer:
             "updates": self.updates,
             "grad_steps": self.learner.grad_steps,
             "seconds": self.seconds,
-            "fps": self.config.pqn.frames_per_update / took,
-            "loss": metrics.loss,
-            "q_mean": metrics.q_mean,
-            "td_error": metrics.td_error,
-            "grad_norm": metrics.grad_norm,
+            "fps": self.config.learner.frames_per_update / took,
+            **metrics,
             "epsilon": epsilon,
-            "lr": metrics.lr,
             "train_return": sum(finished) / len(finished) if finished else None,
             "train_return_ewm": self.stats.smooth,
             "train_return_last": last,
@@ -123,8 +125,7 @@ class Trainer:
     def state_dict(self) -> dict[str, Any]:
         """Everything but the weights that the rest of the run depends on."""
         return {
-            "optimizer": self.learner.optimizer.state_dict(),
-            "grad_steps": self.learner.grad_steps,
+            **self.learner.state_dict(),
             "explore": self.explore.get_state(),
             "shuffle": self.shuffle.get_state(),
             "collector": self.collector.state_dict(),
@@ -140,10 +141,12 @@ class Trainer:
         Args:
             weights: the network's ``state_dict``.
             state: from :meth:`state_dict`.
+
+        Raises:
+            CheckpointError: a file of the replay is missing or damaged.
         """
+        self.learner.load_state_dict(state)
         self.network.load_state_dict(weights)
-        self.learner.optimizer.load_state_dict(state["optimizer"])
-        self.learner.grad_steps = state["grad_steps"]
         self.explore.set_state(state["explore"])
         self.shuffle.set_state(state["shuffle"])
         self.collector.load_state_dict(state["collector"])
@@ -160,4 +163,4 @@ class Trainer:
 
     def _new_steps(self, entry: Tensor) -> Tensor:
         """Without the context that the previous window already had."""
-        return entry[:, entry.shape[1] - self.config.pqn.num_steps :]
+        return entry[:, entry.shape[1] - self.config.learner.num_steps :]

@@ -8,13 +8,14 @@ gives the exact value of every next observation for any causal memory model, and
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from arcade_torch.agents.protocols import QNetwork
 from arcade_torch.agents.targets import TimeLimit
 
 Bootstrap = Literal["next", "last"]
@@ -38,6 +39,11 @@ class WindowKeys:
     initial_state: Key = "initial_state"
     state: Key = "memory"
 
+    def required(self) -> list[object]:
+        """Entries that every batch must hold."""
+        roots: list[object] = [self.pixels, self.action, self.last_action, self.is_init]
+        return [*roots, self.reward, self.terminated, self.truncated]
+
 
 @dataclass(frozen=True)
 class Window:
@@ -58,6 +64,7 @@ class Window:
         is_init: bool [B, L + K], of the extended sequence.
         inserted: per row the number of places in use (host integers, so that choosing K needs no synchronisation).
         shuffled: per row whether something is inserted before the end.
+        extras: what a learner wants to have beside the experience, each [B, ...].
     """
 
     pixels: Tensor
@@ -74,6 +81,7 @@ class Window:
     is_init: Tensor
     inserted: list[int]
     shuffled: list[bool]
+    extras: dict[str, Tensor] = field(default_factory=dict)
 
     def rows(self, index: list[int]) -> "Window":
         """The windows of some rows, with only as many inserted places as these rows use.
@@ -103,7 +111,27 @@ class Window:
             is_init=self.is_init[:, :total].index_select(0, rows),
             inserted=inserted,
             shuffled=[self.shuffled[i] for i in index],
+            extras={name: value.index_select(0, rows) for name, value in self.extras.items()},
         )
+
+    def roots(self) -> "Window":
+        """The same without the final observations that were inserted: L positions, for a pass that needs no targets."""
+        num_rows, length = self.action.shape
+        order = torch.arange(length, device=self.action.device).expand(num_rows, -1)
+        return replace(
+            self,
+            slot=self.slot[:, :0],
+            order=order,
+            position=order,
+            last_action=self.last_action.gather(1, self.position),
+            is_init=self.is_init.gather(1, self.position),
+            inserted=[0] * num_rows,
+            shuffled=[False] * num_rows,
+        )
+
+    def with_extras(self, **extras: Tensor) -> "Window":
+        """The same with further entries [B, ...]."""
+        return replace(self, extras={**self.extras, **extras})
 
     def extend(self, features: Tensor, inserted: Tensor) -> Tensor:
         """Put the inserted places where they belong.
@@ -121,6 +149,27 @@ class Window:
         rows, total = both.shape[:2]
         start = torch.arange(rows, device=both.device).unsqueeze(1) * total
         return both.flatten(0, 1).index_select(0, (self.order + start).flatten()).view_as(both)
+
+
+def outputs_along(network: QNetwork, window: Window, state: TensorDictBase | None = None) -> Tensor:
+    """Read a window once.
+
+    Args:
+        network: what reads it.
+        window: the experience.
+        state: recurrent state before index 0, TensorDict [B]; default that of the window.
+
+    Returns:
+        float [B, L + K, A], outputs along the extended sequence. The features of inserted observations carry no
+        gradient: they only lend their value.
+    """
+    features = network.encode(window.pixels)
+    if window.slot.shape[1]:
+        with torch.no_grad():
+            inserted = network.encode(window.pool[window.slot])
+        features = window.extend(features, inserted)
+    out, _ = network.remember(features, window.last_action, window.is_init, window.state if state is None else state)
+    return out
 
 
 def read_window(

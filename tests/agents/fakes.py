@@ -1,4 +1,4 @@
-"""A toy recurrent Q-network and a random stream of experience with known final frames."""
+"""Toy recurrent networks and a random stream of experience with known final frames."""
 
 from dataclasses import dataclass
 
@@ -6,19 +6,21 @@ import torch
 from tensordict import NonTensorData, TensorDict
 from torch import Tensor, nn
 
+from arcade_torch.models.actor_critic import ActorCriticNetwork
+
 ACTIONS = 5
 
 
 class ToyNetwork(nn.Module):
     """The interface of MemoryNetwork over a tiny gated recurrence, stepped by a plain loop."""
 
-    def __init__(self, seed: int = 0, width: int = 6, pixels: int = 12) -> None:
+    def __init__(self, seed: int = 0, width: int = 6, pixels: int = 12, outputs: int = ACTIONS) -> None:
         super().__init__()
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.eye = nn.Linear(pixels, width)
             self.inner = nn.Linear(width + ACTIONS + width, width)
-            self.head = nn.Linear(width, ACTIONS)
+            self.head = nn.Linear(width, outputs)
         self.width = width
 
     def compress(self, pixels: Tensor) -> Tensor:
@@ -44,6 +46,11 @@ class ToyNetwork(nn.Module):
 
     def initial_state(self, batch_size: int) -> TensorDict:
         return TensorDict({"h": self.head.weight.new_zeros(batch_size, self.width)}, [batch_size])
+
+
+def toy_actor_critic(seed: int = 0) -> ActorCriticNetwork:
+    """Two toys behind the interface of an actor-critic."""
+    return ActorCriticNetwork(ToyNetwork(seed), ToyNetwork(seed + 1, outputs=1))  # type: ignore[arg-type]
 
 
 class Pool:

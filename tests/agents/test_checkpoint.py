@@ -18,9 +18,9 @@ from arcade_torch.agents.checkpoint import (
     load_latest,
     save_checkpoint,
 )
-from arcade_torch.agents.config import preset
 from arcade_torch.agents.files import CsvLog, read_csv
 from arcade_torch.agents.plain import from_plain, to_plain
+from arcade_torch.agents.presets import preset
 
 CONFIG = preset("smoke")
 

@@ -5,8 +5,10 @@ import json
 
 import pytest
 
-from arcade_torch.agents.config import TrainConfig, differing_fields, preset, preset_names
+from arcade_torch.agents.config import GROUPS, TrainConfig, differing_fields
+from arcade_torch.agents.dqn import DQNConfig
 from arcade_torch.agents.pqn import PQNConfig
+from arcade_torch.agents.presets import preset, preset_names
 
 
 def test_the_defaults_are_the_papers_numbers():
@@ -39,7 +41,11 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     c = preset("reference", env="CartPoleEasy", seed=3)
     quirks = {"time_limit": "terminal", "bootstrap": "last"}
     changes = {"rules": "reference", "network_options": {"skip": "none"}, "pqn": quirks}
-    assert c == preset("paper", env="CartPoleEasy", seed=3, **changes)
+    assert differing_fields(c, preset("paper", env="CartPoleEasy", seed=3, **changes)) == []
+    ppo = preset("reference", algorithm="ppo", env="CartPoleEasy")
+    assert (ppo.ppo.time_limit, ppo.network_options) == ("terminal", {"skip": "none", "use_last_action": False})
+    dqn = preset("reference", algorithm="dqn", env="CartPoleEasy").dqn
+    assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
 
 def test_the_small_preset_takes_1552_gradient_steps_in_200k_frames():
@@ -63,9 +69,10 @@ def test_a_preset_can_be_changed_down_to_its_learner():
     ("change", "words"),
     [
         ({"total_frames": 10}, "at least one update of 64 envs x 32 steps = 2048 frames"),
-        ({"observability": "half"}, "'full' or 'partial'"),
+        ({"observability": "half"}, "'full', 'partial' or 'mixed'; got 'half'"),
         ({"rules": "old"}, "'default' or 'reference'"),
-        ({"algorithm": "sarsa"}, "'pqn'"),
+        ({"algorithm": "sarsa"}, "'pqn', 'ppo' or 'dqn'; got 'sarsa'"),
+        ({"total_frames": float("inf")}, "total_frames must be a whole number"),
         ({"seed": -1}, "seed"),
         ({"seed": 2**30}, "seed"),
         ({"seed": 1.5}, "seed must be a whole number; got 1.5"),
@@ -96,3 +103,69 @@ def test_differing_fields_are_named_but_for_those_that_do_not_matter():
     other = dataclasses.replace(one, seed=1, threads=7, pqn=dataclasses.replace(one.pqn, lam=0.5))
     assert differing_fields(one, other) == ["pqn.lam (0.8 != 0.5)", "seed (0 != 1)"]
     assert differing_fields(one, dataclasses.replace(one, checkpoint_every=1)) == []
+
+
+BAD = [
+    *[
+        (a, f, v)
+        for a in ("pqn", "ppo", "dqn")
+        for f in ("num_envs", "num_steps", "epochs", "minibatches")
+        for v in (0, -1)
+    ],
+    *[(a, "warmup_steps", -1) for a in ("pqn", "ppo", "dqn")],
+    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("gamma", "lam", "learning_rate_share") for v in (-0.1, 1.1)],
+    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("learning_rate", "max_grad_norm") for v in (0.0, -1.0)],
+    *[(a, "gamma", float("nan")) for a in ("pqn", "ppo", "dqn")],
+    *[(a, "learning_rate_end", -1e-9) for a in ("pqn", "ppo", "dqn")],
+    *[(a, "time_limit", "never") for a in ("pqn", "ppo", "dqn")],
+    *[(a, "minibatches", 7) for a in ("pqn", "ppo", "dqn")],
+    *[(a, f, 1.5) for a in ("pqn", "dqn") for f in ("epsilon_start", "epsilon_end", "epsilon_share")],
+    *[(a, "context", v) for a in ("pqn", "dqn") for v in (-1, 129)],
+    ("pqn", "bootstrap", "first"),
+    ("ppo", "clip", 0.0),
+    ("ppo", "entropy_weight", -0.1),
+    ("ppo", "value_weight", -0.1),
+    ("dqn", "batch_sequences", 0),
+    ("dqn", "learning_starts", 0),
+    ("dqn", "replay_ram", -1),
+    ("dqn", "burn_in", -1),
+    ("dqn", "burn_in", 132),
+    ("dqn", "target_every", -1),
+    ("dqn", "targets", "old"),
+    ("dqn", "replay_frames", 10),
+]
+
+
+@pytest.mark.parametrize(("algorithm", "field", "value"), BAD)
+def test_every_number_out_of_range_gets_one_line_that_names_it(algorithm, field, value):
+    with pytest.raises(ValueError, match=rf"^{algorithm}\.{field} must be .*; got ") as info:
+        GROUPS[algorithm](**{field: value})
+    assert "\n" not in str(info.value)
+
+
+def test_every_number_of_every_learner_is_tried_out_of_range():
+    tried = {(algorithm, field) for algorithm, field, _ in BAD}
+    assert tried == {(name, f.name) for name, kind in GROUPS.items() for f in dataclasses.fields(kind)}
+
+
+def test_numbers_of_another_algorithm_are_refused_where_they_would_do_nothing():
+    with pytest.raises(ValueError, match="the algorithm is 'ppo', its numbers are ppo"):
+        preset("small", algorithm="ppo", pqn={"gamma": 0.5})
+    assert preset("small", algorithm="ppo", ppo={"gamma": 0.0}).learner.gamma == 0.0
+
+
+def test_mixed_twins_need_an_even_number_of_environments():
+    with pytest.raises(ValueError, match=r"ppo\.num_envs must be even"):
+        preset("small", algorithm="ppo", observability="mixed", ppo={"num_envs": 3, "minibatches": 1})
+
+
+def test_stored_targets_and_a_target_network_exclude_each_other():
+    with pytest.raises(ValueError, match=r"dqn\.target_every must be 0 with targets='stored'"):
+        DQNConfig(targets="stored", target_every=10)
+
+
+def test_every_preset_has_numbers_for_every_algorithm():
+    for name in preset_names():
+        for algorithm in GROUPS:
+            config = preset(name, algorithm=algorithm)
+            assert config.learner is getattr(config, algorithm) and config.num_updates >= 1

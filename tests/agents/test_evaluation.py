@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 
 import arcade_torch
-from arcade_torch.agents.config import preset
 from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_eval_env
+from arcade_torch.agents.presets import preset
 
 EPISODES = 6
 

@@ -186,8 +186,8 @@ def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
     made = []
     real = loop.Trainer
 
-    def spy(config):
-        made.append(real(config))
+    def spy(*args):
+        made.append(real(*args))
         return made[-1]
 
     monkeypatch.setattr(loop, "Trainer", spy)

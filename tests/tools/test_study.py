@@ -351,3 +351,10 @@ def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
     with Display(Watcher({run.name: folder.run(run)}, 2048), "toy", every_s=0.01, stream=stream):
         time.sleep(0.1)
     assert "toy" in stream.getvalue() and "50%" in stream.getvalue()
+
+
+def test_numbers_of_a_learner_are_given_to_its_own_runs_only() -> None:
+    what = small_study(algorithms=("pqn", "ppo"), settings={"pqn": {"gamma": 0.9}, "ppo": {"clip": 0.1}})
+    for run in what.runs():
+        words = what.arguments(run, Path("here"))
+        assert ("--pqn.gamma" in words, "--ppo.clip" in words) == (run.algorithm == "pqn", run.algorithm == "ppo")

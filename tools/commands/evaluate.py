@@ -37,8 +37,9 @@ class Evaluate:
         returns = [float(value) for value in result.returns]
         mean, half = mean_and_half_width(returns)
         twin = self.observability or agent.config.observability
+        config = agent.config
         print(
-            f"{agent.config.env} ({twin}), {agent.config.memory}, {agent.frames:,} frames of training: "
+            f"{config.env} ({twin}), {config.algorithm} {config.memory}, {agent.frames:,} frames of training: "
             f"mean return {mean:.3f} +- {half:.3f} (95 %) over {len(returns)} episodes"
         )
         if self.json is not None:

@@ -1,9 +1,7 @@
 """``arcade-torch train``."""
 
 import dataclasses
-import json
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +9,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from arcade_torch.agents.config import TrainConfig, preset
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.presets import preset
 from arcade_torch.tools import cli
+from arcade_torch.tools.extensions import command_line
+from arcade_torch.tools.name_value import name_and_value
 from arcade_torch.tools.train_bar import TrainBar
 
 _WHOLE = re.compile(r"\d+(\.\d*)?[eE]\+?\d+")
@@ -22,7 +23,8 @@ _WHOLE = re.compile(r"\d+(\.\d*)?[eE]\+?\d+")
 class Train:
     """Train one agent into a run folder: settings, logs, checkpoints, final evaluation.
 
-    Options start from a preset (paper, small, demo, smoke); the resolved settings are kept in the folder's config.json.
+    Options start from a preset (paper, reference, small, demo, smoke); the resolved settings are kept in the folder's
+    config.json. Numbers of the learner are --pqn.*, --ppo.* or --dqn.*, whichever --algorithm names.
 
     Example: arcade-torch train --preset small --env MineSweeperEasy --observability partial --out runs/one
     """
@@ -35,7 +37,7 @@ class Train:
     network_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the network; may be given several times."""
     out: Path | None = None
-    """Run folder; runs/ENV-OBSERVABILITY-MEMORY-SEED by default."""
+    """Run folder; runs/ENV-OBSERVABILITY-MEMORY-ALGORITHM-SEED by default."""
     resume: bool = False
     """Go on with the run in that folder."""
     words: tyro.conf.Suppress[tuple[str, ...]] = ()
@@ -43,7 +45,7 @@ class Train:
     def folder(self) -> Path:
         """The run folder."""
         config = self.config
-        name = f"{config.env}-{config.observability}-{config.memory}-seed{config.seed}"
+        name = f"{config.env}-{config.observability}-{config.memory}-{config.algorithm}-seed{config.seed}"
         return self.out if self.out is not None else Path("runs") / name
 
     def run(self) -> int:
@@ -64,7 +66,7 @@ class Train:
     def how_to_go_on(self) -> str:
         """What to type after an interruption."""
         words = [word for word in self.words if word != "--resume"]
-        return f"go on with: {shlex.join(['arcade-torch', 'train', *words, '--resume'])}"
+        return f"go on with: {command_line(['train', *words, '--resume'])}"
 
 
 COMMAND = Train
@@ -82,14 +84,15 @@ def parse(words: Sequence[str], prog: str) -> Train:
     """
     words = [_plain_number(word) for word in words]
     name = _peek(words, "--preset") or "paper"
-    env = _peek(words, "--env")
-    base = preset(name, **({"env": env} if env else {}))
+    # The preset's numbers depend on these two, and the help shows them.
+    decisive = {key: _peek(words, f"--{key}") for key in ("env", "algorithm")}
+    base = preset(name, **{key: value for key, value in decisive.items() if value})
     parsed: Train = cli.parse(Train, words, prog, Train(base, name))
     given = {word[2:].partition("=")[0].replace("-", "_") for word in words if word.startswith("--")}
     changes = _changes(base, parsed.config, given, "")
     for key, pairs in (("env_options", parsed.env_option), ("network_options", parsed.network_option)):
         if pairs:
-            changes[key] = {**getattr(base, key), **dict(_pair(pair) for pair in pairs)}
+            changes[key] = {**getattr(base, key), **dict(map(name_and_value, pairs))}
     return dataclasses.replace(parsed, config=preset(name, **changes), words=tuple(words))
 
 
@@ -121,13 +124,3 @@ def _plain_number(word: str) -> str:
     if _WHOLE.fullmatch(word) and float(word).is_integer():
         return str(int(float(word)))
     return word
-
-
-def _pair(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not equals or not name:
-        raise ValueError(f"an option is written NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value.lower() if value in ("True", "False") else value)
-    except json.JSONDecodeError:
-        return name, value

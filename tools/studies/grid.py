@@ -1,13 +1,14 @@
 """What a study asks: a grid of runs, written in one TOML file."""
 
 import re
-import shlex
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import product
 from pathlib import Path
 from typing import Any
+
+from arcade_torch.tools.extensions import command_line
 
 OBSERVABILITIES = ("full", "partial")
 _AXES = ("games", "observability", "memories", "algorithms", "seeds")
@@ -148,12 +149,15 @@ class Study:
         if self.total_frames is not None:
             words += ["--total-frames", str(self.total_frames)]
         for key, value in flatten(self.settings).items():
+            group = key.partition(".")[0]
+            if group in self.algorithms and group != run.algorithm:
+                continue  # numbers of another learner of the grid
             words += _flag(key, value)
         return [*words, "--out", str(out)]
 
     def command(self, run: RunSpec, out: Path) -> str:
         """The same as one line for a shell."""
-        return shlex.join(["arcade-torch", *self.arguments(run, out)])
+        return command_line(self.arguments(run, out))
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

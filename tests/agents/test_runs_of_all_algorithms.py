@@ -1,0 +1,141 @@
+"""Whole runs of every algorithm: files, an abrupt stop, a NaN, loading."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from arcade_torch.agents import CheckpointError, NonFiniteError, evaluate, load, loop, preset, train
+from arcade_torch.agents.checkpoint import list_checkpoints
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.files import read_csv
+from tests.agents.test_training import assert_same_run, stop_after, weights
+
+ALGORITHMS = ("ppo", "dqn")  # PQN: test_training
+CHANGES = {"env": "CartPoleEasy-v0", "memory": "gru", "total_frames": 256, "checkpoint_every": 128, "eval_episodes": 4}
+MAPPED = {"dqn": {"replay_ram": 0, "target_every": 2}}
+
+
+def config(algorithm, **more):
+    return preset("smoke", algorithm=algorithm, **CHANGES, **more)
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
+def whole(request, tmp_path_factory):
+    """An uninterrupted run."""
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    what = config(request.param)
+    return what, folder, train(what, folder)
+
+
+def crash():
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("updates", [1, 3])
+def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(whole, tmp_path, updates):
+    what, folder, _ = whole
+    with pytest.raises(ZeroDivisionError):
+        train(what, tmp_path / "run", progress=stop_after(updates, crash))
+    assert train(what, tmp_path / "run", resume=True).status == "finished"
+    assert_same_run(tmp_path / "run", folder)
+
+
+def test_a_mapped_replay_with_a_target_network_goes_on_to_the_bit(tmp_path):
+    what = config("dqn", **MAPPED)
+    train(what, tmp_path / "whole")
+    with pytest.raises(ZeroDivisionError):
+        train(what, tmp_path / "parts", progress=stop_after(3, crash))
+    train(what, tmp_path / "parts", resume=True)
+    assert_same_run(tmp_path / "parts", tmp_path / "whole")
+    names = [sorted(p.name for p in (tmp_path / run / "replay").iterdir()) for run in ("parts", "whole")]
+    assert names[0] == names[1] and all(name.startswith("window-") for name in names[0])
+
+
+@pytest.mark.parametrize("whole", ["dqn"], indirect=True)
+def test_a_damaged_file_of_the_replay_costs_only_the_way_since_the_checkpoint_before(whole, tmp_path):
+    what, folder, _ = whole
+    what = dataclasses.replace(what, checkpoint_every=64)
+    with pytest.raises(ZeroDivisionError):
+        train(what, tmp_path / "run", progress=stop_after(3, crash))
+    newest = sorted((tmp_path / "run" / "replay").iterdir())[-1]
+    newest.write_bytes(newest.read_bytes()[:-4])
+    with pytest.warns(RuntimeWarning, match="is damaged.*going on from frames-000000000128"):
+        train(what, tmp_path / "run", resume=True)
+    assert_same_run(tmp_path / "run", folder)
+
+
+@pytest.mark.parametrize("whole", ["dqn"], indirect=True)
+def test_without_any_whole_replay_the_run_is_refused(whole, tmp_path):
+    what, *_ = whole
+    with pytest.raises(ZeroDivisionError):
+        train(what, tmp_path / "run", progress=stop_after(3, crash))
+    for file in (tmp_path / "run" / "replay").iterdir():
+        file.unlink()
+    with pytest.raises(CheckpointError, match=r"no whole checkpoint.*is missing"):
+        train(what, tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_nan_stops_the_run_and_the_last_good_checkpoint_stays(algorithm, tmp_path, monkeypatch):
+    made, real = [], loop.Trainer
+
+    def spy(*args):
+        made.append(real(*args))
+        return made[-1]
+
+    monkeypatch.setattr(loop, "Trainer", spy)
+
+    def poison():
+        next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
+
+    words = r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of .*last good checkpoint is .*128"
+    with pytest.raises(NonFiniteError, match=words):
+        train(config(algorithm), tmp_path / "run", progress=stop_after(3, poison))
+    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == ["frames-000000000128"]
+    assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
+    monkeypatch.undo()
+    assert train(config(algorithm), tmp_path / "run", resume=True).status == "finished"
+
+
+def test_an_agent_is_loaded_and_plays_as_in_the_last_evaluation(whole):
+    what, folder, result = whole
+    agent = load(folder)
+    assert agent.frames == result.frames == 256 and agent.config == what
+    assert evaluate(agent, episodes=4).returns.tolist() == result.evaluation.returns.tolist()
+    state = agent.initial_state(4)
+    from arcade_torch.agents.evaluation import make_eval_env
+
+    obs = make_eval_env(what, 4).reset()
+    action, extras, _ = agent.act(obs, state)
+    best = extras["logits" if what.algorithm == "ppo" else "q_value"].argmax(-1)
+    assert torch.equal(action, best) and torch.equal(agent.act(obs, state)[0], action)  # greedy: no draw
+
+
+def test_metrics_have_the_columns_of_their_algorithm(whole):
+    what, folder, _ = whole
+    rows = read_csv(folder / "metrics.csv")
+    filled = {name for name, value in rows[-1].items() if value}
+    of_ppo, of_q = {"policy_loss", "value_loss", "entropy", "kl", "clip_share"}, {"epsilon", "replay_frames"}
+    assert (of_ppo <= filled, bool(of_q & filled)) == (what.algorithm == "ppo", what.algorithm != "ppo")
+    assert {"loss", "q_mean", "td_error", "grad_norm", "lr", "episodes"} <= filled
+    if what.algorithm == "dqn":
+        assert not rows[0]["loss"] and rows[0]["replay_frames"]
+
+
+def test_config_json_repeats_the_run(whole):
+    what, folder, _ = whole
+    saved = TrainConfig.from_dict(json.loads((folder / "config.json").read_text())["config"])
+    assert saved == what
+    changed = dataclasses.replace(what, pqn=dataclasses.replace(what.pqn, gamma=0.5))
+    assert train(changed, folder, resume=True).status == "finished"  # PQN's numbers are not this run's
+
+
+def test_a_mixed_run_is_evaluated_on_both_twins(tmp_path):
+    what = config("ppo", observability="mixed")
+    result = train(what, tmp_path / "run")
+    full, partial = (
+        evaluate(load(tmp_path / "run"), twin, episodes=4).returns.tolist() for twin in ("full", "partial")
+    )
+    assert result.evaluation.returns.tolist() == full[:2] + partial[2:]
