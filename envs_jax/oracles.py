@@ -4,6 +4,8 @@ A *state* oracle sees the game's state; it pins the return that is reachable. A 
 POMDP's frames have shown so far, and remembers it; it shows how much of that return memory can recover.
 """
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -28,6 +30,8 @@ from arcade_torch.envs_jax.minesweeper import MineSweeper
 from arcade_torch.envs_jax.minesweeper.oracle import MineSweeperFrames, MineSweeperState
 from arcade_torch.envs_jax.navigator import Navigator
 from arcade_torch.envs_jax.navigator.oracle import NavigatorFrames, NavigatorState
+from arcade_torch.envs_jax.signpost import Signpost
+from arcade_torch.envs_jax.signpost.oracle import SignpostFrames, SignpostState
 from arcade_torch.envs_jax.skittles import Skittles
 from arcade_torch.envs_jax.skittles.oracle import SkittlesFrames, SkittlesState
 from arcade_torch.envs_jax.tetris import Tetris
@@ -74,6 +78,7 @@ _ORACLES: dict[type[Game[Any]], dict[str, Callable[[Any], Player]]] = {
     Navigator: {"state": NavigatorState, "frames": NavigatorFrames},
     CartPole: {"state": CartPoleState, "frames": CartPoleFrames},
     MineSweeper: {"state": MineSweeperState, "frames": MineSweeperFrames},
+    Signpost: {"state": SignpostState, "frames": SignpostFrames},
     Skittles: {"state": SkittlesState, "frames": SkittlesFrames},
     Tetris: {"state": TetrisState, "frames": TetrisFrames},
 }
@@ -114,7 +119,14 @@ def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
 
 
 def play(
-    game: Game[Any], player: Player, episodes: int, seed: int = 0, *, frames: bool = False, block: int = 256
+    game: Game[Any],
+    player: Player,
+    episodes: int,
+    seed: int = 0,
+    *,
+    frames: bool = False,
+    block: int = 256,
+    seconds: float = math.inf,
 ) -> Episodes:
     """Let a player finish one episode in each of many envs.
 
@@ -125,6 +137,7 @@ def play(
         seed: Seed of the envs.
         frames: Show the player the frames of the POMDP twin; otherwise the states.
         block: Envs played at once; bounds the memory, and does not change any result of a player that is deterministic.
+        seconds: No block is begun when this time has passed; the first one is always played, and all to the end.
 
     Returns:
         Returns and lengths.
@@ -135,8 +148,12 @@ def play(
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}, expected at least 1")
     block = min(block, episodes)
-    batched = BatchedGame(game)
-    parts = [_play_block(batched, player, env_keys(seed, block, first), frames) for first in range(0, episodes, block)]
+    batched, started = BatchedGame(game), time.monotonic()
+    parts: list[Episodes] = []
+    for first in range(0, episodes, block):
+        if parts and time.monotonic() - started > seconds:
+            break
+        parts.append(_play_block(batched, player, env_keys(seed, block, first), frames))
     return Episodes(*(np.concatenate(field)[:episodes] for field in zip(*parts, strict=True)))
 
 

@@ -7,15 +7,17 @@ from pathlib import Path
 from arcade_torch.tools.studies.grid import Study
 from arcade_torch.tools.studies.progress import clock
 
-GAME = "MineSweeperEasy"
+GAME = "SignpostMedium"
+FRAMES = 100_000
 
 
-def demo_study(frames: int = 400_000, seeds: int = 2) -> Study:
+def demo_study(frames: int = FRAMES, seeds: int = 4, game: str = GAME) -> Study:
     """The demo's study: one game, both twins, one memory model and the memory-free control.
 
     Args:
         frames: environment steps of each run.
         seeds: runs of each agent and twin.
+        game: id of the game.
 
     Raises:
         ValueError: a number is below 1.
@@ -24,25 +26,36 @@ def demo_study(frames: int = 400_000, seeds: int = 2) -> Study:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     return Study(
         name="demo",
-        games=(GAME,),
+        games=(game,),
         memories=("lru", "mlp"),
         seeds=tuple(range(seeds)),
-        preset="demo",
+        preset="small",
         total_frames=frames,
-        question=(
-            "Does a memory let an agent play MineSweeper when only the number under the cursor is shown (POMDP), "
-            "and what does memory cost where every uncovered number stays in view (MDP)?"
+        question=_QUESTIONS.get(
+            game, f"What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
         ),
     )
 
 
-def demo(out: Path, frames: int, seeds: int, workers: int, command: str) -> int:
+_QUESTIONS = {
+    "SignpostMedium": (
+        "A sign says which of four ways to take at the end of a corridor. Does a memory let an agent take it when the "
+        "sign is shown in the first frame alone (POMDP), and what does memory cost where the sign stays in view (MDP)? "
+        "Whoever forgets the sign can expect a return of 0.25 and no more."
+    ),
+    "MineSweeperEasy": (
+        "Does a memory let an agent play MineSweeper when only the number under the cursor is shown (POMDP), and what "
+        "does memory cost where every uncovered number stays in view (MDP)?"
+    ),
+}
+
+
+def demo(out: Path, study_of: Study, workers: int, command: str) -> int:
     """Run the demo, or go on with it, and write its report.
 
     Args:
         out: folder.
-        frames: environment steps of each run.
-        seeds: runs of each agent and twin.
+        study_of: what to run, see :func:`demo_study`.
         workers: runs at once, 0 for one a core.
         command: how the user started it.
 
@@ -53,12 +66,8 @@ def demo(out: Path, frames: int, seeds: int, workers: int, command: str) -> int:
     from arcade_torch.tools.studies.runner import study
 
     started = time.monotonic()
-    what = demo_study(frames, seeds)
-    print(
-        f"{len(what.runs())} runs of {frames:,} frames in {out}; Ctrl-C stops, the same command goes on",
-        file=sys.stderr,
-    )
-    result = study(what, out, workers=workers, command=command)
+    print(f"{len(study_of.runs())} runs in {out}; Ctrl-C stops, the same command goes on", file=sys.stderr)
+    result = study(study_of, out, workers=workers, command=command)
     for name, error in result.errors.items():
         print(f"failed: {name}: {error}", file=sys.stderr)
     if not result.finished:

@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.autoencode.numbers import SUITS
-from arcade_torch.envs_jax.cartpole.oracle import read_slot
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UP
 from arcade_torch.envs_jax.render.suits import NO_CARD
 
@@ -54,8 +53,8 @@ class AutoEncodeFrames:
             self.stack = np.zeros((len(seen), self.cards), np.int64)
             self.seen, self.left = np.zeros_like(envs), np.zeros_like(envs)
         self.seen[is_init], self.left[is_init] = 0, 0
-        card = read_slot(seen, self.screen.card)
-        selected = read_slot(seen, self.screen.selector) - 1
+        card = self.screen.card.read(seen)
+        selected = self.screen.selector.read(seen) - 1
         watching = card != NO_CARD
         self.stack[envs[watching], self.seen[watching]] = card[watching] - 1
         self.seen += watching

@@ -61,7 +61,7 @@ class CartPoleFrames:
 
     def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        codes = np.stack([read_slot(seen, slot) for slot in self.game.screen.arrows], -1)
+        codes = np.stack([slot.read(seen) for slot in self.game.screen.arrows], -1)
         if self.belief is None or len(self.action) != len(seen):
             self.action = np.zeros(len(seen), np.int32)
             keys = jax.random.split(jax.random.PRNGKey(0), len(seen))
@@ -70,20 +70,6 @@ class CartPoleFrames:
         self.belief, action = self._update(self.belief, self.action, codes, is_init)
         self.action = np.asarray(action)
         return self.action
-
-
-def read_slot(frames: npt.NDArray[np.uint8], slot: Any) -> npt.NDArray[np.int64]:
-    """Which picture of a slot each frame shows: int64 [N].
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        slot: A :class:`~arcade_torch.envs_jax.render.Slot`.
-    """
-    height, width = slot.pictures.shape[1:3]
-    shown = frames[:, slot.y : slot.y + height, slot.x : slot.x + width]
-    distance = [np.abs(shown.astype(np.int16) - picture).sum((1, 2, 3)) for picture in slot.pictures.astype(np.int16)]
-    codes: npt.NDArray[np.int64] = np.stack(distance).argmin(0)
-    return codes
 
 
 def _arrow_edges(game: Any) -> Array:

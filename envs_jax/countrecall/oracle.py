@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.cartpole.oracle import read_slot
 from arcade_torch.envs_jax.game import DOWN, FIRE, UP
 from arcade_torch.envs_jax.render.suits import NO_CARD
 
@@ -112,8 +111,8 @@ class CountRecallFrames:
         self.turns[is_init], self.moves[is_init], self.fresh[is_init] = self.level.cards, self.budget, True
 
         screen = self.screen
-        card, query = read_slot(seen, screen.card), read_slot(seen, screen.query)
-        answer = read_slot(seen, screen.counter) + screen.counter_range[0]
+        card, query = screen.card.read(seen), screen.query.read(seen)
+        answer = screen.counter.read(seen) + screen.counter_range[0]
         wanted = self.counts[envs, np.maximum(query - 1, 0)]
         distance = np.abs(wanted - answer)
         reach = 3.5 * self.moves / np.maximum(self.turns, 1) + 0.5

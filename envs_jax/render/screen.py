@@ -40,6 +40,12 @@ class Slot:
         """Show picture ``code`` (int scalar) on ``frame`` (uint8 [S, S, 3])."""
         return place(frame, gather(jnp.asarray(self.pictures), code), self.x, self.y)
 
+    def read(self, frames: Picture) -> npt.NDArray[np.int64]:
+        """Which picture each frame (uint8 [N, S, S, 3]) shows: int64 [N], -1 where none; on the host."""
+        height, width = self.pictures.shape[1:3]
+        shown = frames[:, self.y : self.y + height, self.x : self.x + width]
+        return recognise(shown.reshape(len(frames), -1), self.pictures)
+
 
 @dataclass(frozen=True, eq=False)
 class TileGrid:
@@ -71,15 +77,27 @@ class TileGrid:
         height, width = self.atlas.shape[1:3]
         area = frames[:, self.y : self.y + rows * height, self.x : self.x + columns * width]
         tiles = area.reshape(len(frames), rows, height, columns, width, 3).swapaxes(2, 3)
-        tiles = np.ascontiguousarray(tiles).reshape(len(frames), rows, columns, -1)
-        known = self.atlas.reshape(len(self.atlas), -1)
-        # Random weights give every picture a number of its own; whole numbers are summed without rounding.
-        weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
-        numbers = known @ weights
-        order = numbers.argsort(kind="stable")
-        found = np.searchsorted(numbers, tiles @ weights, sorter=order)
-        codes = order[np.minimum(found, len(order) - 1)]
-        return np.where((known[codes] == tiles).all(-1), codes, -1)
+        return recognise(np.ascontiguousarray(tiles).reshape(len(frames), rows, columns, -1), self.atlas)
+
+
+def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
+    """Which of some pictures each of many cut-outs is; on the host.
+
+    Args:
+        shown: uint8 [..., h * w * 3], the cut-outs.
+        pictures: uint8 [codes, h, w, 3].
+
+    Returns:
+        int64 [...]: the lowest code that looks like this, -1 where none does.
+    """
+    known = pictures.reshape(len(pictures), -1)
+    # Random weights give every picture a number of its own; whole numbers are summed without rounding.
+    weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
+    numbers = known @ weights
+    order = numbers.argsort(kind="stable")
+    found = np.searchsorted(numbers, shown @ weights, sorter=order)
+    codes = order[np.minimum(found, len(order) - 1)]
+    return np.where((known[codes] == shown).all(-1), codes, -1)
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:

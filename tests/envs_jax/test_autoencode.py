@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.cards import deal
-from arcade_torch.envs_jax.cartpole.oracle import read_slot
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import BLACK, RED, SMOKE
 from arcade_torch.envs_jax.render.suits import suit_mask, suit_pictures
@@ -211,9 +210,9 @@ def test_card_selector_and_stack_can_be_read_back(id, size):
         assert np.array_equal(read_history(full, game.screen, len(expected) // 9)[0], expected)
         assert not read_history(partial, game.screen, len(expected) // 9).any()
         for frame in (full, partial):
-            assert read_slot(frame, game.screen.card)[0] == (1 + suits[timestep] if timestep < cards else 0)
-            assert read_slot(frame, game.screen.selector)[0] == 1 + selected
-            assert read_slot(frame, game.screen.score)[0] == count
+            assert game.screen.card.read(frame)[0] == (1 + suits[timestep] if timestep < cards else 0)
+            assert game.screen.selector.read(frame)[0] == 1 + selected
+            assert game.screen.score.read(frame)[0] == count
         low = game.screen.history.y
         differs = (full != partial).any((0, 2, 3))
         assert not differs[:low].any() and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from arcade_torch.envs_jax import env_keys, make
-from arcade_torch.envs_jax.cartpole.oracle import read_slot
 from arcade_torch.envs_jax.countrecall.oracle import SKIP, best_plan, right_answers
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 
@@ -93,8 +92,8 @@ def test_the_counter_of_the_reference_goes_anywhere_and_is_drawn_as_it_is():
     assert len(np.unique(pictures, axis=0)) == len(pictures) == 99 + 126 + 1
     for answer in (-99, -1, 0, 9, 100, 126):
         frame = draw(game, one(game, answer=answer, score=26), False)[None]
-        assert read_slot(frame, game.screen.counter)[0] - 99 == answer
-        assert read_slot(frame, game.screen.score)[0] == 26
+        assert game.screen.counter.read(frame)[0] - 99 == answer
+        assert game.screen.score.read(frame)[0] == 26
     assert np.array_equal(draw(game, one(game, answer=-120), False), draw(game, one(game, answer=-99), False))
 
 
@@ -169,9 +168,9 @@ def test_everything_shown_can_be_read_back(id, size):
         assert not read_history(partial, game.screen, rows).any()
         for frame in (full, partial):
             for slot, pack in ((game.screen.card, state.cards), (game.screen.query, state.queries)):
-                assert read_slot(frame, slot)[0] == (1 + int(pack[turn]) if turn < cards else 0)
-            assert read_slot(frame, game.screen.counter)[0] == answer
-            assert read_slot(frame, game.screen.score)[0] == score
+                assert slot.read(frame)[0] == (1 + int(pack[turn]) if turn < cards else 0)
+            assert game.screen.counter.read(frame)[0] == answer
+            assert game.screen.score.read(frame)[0] == score
         low = game.screen.history.y
         differs = (full != partial).any((0, 2, 3))
         assert not differs[:low].any() and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()

@@ -137,7 +137,8 @@ def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], m
 
     monkeypatch.setattr(command.Demo, "run", interrupted)
     said = one_error(capsys, ["demo", "--frames", "4096", "--out", "runs/a b"], cli.EXIT_INTERRUPTED)
-    assert "go on from their checkpoints with: arcade-torch demo --frames 4096 --seeds 2 --out 'runs/a b'" in said
+    again = "arcade-torch demo --game SignpostMedium --frames 4096 --seeds 4 --out 'runs/a b'"
+    assert f"go on from their checkpoints with: {again}" in said
 
 
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:

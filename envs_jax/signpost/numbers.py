@@ -1,0 +1,31 @@
+"""The numbers of Signpost."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Level:
+    """One difficulty.
+
+    Attributes:
+        corridor: Cells to walk before the gate; the sign has to be remembered for as many steps.
+    """
+
+    corridor: int
+
+    @property
+    def cells(self) -> int:
+        """Cells of the corridor and the gate."""
+        return self.corridor + 1
+
+    @property
+    def max_steps(self) -> int:
+        """Steps of every episode: the walk and the answer."""
+        return self.cells
+
+
+LEVELS = {
+    "SignpostEasy": Level(4),
+    "SignpostMedium": Level(6),
+    "SignpostHard": Level(9),
+}

@@ -1,0 +1,43 @@
+"""The law of Signpost: read the sign, walk to the gate, press what the sign said."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.game import RIGHT, Array
+from arcade_torch.envs_jax.signpost.numbers import Level
+
+SIGNS = 4  # up, down, left, right, numbered like the actions
+
+
+class SignpostState(NamedTuple):
+    """A sign, a walker, and what became of the answer."""
+
+    sign: Array  # int32 in 0..3, the action that opens the gate
+    x: Array  # int32, cells walked; the gate is the last
+    score: Array  # int32, 1 once the gate is open
+    timestep: Array  # int32, steps taken
+
+
+def reset(key: Array) -> SignpostState:
+    """Any of the four signs, the walker at the beginning."""
+    zero = jnp.int32(0)
+    return SignpostState(jax.random.randint(key, (), 0, SIGNS, dtype=jnp.int32), zero, zero, zero)
+
+
+def step(state: SignpostState, action: Array, level: Level) -> tuple[SignpostState, Array, Array, Array]:
+    """Walk one cell; at the gate, answer.
+
+    Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents are told their last
+    action, so a player without memory could carry the sign to the gate by repeating it; stumbling all the way costs as
+    much as the gate pays, so that nobody without memory can expect more than 1/4.
+
+    Returns:
+        New state, reward, terminated, truncated (never: an episode has ``corridor + 1`` steps).
+    """
+    at_gate = state.x == level.corridor
+    opened = at_gate & (action == state.sign)
+    stumbled = ~at_gate & (action != RIGHT)
+    new = SignpostState(state.sign, state.x + ~at_gate, opened.astype(jnp.int32), state.timestep + 1)
+    return new, opened - stumbled / jnp.float32(level.corridor), at_gate, jnp.bool_(False)

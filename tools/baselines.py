@@ -1,0 +1,151 @@
+"""What random play and the scripted players earn in each game, as rows of a table."""
+
+import dataclasses
+import math
+import re
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from arcade_torch.tools.files import read_csv, write_csv, write_text
+
+PLAYERS = ("random", "state", "frames")
+"""Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
+
+BEGIN, END = "<!-- baselines -->", "<!-- end of baselines -->"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What one player earned in one game.
+
+    Attributes:
+        id: the game.
+        player: one of `PLAYERS`.
+        episodes: how many were played.
+        mean: mean undiscounted return.
+        half_width: of the 95 % interval around it (normal approximation).
+        steps: mean length of an episode.
+        seconds: what it took, compilation included.
+    """
+
+    id: str
+    player: str
+    episodes: int
+    mean: float
+    half_width: float
+    steps: float
+    seconds: float
+
+
+def measure(id: str, player: str, episodes: int, seconds: float, seed: int = 0) -> Baseline:
+    """Let one player play one game.
+
+    Args:
+        id: the game.
+        player: one of `PLAYERS`.
+        episodes: how many at most.
+        seconds: after this time no further block of 250 episodes is begun.
+        seed: of the episodes.
+
+    Raises:
+        ValueError: unknown game or player, or the game has no such oracle.
+    """
+    from arcade_torch.envs_jax import make
+    from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
+
+    if player not in PLAYERS:
+        raise ValueError(f"player is {player!r}, allowed: {', '.join(PLAYERS)}")
+    started, game = time.monotonic(), make(id)
+    who = RandomPlayer(seed) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
+    played = play(game, who, episodes, seed, frames=player == "frames", block=min(episodes, 250), seconds=seconds)
+    returns = played.returns.astype(np.float64)
+    spread = float(returns.std(ddof=1)) if returns.size > 1 else math.nan
+    return Baseline(
+        game.id,
+        player,
+        returns.size,
+        float(returns.mean()),
+        1.96 * spread / math.sqrt(returns.size),
+        float(played.lengths.mean()),
+        time.monotonic() - started,
+    )
+
+
+def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
+    """Every player in every game, one row after another; rows that ``out`` holds already are not measured again.
+
+    Args:
+        ids: the games.
+        episodes: of each player, at most.
+        seconds: of each player, see `measure`.
+        out: CSV file, written anew after each row.
+
+    Yields:
+        The rows, those from the file as well.
+    """
+    known = {(row.id, row.player): row for row in read_baselines(out)} if out.exists() else {}
+    for id in ids:
+        for player in PLAYERS:
+            if (id, player) not in known:
+                known[id, player] = measure(id, player, episodes, seconds)
+                write_csv(out, map(_plain, known.values()), [field.name for field in dataclasses.fields(Baseline)])
+            yield known[id, player]
+
+
+def read_baselines(path: Path) -> list[Baseline]:
+    """The rows of a file that `measure_all` has written."""
+    rows = read_csv(path)
+    try:
+        return [
+            Baseline(
+                row["id"],
+                row["player"],
+                int(row["episodes"]),
+                *(float(row[name]) for name in ("mean", "half_width", "steps", "seconds")),
+            )
+            for row in rows
+        ]
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no table of baselines ({error}); choose another --out") from None
+
+
+def markdown(rows: Iterable[Baseline]) -> str:
+    """The rows as a Markdown table, one line a game."""
+    from arcade_torch.envs_jax import make
+
+    games: dict[str, dict[str, Baseline]] = {}
+    for row in rows:
+        games.setdefault(row.id, {})[row.player] = row
+    lines = [
+        "| id | random | state oracle | frames oracle | highest | steps: random, state, frames | episodes |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for id, by_player in games.items():
+        found = [by_player.get(player) for player in PLAYERS]
+        returns = " | ".join(f"{r.mean:.3f} ± {r.half_width:.3f}" if r else "" for r in found)
+        steps = ", ".join(f"{r.steps:.0f}" if r else "" for r in found)
+        count = ", ".join(dict.fromkeys(f"{r.episodes}" for r in found if r))
+        lines.append(f"| `{id}` | {returns} | {make(id).return_range[1]:.4g} | {steps} | {count} |")
+    return "\n".join(lines)
+
+
+def insert(page: Path, table: str) -> Path:
+    """Put the table between the two marks of a page, in the place of the old one.
+
+    Raises:
+        ValueError: the page has no such marks.
+    """
+    text = page.read_text(encoding="utf-8")
+    if text.count(BEGIN) != 1 or text.count(END) != 1:
+        raise ValueError(f"{page} needs one line {BEGIN!r} and one line {END!r}; the table goes between them")
+    between = re.compile(f"(?<={re.escape(BEGIN)}).*(?={re.escape(END)})", re.DOTALL)
+    return write_text(page, between.sub(lambda _: f"\n\n{table}\n\n", text))
+
+
+def _plain(row: Baseline) -> dict[str, object]:
+    rounded = {name: round(getattr(row, name), 5) for name in ("mean", "half_width", "steps")}
+    return dataclasses.asdict(row) | rounded | {"seconds": round(row.seconds, 1)}
