@@ -7,6 +7,8 @@ Public names are resolved on first use, so that importing the package costs litt
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from arcade_torch.gym_ids import register_when_gymnasium_is_there
+
 __version__ = "0.1.0"
 
 _PUBLIC = {
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
     from arcade_torch.frames import next_pixels
 
 __all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "next_pixels", "registered_ids"]
+
+register_when_gymnasium_is_there()
 
 
 def __getattr__(name: str) -> Any:

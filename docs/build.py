@@ -21,7 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     "index": ROOT / "README.md",
     "environments": ROOT / "docs/environments.md",
+    "play": ROOT / "docs/play.md",
     "differences": ROOT / "docs/differences.md",
+    "conformance": ROOT / "docs/conformance.md",
+    "parity": ROOT / "results/parity.md",
     "architecture": ROOT / "docs/architecture.md",
     "glossary": ROOT / "docs/glossary.md",
     "changelog": ROOT / "CHANGELOG.md",

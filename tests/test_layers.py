@@ -24,7 +24,7 @@ MAY_IMPORT = {
 }
 LIBRARIES = {
     "envs_jax": {"jax", "jaxlib", "numpy"},
-    "bridge": {"torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy", "gymnasium"},
+    "bridge": {"torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy", "gymnasium", "pygame"},
     "models": {"torch", "torchrl", "tensordict", "numpy", "triton"},
     "agents": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors"},
     "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},

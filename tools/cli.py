@@ -16,6 +16,7 @@ from importlib import import_module
 from io import StringIO
 from typing import Any, NamedTuple
 
+from arcade_torch.tools.extensions import load_extensions, take_imports
 from arcade_torch.tools.optional import MissingPackage, missing_package_message, need
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -36,6 +37,12 @@ WORK_FAILED = ("NonFiniteError",)
 """Own error types that do not mean bad input."""
 
 
+EVERYWHERE = (
+    "With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory models;",
+    "--debug shows the traceback of an error.",
+)
+
+
 class Command(NamedTuple):
     """Where a command lives and what it does in a few words."""
 
@@ -46,12 +53,19 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "demo": Command("demo", "small study of one game: learning, gap, bias and saliency in one HTML page"),
     "list": Command("list", "the registered environments and memory models"),
+    "baselines": Command("baselines", "what random play and the scripted players earn in each game"),
+    "sheet": Command("sheet", "one picture of all games, both twins"),
     "train": Command("train", "train one agent into a run folder"),
     "evaluate": Command("evaluate", "greedy returns of a trained agent"),
     "study": Command("study", "run a grid of trainings from one TOML file, resumable run by run"),
     "report": Command("report", "write the HTML page of a study"),
     "analyze gap-bias": Command("gap_bias", "observability gap and memory bias with intervals"),
     "analyze saliency": Command("saliency", "which past pixels the current decision depends on"),
+    "analyze recall-density": Command("recall_density", "how decisions spread over the past of their episodes"),
+    "analyze contamination": Command("contamination", "what one noisy past frame does to later decisions"),
+    "figure": Command("figure", "draw one of the paper's figures from run folders"),
+    "play": Command("play", "play a game by hand, in a window or in the terminal"),
+    "record": Command("record", "a GIF or MP4 of a random, scripted or trained player"),
     "bench envs": Command("bench_envs", "frames per second of the games, every frame consumed"),
 }
 
@@ -69,7 +83,8 @@ def usage() -> str:
             *lines,
             "",
             "arcade-torch COMMAND --help explains a command and gives an example.",
-            "--debug (with any command) shows the traceback of an error; --version prints the version.",
+            *EVERYWHERE,
+            "--version prints the version.",
         ]
     )
 
@@ -180,11 +195,14 @@ def _run(name: str, words: Sequence[str], state: dict[str, Any]) -> int:
     return int(command.run() or EXIT_OK)
 
 
-def _guarded(name: str, words: Sequence[str], debug: bool) -> int:
+def _guarded(name: str, words: Sequence[str], imports: Sequence[str], debug: bool) -> int:
     state: dict[str, Any] = {}
     try:
+        load_extensions(imports)
         return _run(name, words, state)
     except SystemExit as stop:
+        if not stop.code:
+            print(*EVERYWHERE, sep="\n")
         return stop.code if isinstance(stop.code, int) else EXIT_OK if stop.code is None else EXIT_FAILED
     except KeyboardInterrupt:
         tell = getattr(state.get("command"), "how_to_go_on", None)
@@ -218,6 +236,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
+    try:
+        imports, words = take_imports(words)
+    except ValueError as error:
+        _say(one_line(error))
+        return EXIT_BAD_INPUT
     if not words or words[0] in ("-h", "--help", "help"):
         print(usage())
         return EXIT_OK
@@ -236,7 +259,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_BAD_INPUT
     previous = signal.signal(signal.SIGTERM, _terminate) if argv is None else None
     try:
-        return _guarded(name, options, debug)
+        return _guarded(name, options, imports, debug)
     finally:
         if previous is not None:
             signal.signal(signal.SIGTERM, previous)

@@ -1,0 +1,228 @@
+"""N episodes of one game behind numpy arrays: what the Gymnasium environments and the player's session stand on.
+
+Loads no torch. Every array that is handed out is the caller's own.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+
+from arcade_torch.compiled import CompiledGame
+from arcade_torch.envs_jax import Game
+from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+
+Bools = npt.NDArray[np.bool_]
+Frames = npt.NDArray[np.uint8]
+Observability = Literal["full", "partial"] | npt.ArrayLike
+Info = dict[str, Any]
+
+_ALLOWED = "allowed: 'full', 'partial', or for a vector environment one bool an env (True = partial)"
+
+
+class Stepped(NamedTuple):
+    """What one step gave, before anything was begun anew."""
+
+    reward: npt.NDArray[np.float64]  # [N]
+    terminated: Bools  # [N]
+    truncated: Bools  # [N]
+    info: Info  # episode_reward float64 [N], step_count int64 [N]
+
+
+def partial_flags(observability: Observability | None, partial_obs: bool | None, num_envs: int) -> Bools:
+    """Turn what a user may write into one flag an env.
+
+    Args:
+        observability: ``"full"``, ``"partial"``, or bool [num_envs], true = partial; None if not given.
+        partial_obs: The alias: true means ``"partial"``; None if not given.
+        num_envs: Number of envs.
+
+    Returns:
+        bool [num_envs], true where the env shows its POMDP twin. False everywhere if neither is given.
+
+    Raises:
+        ValueError: Both are given, or another word, type or shape.
+        TypeError: ``partial_obs`` is no bool.
+
+    Example:
+        >>> partial_flags("partial", None, 2)
+        array([ True,  True])
+    """
+    if partial_obs is not None:
+        if observability is not None:
+            raise ValueError(
+                "both observability and partial_obs are given: keep observability, partial_obs is its alias"
+            )
+        if not isinstance(partial_obs, bool):
+            raise TypeError(f"partial_obs is {partial_obs!r}, allowed: True, False")
+        return np.full(num_envs, partial_obs)
+    if observability is None or isinstance(observability, str):
+        if observability not in (None, "full", "partial"):
+            raise ValueError(f"observability is {observability!r}, {_ALLOWED}")
+        return np.full(num_envs, observability == "partial")
+    flags = np.array(observability)
+    if flags.dtype != np.bool_ or flags.shape != (num_envs,):
+        raise ValueError(f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}")
+    return flags
+
+
+def seed_keys(seed: int | Sequence[int], num_envs: int) -> jax.Array:
+    """Random keys of N envs.
+
+    Args:
+        seed: One seed for the batch: env ``i`` walks the path of env ``i`` of an ``ArcadeEnv`` with that seed. Or one
+            seed an env: each walks the path of env 0 of an ``ArcadeEnv`` with its seed.
+        num_envs: Number of envs.
+
+    Returns:
+        uint32 [num_envs, 2].
+
+    Raises:
+        ValueError: A seed is out of range, or their number is wrong.
+    """
+    if isinstance(seed, int | np.integer):
+        return env_keys(int(seed), num_envs)
+    if len(seed) != num_envs:
+        raise ValueError(f"{len(seed)} seeds for {num_envs} envs: give one seed, or one an env")
+    return jnp.concatenate([env_keys(int(each), 1) for each in seed])
+
+
+class NumpyBatch:
+    """N running episodes: numpy in, numpy out, nothing is begun anew unless asked. The first call is a reset of all.
+
+    Steps and drawing are compiled apart, so that whoever plays, resets and redraws compiles the picture once.
+
+    Args:
+        compiled: The game.
+        flags: bool [N], true where the env shows its POMDP twin.
+    """
+
+    def __init__(self, compiled: CompiledGame, flags: Bools) -> None:
+        self._compiled = compiled
+        self._batched = compiled.batched
+        self.num_envs = len(flags)
+        # Nothing runs before the first reset, so its shape is all that is needed of a batch, and nothing is compiled.
+        shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
+        batch: Batch = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+        self._batch = batch._replace(partial=jnp.asarray(flags))
+
+    @property
+    def game(self) -> Game[Any]:
+        """The game that is played."""
+        return cast(Game[Any], self._batched.game)  # not a mixture of games
+
+    @property
+    def state(self) -> Any:
+        """The game's state, numpy leaves [N, ...]; read only."""
+        return jax.tree.map(np.asarray, self._batch.state)
+
+    @property
+    def info(self) -> Info:
+        """Return so far (float64 [N]) and steps so far (int64 [N]) of the running episodes."""
+        return _info(self._batch)
+
+    def set_partial(self, flags: Bools) -> None:
+        """Change which twin is shown, bool [N]; only what is drawn from now on changes."""
+        self._batch = self._batch._replace(partial=jnp.asarray(flags))
+
+    def draw(self, flags: Bools | None = None, copy: bool = True) -> Frames:
+        """Draw all envs.
+
+        Args:
+            flags: bool [N], the twins to draw; those the envs show by default.
+            copy: Whether the caller may write into the frames.
+
+        Returns:
+            uint8 [N, S, S, 3].
+        """
+        batch = self._batch if flags is None else self._batch._replace(partial=jnp.asarray(flags))
+        return _own(self._batched.render(batch), copy)
+
+    def reset(self, mask: Bools, keys: jax.Array | None = None) -> None:
+        """Begin a new episode where ``mask`` (bool [N]) is true, from ``keys`` (uint32 [N, 2]) if they are given."""
+        if keys is not None:
+            keys = jnp.where(jnp.asarray(mask)[:, None], keys, self._batch.key)
+            self._batch = self._batch._replace(key=keys)
+        self._batch = self._batched.reset_where(self._batch, mask)
+
+    def step(self, action: npt.NDArray[np.int32]) -> Stepped:
+        """Take one action in every env, int32 [N] in 0..4; nothing is drawn."""
+        self._batch, outcome = self._batched.step(self._batch, action)
+        return _stepped(self._batch, outcome)
+
+    def reset_or_step(self, action: npt.NDArray[np.int32], ended: Bools) -> Stepped:
+        """Begin anew where ``ended`` (bool [N]) is true and take one action elsewhere; nothing is drawn.
+
+        Rows that begin anew ignore their action; their reward is 0 and no flag is set.
+        """
+        self._batch, outcome = _reset_or_step(self._compiled)(self._batch, action, ended)
+        return _stepped(self._batch, outcome)
+
+    def step_and_reset(
+        self, action: npt.NDArray[np.int32], copy: bool = True
+    ) -> tuple[Stepped, Frames, npt.NDArray[np.int64], Frames]:
+        """Take one action in every env, begin anew where that ended an episode, draw once, and draw the ends.
+
+        Returns:
+            What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that; the n envs that
+            ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
+        """
+        step = self._compiled.step(self._batch, action)
+        self._batch = step.root
+        frames = _own(step.pixels, copy)
+        numbers = np.asarray(step.numbers)
+        _, episode_reward, step_count, terminated, truncated = numbers.T
+        info = {"episode_reward": episode_reward.astype(np.float64), "step_count": step_count.astype(np.int64)}
+        stepped = Stepped(numbers[:, 0].astype(np.float64), terminated > 0, truncated > 0, info)
+        rows = np.flatnonzero(stepped.terminated | stepped.truncated)
+        return stepped, frames, rows, self._final_frames(step.final_state, rows)
+
+    def _final_frames(self, states: Any, rows: npt.NDArray[np.int64]) -> Frames:
+        """Draw some rows of the states before a reset, in portions of one size, so that one compiled shape serves."""
+        size = self.game.obs_size
+        out = np.empty((len(rows), size, size, 3), np.uint8)
+        portion = min(self.num_envs, max(4, self.num_envs // 8))
+        for first in range(0, len(rows), portion):
+            some = rows[first : first + portion]
+            index = np.pad(some, (0, portion - len(some)), mode="edge")
+            picked = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], (states, self._batch.partial))
+            out[first : first + len(some)] = np.asarray(self._compiled.draw(*picked))[: len(some)]
+        return out
+
+
+@functools.lru_cache(maxsize=64)
+def _reset_or_step(compiled: CompiledGame) -> Any:
+    """The compiled call behind ``NumpyBatch.reset_or_step``."""
+    batched = compiled.batched
+
+    def advance(batch: Batch, action: jax.Array, ended: jax.Array) -> tuple[Batch, Outcome]:
+        stepped, outcome = batched.step(batch, action)
+        # A row that begins anew has not stepped: it goes on from the random key it had.
+        key = jnp.where(ended[:, None], batch.key, stepped.key)
+        last_action = jnp.where(ended, batch.last_action, stepped.last_action)
+        root = batched.reset_where(stepped._replace(key=key, last_action=last_action), ended)
+        quiet = jax.tree.map(lambda leaf: jnp.where(ended, jnp.zeros_like(leaf), leaf), outcome)
+        return root, quiet
+
+    return jax.jit(advance)
+
+
+def _own(array: jax.Array, copy: bool) -> Frames:
+    """Frames as numpy: the caller's own, or a read-only view of what JAX wrote."""
+    return np.array(array) if copy else np.asarray(array)
+
+
+def _info(batch: Batch) -> Info:
+    return {
+        "episode_reward": np.array(batch.episode_reward, np.float64),
+        "step_count": np.array(batch.step_count, np.int64),
+    }
+
+
+def _stepped(batch: Batch, outcome: Outcome) -> Stepped:
+    flags = np.array(outcome.terminated), np.array(outcome.truncated)
+    return Stepped(np.array(outcome.reward, np.float64), *flags, _info(batch))

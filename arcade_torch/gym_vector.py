@@ -1,0 +1,213 @@
+"""``ArcadeVectorEnv``: N envs of one game as a Gymnasium vector environment, stepped by one compiled call."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from arcade_torch.compiled import compiled_game
+from arcade_torch.gym_batch import Bools, Frames, Info, NumpyBatch, Observability, Stepped, partial_flags, seed_keys
+from arcade_torch.gym_env import RENDER_FPS, action_space, check_reset_options, observation_space
+
+Rewards = npt.NDArray[np.float64]
+StepResult = tuple[Frames, Rewards, Bools, Bools, Info]
+
+
+class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
+    """N envs of one game. Made by ``gymnasium.make_vec("arcade_torch/<id>", num_envs=N, ...)``.
+
+    Observations are uint8 [N, S, S, 3]. Infos, and what happens at an end, follow ``gymnasium.vector.SyncVectorEnv``
+    in all three auto-reset modes, to the bit; ``metadata["autoreset_mode"]`` says which one is in force:
+
+    * ``NEXT_STEP`` (Gymnasium's default): an end shows its final frame; the following step ignores the env's action,
+      pays 0 and shows the first frame of the new episode.
+    * ``SAME_STEP``: an end shows the first frame of the new episode; the final frame is in ``infos["final_obs"]``, its
+      counts are in ``infos["final_info"]``. No step is lost, and this is how ``ArcadeEnv`` steps.
+    * ``DISABLED``: call ``reset(options={"reset_mask": bool [N]})``.
+
+    Args:
+        game: Id of the game; ``gymnasium.make_vec`` fills it in.
+        num_envs: N.
+        observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
+        partial_obs: Alias: true means ``"partial"``.
+        obs_size: Side of the frames, 128 or 256.
+        rules: ``"default"`` or ``"reference"``.
+        autoreset_mode: One of the three, or its value: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``.
+        copy: Whether observations are the caller's own. False hands out what JAX wrote, read only: no copy, and each
+            step still has its own memory.
+        render_mode: ``"rgb_array"``: ``render()`` returns the N frames.
+        **options: Options of the game.
+
+    Raises:
+        ValueError: Unknown id, size, rules, observability, mode, or a number of envs that is not positive.
+        TypeError: An option the game does not have.
+
+    Example:
+        >>> import gymnasium, arcade_torch
+        >>> envs = gymnasium.make_vec("arcade_torch/CartPoleEasy-v0", num_envs=3, autoreset_mode="SameStep")
+        >>> frames, infos = envs.reset(seed=0)
+        >>> frames, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+        >>> frames.shape
+        (3, 128, 128, 3)
+    """
+
+    def __init__(
+        self,
+        game: str,
+        num_envs: int = 1,
+        *,
+        observability: Observability | None = None,
+        partial_obs: bool | None = None,
+        obs_size: int = 128,
+        rules: str = "default",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs!r}, expected an int of 1 or more")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode of a vector environment is {render_mode!r}, allowed: None, 'rgb_array'")
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": RENDER_FPS,
+            "autoreset_mode": _mode(autoreset_mode),
+        }
+        self._mode = _mode(autoreset_mode)
+        self._copy = copy
+        flags = partial_flags(observability, partial_obs, num_envs)
+        self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
+        self.single_action_space = action_space(self._batch.game.num_actions)
+        self.single_observation_space = observation_space(obs_size)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._started = False
+        self._ended = np.zeros(num_envs, bool)
+
+    def set_observability(self, observability: Observability) -> None:
+        """Change which twins are shown, also in mid-episode; only the frames drawn from now on change."""
+        self._batch.set_partial(partial_flags(observability, None, self.num_envs))
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Frames, Info]:
+        """Begin episodes in all envs, or where a mask says so.
+
+        Args:
+            seed: One seed: env ``i`` has the bits of env ``i`` of ``arcade_torch.make(..., seed=seed)``. One an env:
+                each has the bits of ``gymnasium.make`` with its seed. None goes on with the random numbers there are
+                (at first: draws a seed).
+            options: ``{"reset_mask": bool [N]}``: the other envs go on.
+
+        Returns:
+            Frames and infos.
+
+        Raises:
+            ValueError: A seed out of range, an unknown option, or a mask that does not fit.
+        """
+        mask = self._reset_mask(check_reset_options(options, ("reset_mask",)))
+        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
+        if seed is None and not self._started:
+            seed = int(self.np_random.integers(2**32))
+        self._batch.reset(mask, None if seed is None else seed_keys(seed, self.num_envs))
+        self._started = True
+        self._ended &= ~mask
+        return self._batch.draw(copy=self._copy), _masked(self._batch.info, mask)
+
+    def _reset_mask(self, options: dict[str, Any]) -> Bools:
+        mask = np.array(options.get("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(
+                f"reset_mask is {mask.dtype} {mask.shape}, expected bool ({self.num_envs},) with at least one True"
+            )
+        if not self._started and not mask.all():
+            raise ResetNeeded("the first reset() needs all envs: leave reset_mask out")
+        return mask
+
+    def step(self, actions: npt.NDArray[Any]) -> StepResult:
+        """Take one action in every env.
+
+        Args:
+            actions: Integers [N] in 0..4.
+
+        Returns:
+            Frames uint8 [N, S, S, 3], rewards float64 [N], terminations bool [N], truncations bool [N], infos.
+
+        Raises:
+            ResetNeeded: Before the first reset, or, with auto-reset disabled, after an end.
+            ValueError: Actions of a wrong shape, type or range.
+        """
+        if not self._started:
+            raise ResetNeeded("call reset() before step()")
+        argument = self._check_actions(actions)
+        if self._mode is AutoresetMode.SAME_STEP:
+            return self._step_same(argument)
+        if self._mode is AutoresetMode.NEXT_STEP:
+            stepped = self._batch.reset_or_step(argument, self._ended)
+        else:
+            if self._ended.any():
+                raise ResetNeeded(f"envs {np.flatnonzero(self._ended).tolist()} have ended: reset them by a reset_mask")
+            stepped = self._batch.step(argument)
+        self._ended = stepped.terminated | stepped.truncated
+        frames = self._batch.draw(copy=self._copy)
+        return _result(frames, stepped, _masked(stepped.info, np.ones(self.num_envs, bool)))
+
+    def _step_same(self, argument: npt.NDArray[np.int32]) -> StepResult:
+        """Step, begin anew at once, and put the ends into the infos."""
+        stepped, frames, rows, final_frames = self._batch.step_and_reset(argument, self._copy)
+        ended = stepped.terminated | stepped.truncated
+        infos: Info = {}
+        if len(rows):
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            final_obs[rows] = list(final_frames)
+            infos = {"final_obs": final_obs, "_final_obs": ended.copy()}
+            infos |= {"final_info": _masked(stepped.info, ended), "_final_info": ended.copy()}
+        going_on = {key: np.where(ended, 0, value) for key, value in stepped.info.items()}
+        return _result(frames, stepped, infos | _masked(going_on, np.ones(self.num_envs, bool)))
+
+    def render(self) -> tuple[Frames, ...] | None:
+        """The N frames with ``render_mode="rgb_array"``, otherwise None."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' to gymnasium.make_vec")
+            return None
+        if not self._started:
+            raise ResetNeeded("there is no frame before the first reset()")
+        return tuple(self._batch.draw())
+
+    def _check_actions(self, actions: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+        """The actions as a new array, which JAX may read while the caller goes on."""
+        given = np.asarray(actions)
+        if given.shape != (self.num_envs,) or not np.issubdtype(given.dtype, np.integer):
+            raise ValueError(f"actions are {given.dtype} {given.shape}, expected integers ({self.num_envs},)")
+        num_actions = self._batch.game.num_actions
+        if given.min() < 0 or given.max() >= num_actions:
+            allowed = f"allowed: 0 to {num_actions - 1}"
+            raise ValueError(f"actions range from {given.min()} to {given.max()}, {allowed}")
+        return given.astype(np.int32, copy=True)
+
+
+def _mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        allowed = ", ".join(repr(each.value) for each in AutoresetMode)
+        raise ValueError(f"autoreset_mode is {mode!r}, allowed: {allowed}") from None
+
+
+def _result(frames: Frames, stepped: Stepped, infos: Info) -> StepResult:
+    return frames, stepped.reward, stepped.terminated, stepped.truncated, infos
+
+
+def _masked(info: Info, mask: Bools) -> Info:
+    """Infos as Gymnasium batches them: values beside ``_key`` masks, zeros where the mask is false."""
+    out: Info = {}
+    for key, value in info.items():
+        out[key], out[f"_{key}"] = np.where(mask, value, 0), mask.copy()
+    return out

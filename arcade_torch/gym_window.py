@@ -1,0 +1,66 @@
+"""A window that shows frames, enlarged to whole pixels; needs pygame, which the extra ``play`` brings."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+class Window:
+    """One window of pygame; opened by the first frame.
+
+    Args:
+        scale: Width and height of a frame's pixel on the screen.
+
+    Raises:
+        ImportError: pygame is not installed; says how to get it.
+    """
+
+    def __init__(self, scale: int = 1) -> None:
+        try:
+            import pygame
+        except ModuleNotFoundError as error:
+            raise ImportError("a window needs the package pygame: pip install 'arcade-torch[play]'") from error
+        self.pygame: Any = pygame
+        self._scale = scale
+        self._screen: Any = None
+        self._clock: Any = None
+
+    def show(self, frame: npt.NDArray[np.uint8], title: str) -> None:
+        """Show a frame.
+
+        Args:
+            frame: uint8 [H, W, 3].
+            title: Text in the window's title bar.
+        """
+        pygame = self.pygame
+        height, width = (side * self._scale for side in frame.shape[:2])
+        if self._screen is None:
+            pygame.display.init()
+            self._screen = pygame.display.set_mode((width, height))
+            self._clock = pygame.time.Clock()
+        pygame.display.set_caption(title)
+        pygame.surfarray.blit_array(self._screen, enlarge(frame, self._scale).swapaxes(0, 1))
+        pygame.display.flip()
+
+    def tick(self, fps: float) -> None:
+        """Wait so that this is reached at most ``fps`` times a second, and answer the window system."""
+        if self._clock is not None:
+            self.pygame.event.pump()
+            self._clock.tick(fps)
+
+    def close(self) -> None:
+        """Close the window; closing it again does nothing."""
+        if self._screen is not None:
+            self.pygame.display.quit()
+            self._screen = None
+
+
+def enlarge(frame: npt.NDArray[np.uint8], scale: int) -> npt.NDArray[np.uint8]:
+    """Repeat every pixel ``scale`` times in both directions.
+
+    Example:
+        >>> enlarge(np.zeros((2, 3, 3), np.uint8), 4).shape
+        (8, 12, 3)
+    """
+    return frame.repeat(scale, axis=0).repeat(scale, axis=1)

@@ -1,0 +1,217 @@
+"""A session of play: keys in, frames, a caption and finished episodes out. Knows neither window nor terminal.
+
+Nothing moves on its own: one key, one step. The last picture of an episode stays until the next one is asked for.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from arcade_torch.compiled import CompiledGame
+from arcade_torch.envs_jax import ACTION_NAMES, Game
+from arcade_torch.gym_batch import NumpyBatch, seed_keys
+
+Frame = npt.NDArray[np.uint8]
+End = Literal["terminated", "truncated", "abandoned"]
+
+RESTART, TOGGLE, NEXT, QUIT = "restart", "toggle", "next", "quit"
+KEYS = (*ACTION_NAMES, RESTART, TOGGLE, NEXT, QUIT)
+LEGEND = "arrows and space play, P changes the twin, R restarts, Enter goes on after an end, Esc quits"
+_SEEDS = 2**32
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One episode, enough to play it again.
+
+    Attributes:
+        seed: the episode is that of env 0 of an ``ArcadeEnv`` with this seed.
+        attempt: 1, or more after restarts of the same episode.
+        observability: ``full``, ``partial``, ``both`` (side by side) or ``mixed`` (changed in mid-episode).
+        actions: one digit a step, 0 to 4.
+        total: undiscounted return so far.
+        end: ``terminated`` by the game, ``truncated`` by the time limit, or ``abandoned`` by the player.
+    """
+
+    seed: int
+    attempt: int
+    observability: str
+    actions: str
+    total: float
+    end: End
+
+    @property
+    def steps(self) -> int:
+        """Number of actions."""
+        return len(self.actions)
+
+
+class Session:
+    """One player at one game.
+
+    Args:
+        game: what is played.
+        seed: of the first episode; each further one has the next.
+        partial: show the POMDP twin.
+        both: show both twins, the MDP on the left.
+        episodes: end after so many finished episodes; 0 for never.
+        on_attempt: called with every episode that ended or was abandoned after its first step.
+
+    Raises:
+        ValueError: a negative number of episodes, or a seed out of range.
+
+    Example:
+        >>> from arcade_torch.compiled import compiled_game
+        >>> session = Session(compiled_game("MineSweeperEasy", 128, "default", {}))
+        >>> session.press("right")
+        >>> session.steps, session.frame.shape
+        (1, (128, 128, 3))
+    """
+
+    def __init__(
+        self,
+        game: CompiledGame,
+        *,
+        seed: int = 0,
+        partial: bool = False,
+        both: bool = False,
+        episodes: int = 0,
+        on_attempt: Callable[[Attempt], None] | None = None,
+    ) -> None:
+        if episodes < 0:
+            raise ValueError(f"episodes is {episodes}, expected 0 (no end) or more")
+        self._batch = NumpyBatch(game, np.zeros(1, bool))
+        self.partial, self.both = partial, both
+        self.seed = seed
+        self.finished = 0
+        self.closed = False
+        self._episodes = episodes
+        self._on_attempt = on_attempt or (lambda attempt: None)
+        self._attempt = 0
+        self._begin(seed)
+
+    @property
+    def game(self) -> Game[Any]:
+        """The game that is played."""
+        return self._batch.game
+
+    @property
+    def state(self) -> Any:
+        """The game's state, numpy leaves [1, ...]: what a state oracle sees."""
+        return self._batch.state
+
+    @property
+    def steps(self) -> int:
+        """Steps of the running episode."""
+        return len(self._actions)
+
+    @property
+    def total(self) -> float:
+        """Return of the running episode so far."""
+        return float(self._batch.info["episode_reward"][0])
+
+    @property
+    def end(self) -> End | None:
+        """How the episode ended; None while it runs."""
+        return self._end
+
+    def view(self, partial: bool) -> Frame:
+        """What one twin shows now, uint8 [1, S, S, 3]."""
+        return self._batch.draw(np.array([partial]))
+
+    @property
+    def frame(self) -> Frame:
+        """What the player sees: uint8 [S, S, 3], or [S, 2 S, 3] with both twins."""
+        if self.both:
+            both: Frame = np.concatenate([self.view(False)[0], self.view(True)[0]], axis=1)
+            return both
+        one: Frame = self.view(self.partial)[0]
+        return one
+
+    @property
+    def caption(self) -> str:
+        """Game, twin, return, steps and last reward in one line."""
+        twin = "MDP | POMDP" if self.both else "POMDP" if self.partial else "MDP"
+        numbers = f"return {self.total:+.3f}  steps {self.steps}/{self.game.max_steps}  last {self._reward:+.3f}"
+        return f"{self.game.id} {twin}  {numbers}{self._what_now()}"
+
+    def _what_now(self) -> str:
+        if self._end is None:
+            return ""
+        why = "over" if self._end == "terminated" else "time is up"
+        return f"  {why}: Enter {'ends' if self._all_played() else 'for the next'}, Esc quits"
+
+    def press(self, key: str) -> None:
+        """React to a key.
+
+        Args:
+            key: one of ``KEYS``: up, down, left, right, fire, restart, toggle, next, quit.
+
+        Raises:
+            ValueError: another key.
+        """
+        if key not in KEYS:
+            raise ValueError(f"key is {key!r}, allowed: {', '.join(KEYS)}")
+        if self.closed:
+            return
+        if key == QUIT:
+            self._abandon()
+            self.closed = True
+        elif key == TOGGLE:
+            self._toggle()
+        elif key in (RESTART, NEXT) and self._end is not None:
+            self._go_on()
+        elif key == RESTART:
+            self._abandon()
+            self._begin(self.seed)
+        elif key != NEXT and self._end is None:
+            self._step(ACTION_NAMES.index(key))
+
+    def _begin(self, seed: int) -> None:
+        """Begin the episode of a seed."""
+        self._attempt = self._attempt + 1 if seed == self.seed else 1
+        self.seed = seed
+        self._batch.reset(np.ones(1, bool), seed_keys(seed, 1))
+        self._actions: list[int] = []
+        self._reward = 0.0
+        self._end: End | None = None
+        self._mixed = False
+
+    def _toggle(self) -> None:
+        """Show the other twin; side by side there is none."""
+        if not self.both:
+            self.partial = not self.partial
+            self._mixed |= self._end is None
+
+    def _go_on(self) -> None:
+        """Leave the picture of an end."""
+        if self._all_played():
+            self.closed = True
+        else:
+            self._begin((self.seed + 1) % _SEEDS)
+
+    def _all_played(self) -> bool:
+        return self._episodes > 0 and self.finished >= self._episodes
+
+    def _step(self, action: int) -> None:
+        """Take an action."""
+        stepped = self._batch.step(np.array([action], np.int32))
+        self._actions.append(action)
+        self._reward = float(stepped.reward[0])
+        if stepped.terminated[0] or stepped.truncated[0]:
+            self._end = "terminated" if stepped.terminated[0] else "truncated"
+            self.finished += 1
+            self._report(self._end)
+
+    def _abandon(self) -> None:
+        """Report the running episode, if there is anything to report."""
+        if self._end is None and self._actions:
+            self._report("abandoned")
+
+    def _report(self, end: End) -> None:
+        twin = "both" if self.both else "mixed" if self._mixed else "partial" if self.partial else "full"
+        actions = "".join(map(str, self._actions))
+        self._on_attempt(Attempt(self.seed, self._attempt, twin, actions, self.total, end))

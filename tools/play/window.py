@@ -1,0 +1,64 @@
+"""A session in a window of pygame."""
+
+import os
+import sys
+
+from arcade_torch.gym_window import Window
+from arcade_torch.tools.optional import MissingPackage, need
+from arcade_torch.tools.play.session import NEXT, QUIT, RESTART, TOGGLE, Session
+
+FPS = 30
+_DELAY_MS = 300  # how long a key is held before it repeats
+_KEY_OF = {
+    "up": "K_UP",
+    "down": "K_DOWN",
+    "left": "K_LEFT",
+    "right": "K_RIGHT",
+    "fire": "K_SPACE",
+    RESTART: "K_r",
+    TOGGLE: "K_p",
+    NEXT: "K_RETURN",
+    QUIT: "K_ESCAPE",
+}
+
+
+def why_no_window() -> str | None:
+    """Why a window cannot be opened here, in a few words; None if it can."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        pygame = need("pygame")
+    except MissingPackage as error:
+        return str(error)
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in names):
+        return "there is no display"
+    try:
+        pygame.display.init()
+    except pygame.error as error:
+        return f"no display can be opened ({error})"
+    return None
+
+
+def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> None:
+    """Show a session and hand it the keys, until it is closed.
+
+    Args:
+        session: what is played.
+        scale: width and height of a frame's pixel on the screen.
+        key_repeat_ms: a held key repeats every so many milliseconds; 0 for not at all.
+    """
+    window = Window(scale)
+    pygame = window.pygame
+    keys = {getattr(pygame, constant): name for name, constant in _KEY_OF.items()}
+    try:
+        window.show(session.frame, session.caption)
+        pygame.key.set_repeat(*((_DELAY_MS, key_repeat_ms) if key_repeat_ms else ()))
+        while not session.closed:
+            for event in pygame.event.get((pygame.QUIT, pygame.KEYDOWN)):
+                key = QUIT if event.type == pygame.QUIT else keys.get(event.key)
+                if key is not None:
+                    session.press(key)
+                    window.show(session.frame, session.caption)
+            window.tick(FPS)
+    finally:
+        window.close()

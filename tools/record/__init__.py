@@ -1,0 +1,1 @@
+"""Record episodes of random, scripted and trained players as GIF or MP4."""
