@@ -14,7 +14,7 @@ PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow lint bench docs clean distclean
+.PHONY: help install demo test test-slow lint bench parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -23,6 +23,8 @@ help:
 	@echo "make test       the tests (make test-slow: the long ones)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      frames per second of the environments"
+	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
+	@echo "                (make bench-parity: the ratio of speed to it, game by game)"
 	@echo "make docs       these pages and the API reference in build/docs"
 	@echo "make clean      remove build output and caches (make distclean: and $(VENV))"
 
@@ -42,6 +44,10 @@ $(VENV)/.docs: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[docs]'
 	@touch $@
 
+$(VENV)/.parity: $(VENV)/.installed
+	$(PIP) --no-build-isolation -e '.[parity]'
+	@touch $@
+
 demo: install
 	$(VENV)/bin/arcade-torch demo $(ARGS)
 
@@ -58,6 +64,12 @@ lint: install
 
 bench: install
 	$(VENV)/bin/arcade-torch bench envs $(ARGS)
+
+parity: $(VENV)/.parity
+	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity tests/parity $(ARGS)
+
+bench-parity: $(VENV)/.parity
+	$(RUN) -m tests.parity.bench $(ARGS)
 
 docs: $(VENV)/.docs
 	$(RUN) docs/build.py build/docs

@@ -195,12 +195,13 @@ class ArcadeCollector(BaseCollector):
         assert self._obs is not None
         if self._window is None:
             shape = self._obs["pixels"].shape[1:]
-            self._window = Window(self._num_envs, self._context, self._steps, shape, self.env.device)
+            task = self.env.task if self.env.task_in_td else None
+            self._window = Window(self._num_envs, self._context, self._steps, shape, self.env.device, task)
         return self._window
 
     def _observe(self, root: TensorDictBase) -> None:
         """Take over a root tensordict as what is acted on next."""
-        self._obs = {key: root[key] for key in ROOT_KEYS}
+        self._obs = {key: root[key] for key in ROOT_KEYS if key in root}
         self._obs["pixels"] = self._compressed(self._obs["pixels"])
         self._generation = self.env.generation
 
@@ -237,6 +238,8 @@ class ArcadeCollector(BaseCollector):
             out["step_count"] = to_torch(root.step_count, device).to(torch.int64).unsqueeze(-1)
         if "episode_reward" in keys:
             out["episode_reward"] = to_torch(root.episode_reward, device).clone().unsqueeze(-1)
+        if "task" in keys and self.env.task_in_td:
+            out["task"] = self.env.task
         return out
 
     def _act(

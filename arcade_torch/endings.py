@@ -9,6 +9,7 @@ import torch
 
 from arcade_torch.compiled import CompiledGame, Step
 from arcade_torch.dlpack import to_torch
+from arcade_torch.envs_jax.batch import BatchedGame
 
 # Frames are drawn in portions of one size, an eighth of the batch but some at least, so that one compiled shape serves.
 _SHARE, _AT_LEAST = 8, 4
@@ -20,16 +21,17 @@ class FinalStates:
     A compiled call a step would cost more than the frames; picking rows out of host memory costs next to nothing.
 
     Args:
-        compiled: The game.
+        compiled: The game, or the mixture of games.
         num_envs: Number of envs in the batch.
         device: Where the frames are wanted.
     """
 
     def __init__(self, compiled: CompiledGame, num_envs: int, device: torch.device) -> None:
-        self._compiled = compiled
-        self._portion = min(num_envs, max(_AT_LEAST, num_envs // _SHARE))
-        self._device = device
-        self._taken: list[tuple[int, np.ndarray, Any]] = []
+        batched = compiled.batched
+        self._states = batched.states
+        self._groups = [
+            _OfOneGame(group, rows, device) for group, rows in zip(batched.groups, batched.rows(num_envs), strict=True)
+        ]
 
     def add(self, time: int, rows: np.ndarray, step: Step) -> None:
         """Keep the final states of some envs.
@@ -39,29 +41,55 @@ class FinalStates:
             rows: int64 [n], the envs whose episodes ended.
             step: The step in which they ended.
         """
-        states = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (step.final_state, step.root.partial))
-        self._taken.append((time, rows, states))
+        for group, states in zip(self._groups, self._states(step.final_state), strict=True):
+            group.add(time, rows, states, step.root.partial)
 
     def clear(self) -> None:
         """Forget what was added."""
-        self._taken.clear()
+        for group in self._groups:
+            group.taken.clear()
 
     def draw(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         """Draw what was added, portion by portion, and forget it.
 
         Yields:
-            int64 [n] times, int64 [n] rows, uint8 [n, S, S, 3] frames, in the order they were added.
+            int64 [n] times, int64 [n] rows, uint8 [n, S, S, 3] frames, game by game in the order they were added.
         """
-        if not self._taken:
+        for group in self._groups:
+            yield from group.draw()
+
+
+class _OfOneGame:
+    """The final states of the envs that play one game."""
+
+    def __init__(self, game: BatchedGame[Any], rows: slice, device: torch.device) -> None:
+        self._draw = game.draw
+        self._first, self._last = rows.start, rows.stop
+        size = rows.stop - rows.start
+        self._portion = min(size, max(_AT_LEAST, size // _SHARE))
+        self._device = device
+        self.taken: list[tuple[int, np.ndarray, Any]] = []
+
+    def add(self, time: int, rows: np.ndarray, states: Any, partial: jax.Array) -> None:
+        """Keep the states (leaves [n, ...]) of those ``rows`` that are this game's."""
+        rows = rows[(rows >= self._first) & (rows < self._last)]
+        if len(rows):
+            own = rows - self._first
+            kept = jax.tree.map(lambda leaf: np.asarray(leaf)[own], states), np.asarray(partial)[rows]
+            self.taken.append((time, rows, kept))
+
+    def draw(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """See ``FinalStates``."""
+        if not self.taken:
             return
-        times = np.concatenate([np.full(len(rows), time) for time, rows, _ in self._taken])
-        rows = np.concatenate([rows for _, rows, _ in self._taken])
-        states = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(states for _, _, states in self._taken))
-        self.clear()
+        times = np.concatenate([np.full(len(rows), time) for time, rows, _ in self.taken])
+        rows = np.concatenate([rows for _, rows, _ in self.taken])
+        states = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(states for _, _, states in self.taken))
+        self.taken.clear()
         for first in range(0, len(rows), self._portion):
             portion = slice(first, first + self._portion)
             index = np.arange(len(rows))[portion]
             index = np.pad(index, (0, self._portion - len(index)), mode="edge")
-            frames = self._compiled.draw(*jax.tree.map(lambda leaf, index=index: leaf[index], states))
+            frames = self._draw(*jax.tree.map(lambda leaf, index=index: leaf[index], states))
             when, where = torch.from_numpy(times[portion]), torch.from_numpy(rows[portion])
             yield when.to(self._device), where.to(self._device), to_torch(frames, self._device)[: len(where)]

@@ -14,7 +14,7 @@ from arcade_torch import specs
 from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
 from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
 from arcade_torch.endings import FinalStates
-from arcade_torch.envs_jax import Game
+from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.snapshot import Snapshots
@@ -48,19 +48,20 @@ def check_num_envs(num_envs: int) -> None:
 
 
 class ArcadeEnv(EnvBase):
-    """A batch of N episodes of one game, as a TorchRL environment with ``batch_size=[N]``.
+    """A batch of N episodes of one game or of several, as a TorchRL environment with ``batch_size=[N]``.
 
     Every key of the root and of ``"next"``: ``pixels`` uint8 [N, S, S, 3] (zero copy: **never write to it in place**),
     ``last_action`` int64 [N] (the action that led here; it survives an episode's end, and is 0 at the very first
     step), ``is_init`` bool [N, 1], ``step_count`` int64 [N, 1], ``episode_reward`` float32 [N, 1], ``done``,
     ``terminated``, ``truncated`` bool [N, 1]; ``"next"`` has ``reward`` float32 [N, 1] too. ``("next", "pixels")`` at
-    an end is the true final frame; the following root is the first frame of the new episode.
+    an end is the true final frame; the following root is the first frame of the new episode. With several games also
+    ``task`` int64 [N]: which of ``games`` an env plays, at every step and in every episode the same.
 
     ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
     give equal bits, whatever N, and whichever path is taken.
 
     Args:
-        game: A game, or a compiled one (whose functions are then shared).
+        game: A game, several as ``MixedGames``, or a compiled one (whose functions are then shared).
         num_envs: N.
         observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
         seed: Seed of the batch; None draws one from torch.
@@ -68,6 +69,7 @@ class ArcadeEnv(EnvBase):
         categorical_actions: Actions are int64 [N]; False: one-hot [N, num_actions].
         state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and makes every step start
             from the ``state`` it is handed, so that a planner can branch.
+        task_in_td: Whether there is a key ``task``; None: if there are several games.
         debug: Whether actions are checked on CUDA too.
 
     Raises:
@@ -80,7 +82,7 @@ class ArcadeEnv(EnvBase):
 
     def __init__(
         self,
-        game: Game[Any] | CompiledGame,
+        game: Game[Any] | MixedGames | CompiledGame,
         num_envs: int = 16,
         observability: Observability = "full",
         *,
@@ -88,6 +90,7 @@ class ArcadeEnv(EnvBase):
         device: torch.device | str | None = None,
         categorical_actions: bool = True,
         state_in_td: bool = False,
+        task_in_td: bool | None = None,
         debug: bool = False,
     ) -> None:
         check_num_envs(num_envs)
@@ -100,17 +103,20 @@ class ArcadeEnv(EnvBase):
         self._check_actions = debug or torch_device.type == "cpu"
         self.one_hot = not categorical_actions
         self._state_in_td = state_in_td
+        self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
+        self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         keys = jax.device_put(env_keys(0, num_envs), jax_device)
         self._live = _Live(self._batched.init(keys, jax.device_put(flags.numpy(), jax_device)))
         self._final_states = self.final_states()
-        self._snapshots = Snapshots(self._live.batch, self.game.id, torch_device, jax_device)
+        self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
         self._make_specs(categorical_actions)
         self._set_seed(seed)
 
     def _make_specs(self, categorical_actions: bool) -> None:
         num_envs, actions = self.num_envs, self.game.num_actions
         self.action_spec = specs.action_spec(num_envs, actions, categorical_actions, self.device)
-        observation = specs.observation_spec(num_envs, self.game.obs_size, actions, self.device)
+        tasks = len(self.games) if self.task_in_td else 0
+        observation = specs.observation_spec(num_envs, self.game.obs_size, actions, tasks, self.device)
         if self._state_in_td:
             observation["state"] = self._snapshots.spec()
             self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=self.device)
@@ -119,9 +125,19 @@ class ArcadeEnv(EnvBase):
         self.done_spec = specs.done_spec(num_envs, self.device)
 
     @property
-    def game(self) -> Game[Any]:
-        """The game that is played."""
+    def game(self) -> Game[Any] | Mixture:
+        """The game that is played, or what the games have in common: id, limits of steps and returns, picture size."""
         return self._batched.game
+
+    @property
+    def games(self) -> tuple[Game[Any], ...]:
+        """The games that are played, by task number."""
+        return tuple(group.game for group in self._batched.groups)
+
+    @property
+    def task(self) -> torch.Tensor:
+        """int64 [N], which of ``games`` each env plays. A copy."""
+        return self._task.clone()
 
     @property
     def num_envs(self) -> int:
@@ -328,6 +344,8 @@ class ArcadeEnv(EnvBase):
             "terminated": flags[1],
             "truncated": flags[2],
         }
+        if self.task_in_td:
+            root["task"] = self.task
         if self._state_in_td:
             root["state"] = self._snapshots.export(batch)
         return TensorDict(root, batch_size=self.batch_size, device=self.device)
@@ -352,6 +370,8 @@ class ArcadeEnv(EnvBase):
             "terminated": to_torch(outcome.terminated, self.device).unsqueeze(-1),
             "truncated": to_torch(outcome.truncated, self.device).unsqueeze(-1),
         }
+        if self.task_in_td:
+            following["task"] = self.task
         return TensorDict(following, batch_size=self.batch_size, device=self.device)
 
 

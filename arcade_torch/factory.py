@@ -1,5 +1,6 @@
-"""``make``: from the id of a game to a batch of envs."""
+"""``make``: from the id of a game, or the ids of several, to a batch of envs."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from arcade_torch.observability import Observability, resolve_observability
 
 
 def make(
-    id: str,
+    id: str | Sequence[str],
     num_envs: int = 16,
     observability: Observability | None = None,
     obs_size: int = 128,
@@ -21,13 +22,20 @@ def make(
     partial_obs: bool | None = None,
     categorical_actions: bool = True,
     state_in_td: bool = False,
+    task_in_td: bool | None = None,
     debug: bool = False,
     **options: Any,
 ) -> ArcadeEnv:
-    """Make a batch of envs of one game.
+    """Make a batch of envs of one game, or of several that one policy is to play.
+
+    Several games share the envs nearly equally: env 0 and its neighbours play the first, the last envs the last, and
+    what is left over goes to the earlier ones. An id that stands in the list k times gets k shares. The key ``task``
+    says which game an env plays, as an index into ``env.games``. ``env.game`` then has the longest time limit of all,
+    the lowest and the highest return, and the ids joined by ``+``; to report results, take each game's own from
+    ``env.games[task]``.
 
     Args:
-        id: Id of the game, such as ``"CartPoleEasy"`` (newest version) or ``"CartPoleEasy-v0"``.
+        id: Id of the game, such as ``"CartPoleEasy"`` (newest version) or ``"CartPoleEasy-v0"``; or a list of ids.
         num_envs: Number of envs in the batch.
         observability: ``"full"`` (MDP, the default), ``"partial"`` (POMDP twin), or bool [num_envs], true = partial.
         obs_size: Side of the frames, 128 or 256 pixels.
@@ -37,20 +45,23 @@ def make(
         partial_obs: Alias: True means ``observability="partial"``.
         categorical_actions: False for one-hot actions.
         state_in_td: Whether the whole game state travels in the tensordict, for planners; see ``ArcadeEnv``.
+        task_in_td: Whether there is a key ``task``; None: if ``id`` names several games.
         debug: Whether actions are checked on CUDA too, where that makes the host wait.
-        **options: Options of the game.
+        **options: Options of the game; of several games, each has to know them all.
 
     Returns:
         The env, not yet reset.
 
     Raises:
-        ValueError: Unknown id, size, rules, device, observability, or a number of envs that is not positive.
+        ValueError: Unknown id, size, rules, device, observability, an empty list of ids, or fewer envs than games.
         TypeError: An argument of a wrong type, or an option the game does not have.
 
     Example:
         >>> env = make("CartPoleEasy", num_envs=2, observability="partial")
         >>> env.rollout(3)["pixels"].shape
         torch.Size([2, 3, 128, 128, 3])
+        >>> make(["CartPoleEasy", "MineSweeperEasy"], num_envs=5).reset()["task"]
+        tensor([0, 0, 0, 1, 1])
     """
     check_num_envs(num_envs)
     flags = resolve_observability(observability, partial_obs, num_envs)
@@ -62,5 +73,6 @@ def make(
         device=device,
         categorical_actions=categorical_actions,
         state_in_td=state_in_td,
+        task_in_td=task_in_td,
         debug=debug,
     )

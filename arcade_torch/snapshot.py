@@ -16,6 +16,7 @@ from torchrl.data import Composite, Unbounded
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
+from arcade_torch.envs_jax.mixture import Batched
 
 _SIGNED = {np.dtype(np.uint32): torch.int32, np.dtype(np.uint16): torch.int16}
 
@@ -31,22 +32,24 @@ def _names(path: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 class Snapshots:
-    """Turns batches of one game into TensorDicts and back.
+    """Turns batches of one game, or of a mixture of games, into TensorDicts and back.
 
     Args:
-        batch: Any batch of the game; fixes names, shapes and types.
-        game_id: Versioned id of the game.
+        batched: What is played.
+        batch: Any batch of it; fixes names, shapes and types.
         device: Device of the tensors.
         jax_device: Device of the arrays.
     """
 
-    def __init__(self, batch: Batch, game_id: str, device: torch.device, jax_device: jax.Device) -> None:
-        leaves, self._tree = jax.tree_util.tree_flatten_with_path(batch)
+    def __init__(self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten_with_path(jax.eval_shape(batched.wide, batch))
         self._keys = [_names(path) for path, _ in leaves]
         self._dtypes = [np.dtype(leaf.dtype) for _, leaf in leaves]
         self._shapes = [torch.Size(leaf.shape) for _, leaf in leaves]
         self._num_envs = int(batch.step_count.shape[0])
-        self._game_id = game_id
+        self._batched, self._game_id = batched, batched.game.id
+        numbers = [fingerprint(group.game.id) for group in batched.groups]
+        self._games = torch.tensor(numbers)[torch.from_numpy(batched.task(self._num_envs))]
         self._device = device
         self._jax_device = jax_device
 
@@ -57,12 +60,13 @@ class Snapshots:
             batch: The batch.
 
         Returns:
-            TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own), ``partial`` bool [N],
-            ``last_action`` and ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``game`` int64 [N].
+            TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own; in a mixture under the id of
+            each game, and zero in the envs that play another), ``partial`` bool [N], ``last_action`` and
+            ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``game`` int64 [N].
         """
-        game = torch.full((self._num_envs,), fingerprint(self._game_id), device=self._device)
+        game = self._games.to(self._device, copy=True)
         out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
-        for key, array in zip(self._keys, jax.tree.leaves(batch), strict=True):
+        for key, array in zip(self._keys, jax.tree.leaves(self._batched.wide(batch)), strict=True):
             tensor = to_torch(array, self._device)
             signed = _SIGNED.get(np.dtype(array.dtype))
             out[key] = (tensor if signed is None else tensor.view(signed)).clone()
@@ -94,8 +98,7 @@ class Snapshots:
                     f"expects {dtype} {tuple(shape)}"
                 )
             arrays.append(jax.device_put(value, self._jax_device))
-        batch: Batch = jax.tree_util.tree_unflatten(self._tree, arrays)
-        return batch
+        return self._batched.narrow(jax.tree_util.tree_unflatten(self._tree, arrays))
 
     def _check_game(self, td: TensorDictBase) -> None:
         """Refuse the state of another game or of another number of envs."""
@@ -104,12 +107,12 @@ class Snapshots:
         game = td.get("game", None)
         if game is None:
             raise ValueError("the state has no entry 'game': pass what get_state() gave")
-        mine = fingerprint(self._game_id)
-        others = [int(number) for number in game.unique() if int(number) != mine]
-        if others:
+        differs = (game.cpu() != self._games).nonzero()
+        if len(differs):
+            env = int(differs[0])
             known = {fingerprint(other): other for other in registered_ids()}
-            theirs = known.get(others[0], "another game")
-            raise ValueError(f"the state is one of {theirs}, this env plays {self._game_id}")
+            theirs = known.get(int(game[env]), "another game")
+            raise ValueError(f"the state of env {env} is one of {theirs}, this env plays {self._game_id}")
 
     def spec(self) -> Composite:
         """Spec of what ``export`` gives."""

@@ -11,9 +11,11 @@ def action_spec(num_envs: int, num_actions: int, categorical: bool, device: torc
     return OneHot(num_actions, shape=(num_envs, num_actions), dtype=torch.bool, device=device)
 
 
-def observation_spec(num_envs: int, obs_size: int, num_actions: int, device: torch.device) -> Composite:
-    """Spec of everything the env shows: frames, last action, start flag, steps and return so far."""
+def observation_spec(num_envs: int, obs_size: int, num_actions: int, num_tasks: int, device: torch.device) -> Composite:
+    """Spec of what the env shows: frames, last action, start flag, steps and return so far; ``task`` if it has some."""
+    task = {"task": Categorical(num_tasks, shape=(num_envs,), dtype=torch.int64, device=device)} if num_tasks else {}
     return Composite(
+        **task,
         pixels=Unbounded((num_envs, obs_size, obs_size, 3), dtype=torch.uint8, device=device),
         last_action=Categorical(num_actions, shape=(num_envs,), dtype=torch.int64, device=device),
         is_init=Categorical(2, shape=(num_envs, 1), dtype=torch.bool, device=device),

@@ -47,9 +47,18 @@ class Window:
         steps: T, new steps a window.
         frame_shape: Shape of a stored frame.
         device: Device of the storage.
+        task: int64 [N], the game that each env plays, where there are several.
     """
 
-    def __init__(self, num_envs: int, context: int, steps: int, frame_shape: torch.Size, device: torch.device) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        context: int,
+        steps: int,
+        frame_shape: torch.Size,
+        device: torch.device,
+        task: torch.Tensor | None = None,
+    ) -> None:
         self.num_envs, self.context, self.steps, self.length = num_envs, context, steps, context + steps
         size = (num_envs, self.length)
         self.pixels = torch.empty((*size, *frame_shape), dtype=torch.uint8, device=device)
@@ -62,6 +71,7 @@ class Window:
         self._slots = torch.full(size, -1, dtype=torch.int64, device=device)
         self._tail_ended = torch.zeros(num_envs, dtype=torch.bool, device=device)  # whose tail slot is a final frame
         self._next_dense: torch.Tensor | None = None
+        self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
 
     @property
     def device(self) -> torch.device:
@@ -174,6 +184,8 @@ class Window:
         flags = torch.zeros((4, *size, 1), dtype=torch.bool, device=self.device)
         out["done"], out["terminated"], out["truncated"], out["next", "is_init"] = flags
         out["next", "last_action"] = out["action"]
+        if self._task is not None:
+            out["next", "task"] = out["task"]
         if compact:
             out["next", "frame_slot"] = self._slots[:, self.context :].unsqueeze(-1)
             out["next_pool"] = NonTensorData(self.pool, batch_size=size)
@@ -200,6 +212,8 @@ class Window:
             ("next", "done"): self.done[:, first:, None],
             **{key: buffer[:, first:] for key, buffer in self.extras.items()},
         }
+        if self._task is not None:
+            entries["task"] = self._task[:, first:]
         # With a device set, TensorDict.clone would share the pool with the storage, which the next window overwrites.
         out = TensorDict({}, batch_size=batch_size, device=None if has_pool else self.device)
         for key, value in entries.items():

@@ -9,7 +9,10 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
 
+from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import Array, Game
 
 State = TypeVar("State")
@@ -73,9 +76,13 @@ class BatchedGame(Generic[State]):
 
     Args:
         game: The game to batch.
+
+    Raises:
+        ValueError: It is not one of this package and does not keep the contract; see ``check_game``.
     """
 
     def __init__(self, game: Game[State]) -> None:
+        check_foreign(game)
         self.game = game
         self.init = jax.jit(self._init)
         self.step = jax.jit(self._step)
@@ -85,6 +92,32 @@ class BatchedGame(Generic[State]):
         self.step_render = jax.jit(self._step_render)
         self.reset_render = jax.jit(self._reset_render)
         self.render_rows = jax.jit(self._render_rows)
+        self.draw = jax.jit(jax.vmap(game.render))  # states [K, ...], partial bool [K] -> uint8 [K, S, S, 3]
+
+    @property
+    def groups(self) -> tuple["BatchedGame[State]", ...]:
+        """The games of the batch, here one; see ``MixedGames``."""
+        return (self,)
+
+    def rows(self, num_envs: int) -> tuple[slice, ...]:
+        """The envs of each game of the batch: here all."""
+        return (slice(0, num_envs),)
+
+    def task(self, num_envs: int) -> npt.NDArray[np.int64]:
+        """The index of the game that each env plays, int64 [num_envs]: here 0."""
+        return np.zeros(num_envs, np.int64)
+
+    def states(self, state: Any) -> tuple[Any, ...]:
+        """The states of each game's own envs."""
+        return (state,)
+
+    def wide(self, batch: Batch) -> Batch:
+        """The batch with all leaves [N, ...], which it has; see ``MixedGames``."""
+        return batch
+
+    def narrow(self, batch: Batch) -> Batch:
+        """The inverse of ``wide``."""
+        return batch
 
     def _init(self, keys: Array, partial: Array) -> Batch:
         """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""

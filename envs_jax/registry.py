@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import OBS_SIZES, RULES, Game, check_choice
 
 Factory = Callable[..., Game[Any]]
@@ -13,17 +14,20 @@ Factory = Callable[..., Game[Any]]
 _FACTORIES: dict[str, Factory] = {}
 _NEWEST: dict[str, str] = {}
 _ALIASES: dict[str, str] = {}
+_PROBES: set[str] = set()
 _VERSIONED = re.compile(r"^(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>\d+)$")
 
 
-def register(id: str, factory: Factory, aliases: Iterable[str] = ()) -> None:
+def register(id: str, factory: Factory, aliases: Iterable[str] = (), *, probe: bool = False) -> None:
     """Add a game to the registry.
 
     Args:
         id: Versioned id, ``"NameDifficulty-vN"``. The bare name comes to mean the highest version registered.
-        factory: Called as ``factory(id=..., obs_size=..., rules=..., **options)``; returns the game. Its further
-            keyword arguments are the options that ``make`` accepts.
+        factory: Called as ``factory(id=..., obs_size=..., rules=..., **options)``; returns the game, which ``make``
+            checks. Its further keyword arguments are the options that ``make`` accepts.
         aliases: Other bare names for the same game.
+        probe: Whether this is a small task for looking at agents, listed by :func:`probe_ids`, and not one of the
+            benchmark's, listed by :func:`registered_ids`.
 
     Raises:
         ValueError: The id has no version, or is taken.
@@ -39,16 +43,28 @@ def register(id: str, factory: Factory, aliases: Iterable[str] = ()) -> None:
         _NEWEST[name] = id
     for alias in aliases:
         _ALIASES[alias] = name
+    if probe:
+        _PROBES.add(id)
 
 
 def registered_ids() -> list[str]:
-    """All versioned ids, sorted.
+    """All versioned ids of the benchmark and of games of your own, sorted; without the probes.
 
     Example:
         >>> "MineSweeperEasy-v0" in registered_ids()
         True
     """
-    return sorted(_FACTORIES)
+    return sorted(_FACTORIES.keys() - _PROBES)
+
+
+def probe_ids() -> list[str]:
+    """Versioned ids of the small tasks that show whether an agent remembers, sorted.
+
+    Example:
+        >>> probe_ids()
+        ['SignpostEasy-v0', 'SignpostHard-v0', 'SignpostMedium-v0']
+    """
+    return sorted(_PROBES)
 
 
 def resolve_id(id: str) -> str:
@@ -81,7 +97,10 @@ def resolve_id(id: str) -> str:
     known = {known.lower(): known for known in (*_NEWEST, *_ALIASES)}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
-    raise ValueError(f"unknown env id {id!r}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'")
+    raise ValueError(
+        f"unknown env id {id!r}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a game of your "
+        "own has to be registered first, on the command line with --import"
+    )
 
 
 def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any) -> Game[Any]:
@@ -99,7 +118,8 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         The game.
 
     Raises:
-        ValueError: Unknown id, size, rules or option value.
+        ValueError: Unknown id, size, rules or option value; or a game of one's own that does not keep the contract,
+            see ``check_game``.
         TypeError: Unknown option.
 
     Example:
@@ -115,7 +135,21 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     if unknown:
         has = f"its options are {', '.join(allowed)}" if allowed else "it has no options"
         raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has}")
-    return factory(id=full_id, obs_size=obs_size, rules=rules, **options)
+    game = factory(id=full_id, obs_size=obs_size, rules=rules, **options)
+    _check_made(game, full_id, obs_size)
+    return game
+
+
+def _check_made(game: Game[Any], full_id: str, obs_size: int) -> None:
+    """Refuse what a factory made if it is not the game that was asked for, or does not keep the contract."""
+    if not isinstance(game, Game):
+        raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
+    if (game.id, game.obs_size) != (full_id, obs_size):
+        made = f"{game.id!r} with obs_size {game.obs_size!r}"
+        raise ValueError(
+            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: pass on both"
+        )
+    check_foreign(game)
 
 
 def option_names(id: str) -> list[str]:

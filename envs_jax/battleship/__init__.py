@@ -25,7 +25,8 @@ class BattleShip(Game[BattleShipState]):
         level: Numbers of the difficulty.
         id: Versioned id.
         obs_size: 128 or 256.
-        rules: ``"reference"`` judges the repeats one shot late; the lowest return is then one repeat lower.
+        rules: ``"reference"`` judges the repeats one shot late (the lowest return is then one repeat lower) and never
+            starts the cursor in the last row or column.
 
     Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: the end by repeats is not one shot late, the
     cursor starts on any cell, a mark has one colour in both twins and at all times.
@@ -39,7 +40,7 @@ class BattleShip(Game[BattleShipState]):
 
     def reset(self, key: Array) -> BattleShipState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return law.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""

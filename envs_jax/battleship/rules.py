@@ -80,10 +80,14 @@ def draw_board(key: Array, level: Level) -> Array:
     return occupied.astype(jnp.int8)
 
 
-def reset(key: Array, level: Level) -> BattleShipState:
-    """Ships anywhere without overlap, the cursor on any cell, nothing shot at."""
+def reset(key: Array, level: Level, rules: Rules) -> BattleShipState:
+    """Ships anywhere without overlap, the cursor on any cell, nothing shot at.
+
+    With ``rules="reference"`` the cursor never begins in the last column or row.
+    """
     for_ships, for_cursor = jax.random.split(key)
-    x, y = jax.random.randint(for_cursor, (2,), 0, level.side, dtype=jnp.int32)
+    span = level.side if rules == "default" else level.side - 1
+    x, y = jax.random.randint(for_cursor, (2,), 0, span, dtype=jnp.int32)
     board, zero = draw_board(for_ships, level), jnp.int32(0)
     return BattleShipState(x, y, board, jnp.zeros_like(board), zero, zero, zero)
 

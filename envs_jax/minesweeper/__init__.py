@@ -25,7 +25,8 @@ class MineSweeper(Game[MineSweeperState]):
         level: Numbers of the difficulty.
         id: Versioned id.
         obs_size: 128 or 256.
-        rules: ``"reference"`` judges repeats and time one sweep late.
+        rules: ``"reference"`` judges repeats and time one sweep late, and never starts the cursor in the last row or
+            column.
         mine_reward: Reward for hitting a mine. The published scale has 0; the paper's words ask for a negative number.
 
     Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: ends are not one sweep late, the cursor
@@ -54,7 +55,7 @@ class MineSweeper(Game[MineSweeperState]):
 
     def reset(self, key: Array) -> MineSweeperState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return law.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: MineSweeperState, action: Array) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""

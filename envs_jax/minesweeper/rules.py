@@ -46,11 +46,15 @@ def draw_mines(key: Array, level: Level) -> Array:
     return (lower.sum(1) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
 
 
-def reset(key: Array, level: Level) -> MineSweeperState:
-    """Mines on distinct uniformly random cells, the cursor on any cell."""
+def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
+    """Mines on distinct uniformly random cells, the cursor on any cell.
+
+    With ``rules="reference"`` the cursor never begins in the last column or row.
+    """
     for_mines, for_cursor = jax.random.split(key)
     mines = draw_mines(for_mines, level)
-    x, y = jax.random.randint(for_cursor, (2,), 0, level.side, dtype=jnp.int32)
+    span = level.side if rules == "default" else level.side - 1
+    x, y = jax.random.randint(for_cursor, (2,), 0, span, dtype=jnp.int32)
     zero = jnp.int32(0)
     return MineSweeperState(x, y, mines, count_neighbours(mines), zero, zero, zero)
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.compiled import CompiledGame
-from arcade_torch.envs_jax import Game
+from arcade_torch.envs_jax import Game, MixedGames
 
 Array = jax.Array
 
@@ -60,6 +60,41 @@ class StubGame(Game[State]):
         return jnp.broadcast_to(column[:, None, None], (8, 8, 3))
 
 
-# Shared by all test modules, so that each is compiled once. In the second all envs end at once, in every fifth step.
+class Coin(NamedTuple):
+    """State of the other stub game, with another structure."""
+
+    heads: Array  # bool
+    count: Array  # uint8, steps so far
+
+
+class CoinGame(Game[Coin]):
+    """Tosses a coin: action 0 keeps it, any other tosses it. Ends at five heads in a row, truncates at seven steps.
+
+    The frame shows the count and the coin, the partial one all but the coin.
+    """
+
+    id = "CoinEasy-v0"
+    obs_size = 8
+    rules = "default"
+    max_steps = 7
+    return_range = (0.0, 1.0)
+
+    def reset(self, key: Array) -> Coin:
+        return Coin(jax.random.bernoulli(key), jnp.uint8(0))
+
+    def step(self, key: Array, state: Coin, action: Array) -> tuple[Coin, Array, Array, Array]:
+        heads = jnp.where(action == 0, state.heads, jax.random.bernoulli(key))
+        count = state.count + jnp.uint8(1)
+        return Coin(heads, count), heads.astype(jnp.float32) / 7, heads & (count == 5), count >= self.max_steps
+
+    def render(self, state: Coin, partial: Any) -> Array:
+        coin = jnp.where(partial, 0, 100 + state.heads.astype(jnp.uint8))
+        column = jnp.stack([state.count, coin.astype(jnp.uint8), *[jnp.uint8(9)] * 6])
+        return jnp.broadcast_to(column[:, None, None], (8, 8, 3))
+
+
+# Shared by all test modules, so that each is compiled once. In the second all envs end at once, in every fifth step;
+# the third has four envs of one game and two of another where there are six.
 GAME = CompiledGame(StubGame())
 LOCKSTEP = CompiledGame(StubGame(risk=0.0, max_steps=5))
+MIXED = CompiledGame(MixedGames([StubGame(), CoinGame()], weights=(2, 1)))

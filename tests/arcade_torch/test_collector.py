@@ -15,7 +15,7 @@ from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.frames import FramePool, next_pixels, shift_next
-from tests.arcade_torch.stub import GAME, LOCKSTEP
+from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED
 
 N, T = 6, 8
 
@@ -67,7 +67,7 @@ def tensors(batch: TensorDictBase) -> TensorDictBase:
 # -- the same data as TorchRL's ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("game", "steps"), [(GAME, 200), (LOCKSTEP, 24)])  # 1000 and 120 steps an env
+@pytest.mark.parametrize(("game", "steps"), [(GAME, 200), (LOCKSTEP, 24), (MIXED, 24)])  # 1000 and 120 steps an env
 def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: CompiledGame, steps: int) -> None:
     windows = 5
     options = {"frames_per_batch": N * steps, "total_frames": N * steps * windows}
@@ -89,7 +89,7 @@ def test_compact_batches_lack_only_the_next_frames_and_can_have_them_back() -> N
         assert_same(one.exclude(("next", "pixels")), two.exclude("next_pool", ("next", "frame_slot")))
 
 
-@pytest.mark.parametrize("game", [GAME, LOCKSTEP])
+@pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
 def test_sequences_hold_the_data_of_a_rollout(game: CompiledGame) -> None:
     rollout = stub_env(game).rollout(10 * T, scripted, break_when_any_done=False)
     collector = stub_collector(scripted, game)
@@ -258,13 +258,13 @@ def resumed(collector: ArcadeCollector, other: ArcadeCollector, path: Any) -> No
     other.load_state_dict(torch.load(path, weights_only=True))
 
 
-@pytest.mark.parametrize("context", [0, 3, T + 3])
+@pytest.mark.parametrize(("game", "context"), [(GAME, 0), (GAME, 3), (GAME, T + 3), (MIXED, 3)])
 @pytest.mark.parametrize("policy", [Recurrent, lambda: None, lambda: scripted])
-def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, context: int, tmp_path: Any) -> None:
-    collector = stub_collector(policy(), context=context, init_random_frames=N * T)
+def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, game: CompiledGame, context: int, tmp_path: Any) -> None:
+    collector = stub_collector(policy(), game, context=context, init_random_frames=N * T)
     for _ in range(3):
         collector.collect()
-    other = stub_collector(policy(), seed=77, context=context, init_random_frames=N * T)
+    other = stub_collector(policy(), game, seed=77, context=context, init_random_frames=N * T)
     other.collect()
     resumed(collector, other, tmp_path / "collector.pt")
     assert other.frames == collector.frames

@@ -15,7 +15,7 @@ from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.batch import env_keys
 from arcade_torch.factory import make
-from tests.arcade_torch.stub import GAME, LOCKSTEP
+from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED
 
 N = 6
 
@@ -49,12 +49,23 @@ def stock_rollout(env: ArcadeEnv, steps: int) -> TensorDict:
     return torch.stack(taken, 1)
 
 
-@pytest.mark.parametrize("options", [{}, {"categorical_actions": False}, {"state_in_td": True}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"categorical_actions": False},
+        {"state_in_td": True},
+        {"task_in_td": True},
+        {"game": MIXED},
+        {"game": MIXED, "state_in_td": True},
+        {"game": MIXED, "task_in_td": False},
+    ],
+)
 def test_specs_describe_the_data(options: dict[str, Any]) -> None:
     check_env_specs(stub_env(**options), break_when_any_done="both", seed=0)
 
 
-@pytest.mark.parametrize("game", [GAME, LOCKSTEP])
+@pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
 def test_the_fused_path_and_torchrls_stock_path_give_the_same_bits(game: CompiledGame) -> None:
     fused = stub_env(game, seed=3).rollout(80, scripted, break_when_any_done=False)
     stock = stock_rollout(stub_env(game, seed=3), 80)
@@ -97,8 +108,11 @@ def test_last_action_is_the_action_that_led_here_also_over_an_end() -> None:
     assert (data["last_action"][:, 0] == 0).all()
 
 
-def test_frames_rewards_and_flags_are_the_memory_that_jax_wrote(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = stub_env(LOCKSTEP)
+@pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
+def test_frames_rewards_and_flags_are_the_memory_that_jax_wrote(
+    monkeypatch: pytest.MonkeyPatch, game: CompiledGame
+) -> None:
+    env = stub_env(game)
     written = []
     compiled = env._compiled.step
     monkeypatch.setattr(env._compiled, "step", lambda *args: written.append(compiled(*args)) or written[-1])
@@ -109,8 +123,9 @@ def test_frames_rewards_and_flags_are_the_memory_that_jax_wrote(monkeypatch: pyt
         assert td["next", key].data_ptr() == getattr(outcome, key).unsafe_buffer_pointer(), key
 
 
-def test_writing_to_what_the_env_gave_does_not_change_its_future() -> None:
-    wanton, careful = stub_env(seed=2), stub_env(seed=2)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_writing_to_what_the_env_gave_does_not_change_its_future(game: CompiledGame) -> None:
+    wanton, careful = stub_env(game, seed=2), stub_env(game, seed=2)
     ours, theirs = wanton.reset(), careful.reset()
     for _ in range(10):
         taken, following = wanton.step_and_maybe_reset(scripted(ours))
@@ -136,8 +151,9 @@ def test_a_partial_reset_leaves_the_other_envs_bit_identical(mask: list[bool], s
     assert fresh.all()
 
 
-def test_resetting_all_by_mask_is_resetting_all() -> None:
-    one, two = stub_env(seed=4), stub_env(seed=4)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_resetting_all_by_mask_is_resetting_all(game: CompiledGame) -> None:
+    one, two = stub_env(game, seed=4), stub_env(game, seed=4)
     td = one.step_mdp(one.step(scripted(one.reset())))
     two.step(scripted(two.reset()))
     by_mask = one.reset(td.set("_reset", torch.ones(N, 1, dtype=torch.bool)))
@@ -174,8 +190,9 @@ def test_set_seed_returns_another_seed_unless_static() -> None:
     assert env.set_seed(3, static_seed=True) == 3
 
 
-def test_a_snapshot_gives_the_same_future_on_another_env() -> None:
-    env, other = stub_env(seed=1), stub_env(seed=99)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_a_snapshot_gives_the_same_future_on_another_env(game: CompiledGame) -> None:
+    env, other = stub_env(game, seed=1), stub_env(game, seed=99)
     td = env.rollout(10, scripted, break_when_any_done=False)[:, -1]
     snapshot = env.get_state()
     expected = env.rollout(60, scripted, break_when_any_done=False, auto_reset=False, tensordict=env.observe())
@@ -186,12 +203,13 @@ def test_a_snapshot_gives_the_same_future_on_another_env() -> None:
     assert_same(expected, future)
 
 
-def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(tmp_path: Any) -> None:
-    env = stub_env(seed=1)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(tmp_path: Any, game: CompiledGame) -> None:
+    env = stub_env(game, seed=1)
     env.rollout(4)
     torch.save(env.get_state().to_dict(), tmp_path / "state.pt")
     state = TensorDict(torch.load(tmp_path / "state.pt", weights_only=True), [N])
-    root = stub_env(seed=2).reset(TensorDict({"state": state}, [N]), set_state=True)
+    root = stub_env(game, seed=2).reset(TensorDict({"state": state}, [N]), set_state=True)
     assert_same(root.select("pixels", "step_count"), env.observe().select("pixels", "step_count"))
 
 
@@ -203,18 +221,20 @@ def test_a_snapshot_is_a_private_copy() -> None:
     assert torch.equal(env.observe()["pixels"], before)
 
 
-def test_state_dict_of_the_env_restores_it() -> None:
-    env, other = stub_env(seed=1), stub_env(seed=2)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_state_dict_of_the_env_restores_it(game: CompiledGame) -> None:
+    env, other = stub_env(game, seed=1), stub_env(game, seed=2)
     env.rollout(4)
     other.load_state_dict(env.state_dict())
     assert_same(other.get_state(), env.get_state())
 
 
-def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compiles_nothing() -> None:
-    env, twin = stub_env(seed=6), stub_env(seed=6)
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compiles_nothing(game: CompiledGame) -> None:
+    env, twin = stub_env(game, seed=6), stub_env(game, seed=6)
     actions = torch.randint(0, 5, (30, N))
     ours, theirs = env.reset(), twin.reset()
-    compiled = GAME.step._cache_size()
+    compiled = game.step._cache_size()
     flags = torch.arange(N) % 2 == 0
     for time, action in enumerate(actions):
         if time == 10:
@@ -225,7 +245,7 @@ def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compi
         assert_same(taken["next"].exclude("pixels"), other["next"].exclude("pixels"))
         same = (ours["pixels"] == theirs["pixels"]).flatten(1).all(1)
         assert torch.equal(same, ~flags if time >= 10 else torch.ones(N, dtype=torch.bool))
-    assert GAME.step._cache_size() == compiled or compiled == 0
+    assert game.step._cache_size() == compiled or compiled == 0
 
 
 def test_the_state_in_the_tensordict_is_the_state_that_is_stepped() -> None:

@@ -92,7 +92,10 @@ def broken(change: Any) -> TensorDict:
     ("state", "message"),
     [
         (lambda: ArcadeEnv(GAME, 4).get_state(), "the state is of batch size [4], this env has 3 envs"),
-        (lambda: make("CartPoleEasy", 3).get_state(), "state is one of CartPoleEasy-v0, this env plays StubEasy-v0"),
+        (
+            lambda: make("CartPoleEasy", 3).get_state(),
+            "the state of env 0 is one of CartPoleEasy-v0, this env plays",
+        ),
         (lambda: broken(lambda s: s.pop("game")), "the state has no entry 'game'"),
         (lambda: broken(lambda s: s["state"].pop("total")), "the state has no entry 'state.total'"),
         (

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from arcade_torch.envs_jax import env_keys
+from arcade_torch.envs_jax import env_keys, make
+from arcade_torch.envs_jax.oracles import RandomPlayer, play
 
 from .conftest import ALL_IDS, batched, random_actions
 
@@ -87,6 +88,8 @@ def test_twins_step_in_lockstep(id, rules):
         partial, _, outcome_partial, frames_partial = game.step_auto(partial, action)
         assert same(full._replace(partial=partial.partial), partial) and same(outcome, outcome_partial)
         hidden += not np.array_equal(frames, frames_partial)
+        differ = (np.asarray(frames) != np.asarray(frames_partial)).any((0, 2, 3))
+        assert not differ[:14].any() and not differ[115:].any(), "number and name are the same in both"
     assert hidden > 25, "the twins ought to look different"
 
 
@@ -124,6 +127,67 @@ def test_long_random_rollouts_keep_the_contract(id, rules):
         assert len(returns) >= 64, "every env ought to have finished an episode"
     assert all(low - 1e-5 <= value <= high + 1e-5 for value in returns)
     assert longest <= game.game.max_steps + (rules == "reference")
+
+
+@pytest.mark.parametrize("id", EVERY_GAME)
+@settings(max_examples=4, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    small=st.booleans(),
+    actions=hnp.arrays(np.int32, (10, 16), elements=st.integers(0, 4)),
+    partial=hnp.arrays(bool, 16),
+)
+def test_any_play_from_any_seed_keeps_the_contract(id, seed, small, actions, partial):
+    """Ends are one of two kinds, returns stay in the documented range, no frame is blank, nothing is not a number."""
+    game, size = batched(id), 1 if small and id in FAMILIES else 16  # each size is a compilation more
+    low, high = game.game.return_range
+    batch = game.init(env_keys(seed, size), jnp.asarray(partial[:size]))
+    for action in actions[:, :size]:
+        batch, stepped, outcome, frames = game.step_auto(batch, action)
+        done, frames = np.asarray(outcome.done), np.asarray(frames)
+        assert np.array_equal(done, np.asarray(outcome.terminated) | np.asarray(outcome.truncated))
+        assert outcome.reward.dtype == np.float32 and outcome.reward.shape == (size,)
+        returns = np.asarray(stepped.episode_reward)[done]
+        assert ((returns >= low - 1e-5) & (returns <= high + 1e-5)).all()
+        assert frames.dtype == np.uint8 and frames.shape == (size, 128, 128, 3)
+        assert (frames.reshape(size, -1, 3).max(1) > frames.reshape(size, -1, 3).min(1)).any(1).all(), "a blank frame"
+        floats = [leaf for leaf in jax.tree.leaves((stepped, batch, outcome)) if leaf.dtype == np.float32]
+        assert all(np.isfinite(leaf).all() for leaf in floats)
+
+
+LIMIT_NAMES = ("time", "timestep", "moves")  # what the games call the steps taken
+
+
+@pytest.mark.parametrize("id", EVERY_GAME)
+def test_a_new_episode_is_what_reset_gives_for_the_key_of_its_env(id):
+    """After an end the state and the frame are those of `reset` with the derived key; other envs just go on."""
+    game = batched(id)
+    batch = game.init(env_keys(4, 16), jnp.arange(16) % 2 == 0)
+    for action in random_actions(3, 16, seed=2):
+        batch, *_ = game.step_auto(batch, action)
+    clock = next(name for name in LIMIT_NAMES if hasattr(batch.state, name))
+    at_limit = np.arange(16) % 3 == 0
+    time = jnp.where(at_limit, game.game.max_steps - 1, getattr(batch.state, clock))
+    batch = batch._replace(state=batch.state._replace(**{clock: time.astype(getattr(batch.state, clock).dtype)}))
+    root, stepped, outcome, frames = game.step_auto(batch, np.zeros(16, np.int32))
+    done = np.asarray(outcome.done)
+    assert (done >= at_limit).all() and not done.all()
+    keep, use = jax.vmap(jax.random.split, out_axes=1)(stepped.key)
+    fresh = jax.jit(jax.vmap(game.game.reset))(use)
+    assert same(rows(root.state, done), rows(fresh, done)) and same(rows(root.state, ~done), rows(stepped.state, ~done))
+    assert np.array_equal(np.asarray(root.key)[done], np.asarray(keep)[done])
+    drawn = game.render(batch._replace(state=fresh))
+    assert np.array_equal(np.asarray(frames)[done], np.asarray(drawn)[done])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("id", ALL_IDS)
+def test_ten_thousand_random_episodes_return_what_the_table_allows(id):
+    game = make(id)
+    low, high = game.return_range
+    episodes = play(game, RandomPlayer(1), 10_000, seed=9, block=2048)
+    assert (episodes.returns >= low - 1e-5).all() and (episodes.returns <= high + 1e-5).all()
+    assert (episodes.lengths >= 1).all() and (episodes.lengths <= game.max_steps).all()
 
 
 @settings(max_examples=20, deadline=None)

@@ -35,9 +35,9 @@ def step(game, state, action):
 
 
 @functools.cache
-def fresh(id):
+def fresh(id, rules="default"):
     """First states of many envs, with numpy leaves."""
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(make(id).reset))(env_keys(0, 4096)))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, 4096)))
 
 
 def sea(game, ships=(), shots=(), x=0, y=0, **changes):
@@ -117,6 +117,14 @@ def test_the_cursor_starts_on_any_cell_with_equal_chance_whatever_the_sea(id):
     rate = 12 / cells
     on_ship = states.board[np.arange(4096), states.x, states.y].mean()
     assert abs(on_ship - rate) < 4 * np.sqrt(rate * (1 - rate) / 4096), "cursor and ships ought to be independent"
+
+
+def test_the_cursor_of_the_reference_never_starts_in_the_last_column_or_row():
+    """B1; the ships are those of the default rules."""
+    states = fresh("BattleShipEasy", "reference")
+    for coordinate in (states.x, states.y):
+        assert set(coordinate.tolist()) == set(range(7))
+    assert (states.board == fresh("BattleShipEasy").board).all()
 
 
 def test_the_cursor_moves_one_cell_and_stops_at_the_border():

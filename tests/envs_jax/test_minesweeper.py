@@ -17,9 +17,9 @@ KEY = jax.random.PRNGKey(0)
 COMPILED = {}
 
 
-def boards(id, count=512, seed=0):
+def boards(id, count=512, seed=0, rules="default"):
     """Fresh states of many envs, with numpy leaves."""
-    game = batched(id)
+    game = batched(id, rules=rules)
     return jax.tree.map(np.asarray, game.init(env_keys(seed, count), jnp.zeros(count, bool)).state)
 
 
@@ -81,6 +81,14 @@ def test_mines_and_cursor_are_uniform(id):
         assert np.abs(z).max() < 4.5
     both = (fresh.grid[np.arange(4096), fresh.x, fresh.y] == COVERED_MINE).mean()
     assert abs(both - mines / side**2) < 0.02, "cursor and mines ought to be independent"
+
+
+def test_the_cursor_of_the_reference_never_starts_in_the_last_column_or_row():
+    """M3; the mines are those of the default rules."""
+    states = boards("MineSweeperEasy", rules="reference")
+    for coordinate in (states.x, states.y):
+        assert set(coordinate.tolist()) == set(range(3))
+    assert (states.grid == boards("MineSweeperEasy").grid).all()
 
 
 def test_the_cursor_moves_one_cell_and_stops_at_the_border():

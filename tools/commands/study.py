@@ -1,11 +1,12 @@
 """``arcade-torch study``."""
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
+
+from arcade_torch.tools.extensions import command_line
 
 
 @dataclass
@@ -55,9 +56,9 @@ class StudyCommand:
 
     def command(self) -> str:
         """The line that starts this study."""
-        words = ["arcade-torch", "study", str(self.file)]
+        words = ["study", str(self.file)]
         words += ["--out", str(self.out)] if self.out else []
-        return shlex.join([*words, "--engine", self.engine, "--workers", str(self.workers)])
+        return command_line([*words, "--engine", self.engine, "--workers", str(self.workers)])
 
     def how_to_go_on(self) -> str:
         """What to type after an interruption."""

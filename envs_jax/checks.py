@@ -1,0 +1,108 @@
+"""Whether a game keeps the contract of ``Game``: shapes, types and structure, found out without compiling anything."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
+
+_OURS = "arcade_torch.envs_jax."
+
+
+def check_game(game: Game[Any]) -> None:
+    """Refuse a game whose functions do not fit together, or whose frames nobody could use.
+
+    Traces ``reset``, ``step`` and ``render`` once each, for shapes and types alone; that takes milliseconds. ``make``
+    and ``BatchedGame`` call it for every game that is not one of this package.
+
+    Args:
+        game: The game.
+
+    Raises:
+        ValueError: A function cannot be traced, gives something of a wrong shape or type, or ``step`` changes the
+            structure of the state; or an attribute is missing or of no use. One line: the game, what arrived, what is
+            wanted.
+
+    Example:
+        >>> from arcade_torch.envs_jax import make
+        >>> check_game(make("MineSweeperEasy"))
+    """
+    _check_attributes(game)
+    name = game.id
+    key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+    first = _traced(name, "reset", game.reset, key)
+    stepped = _traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
+    if not isinstance(stepped, tuple) or len(stepped) != 4:
+        got = f"{len(stepped)} values" if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
+        raise ValueError(f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated")
+    _check_state(name, first, stepped[0])
+    for what, value in zip(("reward", "terminated", "truncated"), stepped[1:], strict=True):
+        _check_array(name, f"step gives {what} as", value, (), "float32" if what == "reward" else "bool")
+    frame = _traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
+    _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
+
+
+def check_foreign(game: Game[Any]) -> None:
+    """``check_game`` for a game that is not one of this package, whose own are checked by its tests."""
+    if not type(game).__module__.startswith(_OURS):
+        check_game(game)
+
+
+def _check_attributes(game: Game[Any]) -> None:
+    """Refuse a game that lacks what describes it."""
+    name = getattr(game, "id", None)
+    if not isinstance(name, str):
+        raise ValueError(f"{type(game).__name__}: id is {name!r}, wanted the versioned id, such as 'MineEasy-v0'")
+    for what in ("obs_size", "max_steps"):
+        value = getattr(game, what, None)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name}: {what} is {value!r}, wanted an int of 1 or more")
+    limits = getattr(game, "return_range", None)
+    if not isinstance(limits, tuple) or len(limits) != 2 or not limits[0] <= limits[1]:
+        raise ValueError(f"{name}: return_range is {limits!r}, wanted (lowest, highest)")
+    if game.num_actions != NUM_ACTIONS:
+        raise ValueError(f"{name}: num_actions is {game.num_actions!r}, wanted {NUM_ACTIONS}, the same in every game")
+
+
+def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
+    """What a function would give, by shapes and types."""
+    try:
+        return jax.eval_shape(function, *args)
+    except Exception as error:
+        reason = str(error).strip().partition("\n")[0].rstrip(".")
+        hint = "; use jnp.where instead of if" if isinstance(error, jax.errors.TracerBoolConversionError) else ""
+        raise ValueError(
+            f"{name}: {what} cannot be traced by JAX, wanted a pure function of arrays{hint} "
+            f"({type(error).__name__}: {reason})"
+        ) from error
+
+
+def _check_array(name: str, what: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
+    """Refuse anything but an array of this shape and type."""
+    if not hasattr(value, "shape"):
+        raise ValueError(f"{name}: {what} a {type(value).__name__}, wanted {dtype} {list(shape)}")
+    if tuple(value.shape) != shape or value.dtype != dtype:
+        raise ValueError(f"{name}: {what} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}")
+
+
+def _check_state(name: str, first: Any, following: Any) -> None:
+    """Refuse a step whose state has other leaves than that of reset."""
+    ours, theirs = (_leaves(state) for state in (first, following))
+    if not ours:
+        raise ValueError(f"{name}: reset gives a state without any array, wanted a named tuple of arrays")
+    before: object = jax.tree.structure(first)
+    if before != jax.tree.structure(following):
+        raise ValueError(
+            f"{name}: step gives a state of another structure, with {', '.join(theirs) or 'nothing'}; wanted that of "
+            f"reset, a {type(first).__name__} with {', '.join(ours)}"
+        )
+    for leaf, wanted in ours.items():
+        _check_array(name, f"step gives state entry {leaf} as", theirs[leaf], tuple(wanted.shape), str(wanted.dtype))
+
+
+def _leaves(state: Any) -> dict[str, Any]:
+    """The arrays of a state by name."""
+    found = jax.tree_util.tree_flatten_with_path(state)[0]
+    return {jax.tree_util.keystr(path).lstrip(".") or "state": leaf for path, leaf in found}

@@ -1,0 +1,151 @@
+"""A game of one's own that does not keep the contract is refused with one line that says what is wrong."""
+
+import re
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from arcade_torch.envs_jax import BatchedGame, Game, check_game, make, probe_ids, register, registered_ids
+from tests.own_registry import own_registry  # noqa: F401
+
+
+class State(NamedTuple):
+    count: jax.Array  # int32
+    seen: jax.Array  # bool [3]
+
+
+class Right(Game[State]):
+    """Keeps the contract; the tests break it in one place each."""
+
+    id, obs_size, rules, max_steps, return_range = "RightEasy-v0", 128, "default", 5, (0.0, 1.0)
+    wrong = ""
+
+    def reset(self, key):
+        return State(jnp.int32(0), jnp.zeros(3, bool))
+
+    def step(self, key, state, action):
+        count = state.count + 1
+        return State(count, state.seen), jnp.float32(0.2), jnp.bool_(False), count >= self.max_steps
+
+    def render(self, state, partial):
+        return jnp.full((self.obs_size, self.obs_size, 3), state.count, jnp.uint8)
+
+
+def with_methods(**methods):
+    """A game that keeps the contract but for some methods or attributes."""
+    return type("Wrong", (Right,), {"id": "WrongEasy-v0", **methods})()
+
+
+def step_giving(**changes):
+    """A step that gives something else in some places."""
+
+    def step(self, key, state, action):
+        following = {"state": state, "reward": jnp.float32(0), "terminated": jnp.bool_(0), "truncated": jnp.bool_(0)}
+        return tuple({**following, **{name: make(state) for name, make in changes.items()}}.values())
+
+    return step
+
+
+WRONG = [
+    (
+        {"render": lambda s, state, partial: jnp.zeros((64, 64, 3), jnp.uint8)},
+        "render gives uint8 [64, 64, 3], wanted uint8 [128, 128, 3]",
+    ),
+    (
+        {"render": lambda s, state, partial: jnp.zeros((3, 128, 128), jnp.uint8)},
+        "render gives uint8 [3, 128, 128], wanted uint8 [128, 128, 3]",
+    ),
+    (
+        {"render": lambda s, state, partial: jnp.zeros((128, 128, 3))},
+        "render gives float32 [128, 128, 3], wanted uint8 [128, 128, 3]",
+    ),
+    ({"render": lambda s, state, partial: (0, 1)}, "render gives a tuple, wanted uint8 [128, 128, 3]"),
+    (
+        {"render": lambda s, state, partial: jnp.zeros((128, 128, 3), jnp.uint8) if partial else None},
+        "render cannot be traced by JAX, wanted a pure function of arrays; use jnp.where instead of if",
+    ),
+    ({"step": step_giving(reward=lambda s: s.count)}, "step gives reward as int32 [], wanted float32 []"),
+    ({"step": step_giving(reward=lambda s: jnp.zeros(1))}, "step gives reward as float32 [1], wanted float32 []"),
+    ({"step": step_giving(terminated=lambda s: s.count)}, "step gives terminated as int32 [], wanted bool []"),
+    ({"step": step_giving(truncated=lambda s: s.seen)}, "step gives truncated as bool [3], wanted bool []"),
+    ({"step": lambda s, key, state, action: (state, 0.0, False)}, "step gives 3 values, wanted 4: state, reward"),
+    ({"step": lambda s, key, state, action: state.count}, "step gives a ShapeDtypeStruct, wanted 4: state, reward"),
+    (
+        {"step": step_giving(state=lambda s: (s.count, s.seen))},
+        "step gives a state of another structure, with [0], [1]; wanted that of reset, a State with count, seen",
+    ),
+    ({"step": step_giving(state=lambda s: None)}, "step gives a state of another structure, with nothing; wanted that"),
+    (
+        {"step": step_giving(state=lambda s: s._replace(count=s.count + 0.5))},
+        "step gives state entry count as float32 [], wanted int32 []",
+    ),
+    (
+        {"step": step_giving(state=lambda s: s._replace(seen=s.seen[:2]))},
+        "step gives state entry seen as bool [2], wanted bool [3]",
+    ),
+    (
+        {"reset": lambda s, key: (), "step": step_giving()},
+        "reset gives a state without any array, wanted a named tuple of arrays",
+    ),
+    ({"reset": lambda s, key: key.no_such}, "reset cannot be traced by JAX, wanted a pure function of arrays (Attr"),
+    ({"max_steps": 0}, "max_steps is 0, wanted an int of 1 or more"),
+    ({"obs_size": 128.0}, "obs_size is 128.0, wanted an int of 1 or more"),
+    ({"return_range": (1.0, 0.0)}, "return_range is (1.0, 0.0), wanted (lowest, highest)"),
+    ({"num_actions": 3}, "num_actions is 3, wanted 5, the same in every game"),
+]
+
+
+@pytest.mark.parametrize(("methods", "message"), WRONG)
+def test_a_game_that_breaks_the_contract_is_refused_in_one_line(methods, message):
+    with pytest.raises(ValueError, match=re.escape(f"WrongEasy-v0: {message}")) as error:
+        check_game(with_methods(**methods))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("methods", "message"), WRONG[:1] + WRONG[-8:-7])
+def test_it_is_refused_when_it_is_first_made_and_when_it_is_batched(methods, message, own_registry):  # noqa: F811
+    register("WrongEasy-v0", lambda *, id, obs_size, rules: with_methods(**methods))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make("WrongEasy")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        BatchedGame(with_methods(**methods))
+
+
+def test_a_game_that_keeps_the_contract_is_made(own_registry):  # noqa: F811
+    register("RightEasy-v0", lambda *, id, obs_size, rules: Right())
+    assert make("RightEasy").max_steps == 5
+
+
+def test_a_factory_that_does_not_make_what_it_was_asked_for_is_refused(own_registry):  # noqa: F811
+    register("RightEasy-v0", lambda *, id, obs_size, rules: Right())
+    register("OtherEasy-v0", lambda *, id, obs_size, rules: Right())
+    register("NoneEasy-v0", lambda *, id, obs_size, rules: None)
+    with pytest.raises(ValueError, match="the factory of RightEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted"):
+        make("RightEasy", obs_size=256)
+    with pytest.raises(ValueError, match="the factory of OtherEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted"):
+        make("OtherEasy")
+    with pytest.raises(ValueError, match="the factory of NoneEasy-v0 made a NoneType, wanted a Game"):
+        make("NoneEasy")
+
+
+def test_an_attribute_that_is_missing_is_named():
+    class Nameless(Right):
+        id = None
+
+    with pytest.raises(ValueError, match="Nameless: id is None, wanted the versioned id"):
+        check_game(Nameless())
+
+
+def test_nothing_is_compiled_by_the_check():
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
+    check_game(Right())
+    assert not [name for name in compiled if "backend_compile" in name]
+
+
+@pytest.mark.parametrize("id", registered_ids() + probe_ids())
+@pytest.mark.parametrize("obs_size", [128, 256])
+def test_every_game_of_the_package_keeps_the_contract(id, obs_size):
+    check_game(make(id, obs_size=obs_size))

@@ -1,0 +1,88 @@
+"""The example of a game of one's own: its rules, its twins, and that the stock tools take it."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from arcade_torch.envs_jax import BatchedGame, check_game, env_keys, make
+from arcade_torch.tools import cli
+from tests.own_registry import own_registry  # noqa: F401
+
+FILE = Path(__file__).resolve().parents[1] / "examples/own_game.py"
+pytestmark = pytest.mark.usefixtures("own_registry")
+
+
+@pytest.fixture
+def pairs(own_registry: None) -> Any:  # noqa: F811
+    spec = importlib.util.spec_from_file_location("own_game_example", FILE)
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+    return make("PairsEasy")
+
+
+def way(start: int, goal: int) -> list[int]:
+    """Moves from one card to another, and the turn."""
+    down, right = goal // 4 - start // 4, goal % 4 - start % 4
+    return [1 if down > 0 else 0] * abs(down) + [3 if right > 0 else 2] * abs(right) + [4]
+
+
+def test_the_file_is_short_and_keeps_the_contract(pairs: Any) -> None:
+    assert len(FILE.read_text().splitlines()) < 100
+    for size in (128, 256):
+        check_game(make("PairsEasy", obs_size=size))
+
+
+def test_whoever_remembers_finds_all_pairs_and_two_that_differ_are_turned_back(pairs: Any) -> None:
+    batched = BatchedGame(pairs)
+    batch = batched.init(env_keys(0, 1), jnp.ones(1, bool))
+    cards = np.asarray(batch.state.cards[0])
+    assert sorted(cards) == sorted(list(range(8)) * 2)
+    different = [int(np.flatnonzero(cards != cards[0])[0])]
+    order = [0, *different, *(int(card) for face in range(8) for card in np.flatnonzero(cards == face))]
+    place, total, hidden = 0, 0.0, batched.render(batch)
+    for count, goal in enumerate(order):
+        for action in way(place, goal):
+            batch, outcome = batched.step(batch, np.full(1, action, np.int32))
+            total += float(outcome.reward[0])
+        place = goal
+        if count == 1:
+            assert total == 0 and (batch.state.turned >= 0).all()
+            shown = batched.render(batch)
+            back, _ = batched.step(batch, np.zeros(1, np.int32))
+            assert (back.state.turned == -1).all() and not back.state.found.any()
+            assert (np.asarray(shown) != np.asarray(hidden)).any()
+    assert total == pytest.approx(1) and outcome.terminated.all() and not outcome.truncated.any()
+
+
+def test_the_pomdp_hides_the_cards_that_are_down_and_nothing_else(pairs: Any) -> None:
+    draw = jax.jit(pairs.render)
+    state = pairs.reset(jax.random.PRNGKey(1))
+    other = state._replace(cards=state.cards[::-1])
+    assert np.array_equal(draw(state, True), draw(other, True))
+    assert not np.array_equal(draw(state, False), draw(other, False))
+    up = state._replace(found=jnp.ones(16, bool))
+    assert np.array_equal(draw(up, True), draw(up, False))
+
+
+def test_it_trains_and_is_evaluated_with_the_stock_tools(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--preset", "smoke", "--env", "PairsEasy", "--observability", "partial", "--out", str(tmp_path / "run")]
+    assert cli.main(["train", "--import", str(FILE), *words]) == cli.EXIT_OK
+    assert cli.main(["evaluate", str(tmp_path / "run"), "--episodes", "4"]) == cli.EXIT_OK
+    assert "PairsEasy-v0 (partial)" in capsys.readouterr().out
+
+
+def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    right = "return self.board.draw(frame, codes.reshape(SIDE, SIDE) + len(LOOKS) * cursor)"
+    source = FILE.read_text().replace('register("PairsEasy-v0"', 'register("PairsWrong-v0"')
+    assert right in source
+    (tmp_path / "wrong.py").write_text(source.replace(right, f"{right}[:, :64]"))
+    words = ["--preset", "smoke", "--env", "PairsWrong", "--out", str(tmp_path / "run")]
+    assert cli.main(["train", "--import", str(tmp_path / "wrong.py"), *words]) == cli.EXIT_BAD_INPUT
+    err = capsys.readouterr().err
+    assert err == "arcade-torch: PairsWrong-v0: render gives uint8 [128, 64, 3], wanted uint8 [128, 128, 3]\n"
+    assert not (tmp_path / "run").exists()
