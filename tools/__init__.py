@@ -10,6 +10,10 @@ from typing import TYPE_CHECKING, Any
 _PUBLIC = {
     "gap_and_bias": "arcade_torch.tools.analysis.gap_bias",
     "saliency": "arcade_torch.tools.analysis.pixel_saliency",
+    "recall_density": "arcade_torch.tools.analysis.recall_density",
+    "contamination": "arcade_torch.tools.analysis.contamination",
+    "shuffled_beginning": "arcade_torch.tools.analysis.contamination",
+    "Policy": "arcade_torch.tools.analysis.policy",
     "saliency_figure": "arcade_torch.tools.analysis.saliency_figure",
     "greedy_window": "arcade_torch.tools.analysis.windows",
     "study": "arcade_torch.tools.studies.runner",
@@ -18,15 +22,30 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.analysis.contamination import contamination, shuffled_beginning
     from arcade_torch.tools.analysis.gap_bias import gap_and_bias
     from arcade_torch.tools.analysis.pixel_saliency import saliency
+    from arcade_torch.tools.analysis.policy import Policy
+    from arcade_torch.tools.analysis.recall_density import recall_density
     from arcade_torch.tools.analysis.saliency_figure import saliency_figure
     from arcade_torch.tools.analysis.windows import greedy_window
     from arcade_torch.tools.reports.build import report
     from arcade_torch.tools.studies.grid import Study
     from arcade_torch.tools.studies.runner import study
 
-__all__ = ["Study", "gap_and_bias", "greedy_window", "report", "saliency", "saliency_figure", "study"]
+__all__ = [
+    "Policy",
+    "Study",
+    "contamination",
+    "gap_and_bias",
+    "greedy_window",
+    "recall_density",
+    "report",
+    "saliency",
+    "saliency_figure",
+    "shuffled_beginning",
+    "study",
+]
 
 
 def __getattr__(name: str) -> Any:

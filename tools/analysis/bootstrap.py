@@ -61,6 +61,36 @@ def percentile_interval(value: float, draws: Array, confidence: float, known: bo
     return Interval(value, float(low), float(high))
 
 
+def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> tuple[Array, Array, Array]:
+    """Mean over seeds and its percentile interval, cell by cell.
+
+    Args:
+        values: float64 [n_seeds, ...]; NaN where a seed has no value.
+        confidence: of the intervals.
+        draws: resamples of the seeds.
+        seed: of the draws.
+
+    Returns:
+        Mean and both ends of the interval, each [...]; the ends are NaN where fewer than two seeds have a value, the
+        mean is NaN where none has.
+    """
+    flat = values.reshape(values.shape[0], -1)
+    found = np.full((3, flat.shape[1]), np.nan)
+    for cell in range(flat.shape[1]):
+        known = flat[np.isfinite(flat[:, cell]), cell]
+        if known.size:
+            resampled = resampled_means([known], draws, np.random.default_rng(seed)) if known.size > 1 else known
+            interval = percentile_interval(float(known.mean()), resampled, confidence, known.size > 1)
+            found[:, cell] = interval.value, interval.low, interval.high
+    mean, low, high = found.reshape(3, *values.shape[1:])
+    return mean, low, high
+
+
+def seed_coverage(seeds: int, confidence: float = 0.95) -> float:
+    """Measured coverage of `over_seeds` with so many seeds; NaN below two."""
+    return measured_coverage((seeds,), (), confidence) if seeds > 1 else float("nan")
+
+
 @lru_cache(maxsize=64)
 def measured_coverage(
     mdp_seeds: tuple[int, ...],

@@ -1,11 +1,11 @@
 """Learning curves of the agents of a study, with intervals over seeds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Array, percentile_interval, resampled_means
+from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
 from arcade_torch.tools.studies.folder import RunFolder, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -58,6 +58,22 @@ def learning_curves(folder: StudyFolder, study: Study, kind: str = "eval", confi
     groups: dict[tuple[str, str, str], list[RunFolder]] = {}
     for run in study.runs():
         groups.setdefault((agent_name(study, run), run.game, run.observability), []).append(folder.run(run))
+    return curves_of_runs(groups, kind, confidence)
+
+
+def curves_of_runs(
+    groups: Mapping[tuple[str, str, str], Sequence[RunFolder]], kind: str = "eval", confidence: float = 0.95
+) -> list[Curve]:
+    """Curves of groups of run folders.
+
+    Args:
+        groups: (agent, game, observability) -> its runs, one a seed.
+        kind: as for `learning_curves`.
+        confidence: as for `learning_curves`.
+
+    Returns:
+        One curve a group in which some run has logged something.
+    """
     found = []
     for (agent, game, twin), runs in groups.items():
         histories = [history for run in runs if (history := _history(run, kind))[0].size]
@@ -81,10 +97,5 @@ def _curve(
     longest = max((frames for frames, _ in histories), key=len)
     grid = longest[(longest >= start) & (longest <= end)] if kind == "eval" else np.linspace(start, end, POINTS)
     seeds = np.array([np.interp(grid, frames, values) for frames, values in histories])
-    low, high = np.full(grid.size, np.nan), np.full(grid.size, np.nan)
-    if len(histories) > 1:
-        for index in range(grid.size):
-            draws = resampled_means([seeds[:, index]], 2000, np.random.default_rng(0))
-            interval = percentile_interval(float(seeds[:, index].mean()), draws, confidence)
-            low[index], high[index] = interval.low, interval.high
-    return Curve(agent, game, twin, grid, seeds.mean(axis=0), low, high, seeds)
+    mean, low, high = over_seeds(seeds, confidence)
+    return Curve(agent, game, twin, grid, mean, low, high, seeds)

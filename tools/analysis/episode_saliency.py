@@ -1,11 +1,10 @@
 """Saliency of an agent's last decision in one greedy episode."""
 
-from typing import Any, Literal
+from typing import Any
 
 from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, Saliency, Target, saliency
+from arcade_torch.tools.analysis.subject import Twin, own_env
 from arcade_torch.tools.analysis.windows import MAX_STEPS, Window, greedy_window
-
-Twin = Literal["full", "partial"]
 
 
 def episode_window(
@@ -22,25 +21,14 @@ def episode_window(
     Returns:
         What the agent saw, up to the decision that ended the episode.
     """
-    import arcade_torch
     from arcade_torch.agents.evaluation import held_out_seed
 
-    config = agent.config
-    env = arcade_torch.make(
-        config.env,
-        num_envs=1,
-        observability=observability or config.observability,
-        obs_size=config.obs_size,
-        seed=held_out_seed(seed),
-        rules=config.rules,
-        device=next(agent.network.parameters()).device,
-        **dict(config.env_options),
-    )
+    env = own_env(agent, 1, observability, seed)
     return greedy_window(agent, env, seed=held_out_seed(seed), max_steps=max_steps)
 
 
 def explain(
-    agent: Any, window: Window, *, reduce: Reduce = "per_action", norm: Norm = "l2sq", target: Target = "q"
+    agent: Any, window: Window, *, reduce: Reduce = "per_action", norm: Norm = "l2sq", target: Target = "auto"
 ) -> Saliency:
     """Saliency of the last decision of a window; options as in `saliency`."""
     return saliency(

@@ -1,18 +1,26 @@
-"""Windows of experience to analyse: one greedy episode up to the decision that ended it."""
+"""Windows of experience to analyse: greedy episodes up to the decision that ended them, or to one before it."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
 MAX_STEPS = 512
-"""Longest window; a longer episode is cut there, and the window says so."""
+"""Longest window; what is cut, and where, stands with the functions."""
+
+MIN_STEPS = 3
+"""A shorter trajectory says nothing about memory: recall density leaves it out and counts it."""
+
+End = Literal["last", "random"]
+_COLUMNS = ("pixels", "last_action", "is_init")
 
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive steps of one episode; the last frame is the one on which the ending action was chosen.
+    """Consecutive steps of one episode; on the last frame the decision was taken that is looked at.
 
     Attributes:
         frames: uint8 [T, S, S, 3].
@@ -21,8 +29,9 @@ class Window:
         action: int64 [T], the action chosen on each frame.
         reward: float32 [T], what it earned.
         state: recurrent state before the first frame, batch of one.
-        ended: whether the action at the last frame ended the episode (else the window was cut by its length).
-        seed: of the episode.
+        ended: whether the action at the last frame ended the episode (else the window ends earlier).
+        seed: of the batch of episodes.
+        row: which episode of that batch.
     """
 
     frames: Tensor
@@ -33,11 +42,19 @@ class Window:
     state: Any
     ended: bool
     seed: int
+    row: int = 0
 
     @property
     def n(self) -> int:
         """Index of the last step."""
         return self.frames.shape[0] - 1
+
+    def up_to(self, n: int) -> "Window":
+        """The same window ending with step ``n``."""
+        if n == self.n:
+            return self
+        cut = {name: getattr(self, name)[: n + 1] for name in ("frames", "last_action", "is_init", "action", "reward")}
+        return replace(self, **cut, ended=False)
 
 
 def greedy_window(
@@ -62,33 +79,161 @@ def greedy_window(
         raise ValueError(f"a window is played in a batch of one environment, got batch size {list(env.batch_size)}")
     if max_steps < 1 or (keep is not None and keep < 1):
         raise ValueError(f"max_steps and keep must be at least 1, got {max_steps} and {keep}")
+    played = play(agent, env, seed=seed, keep=keep or max_steps, max_steps=max_steps)
+    if played.lengths[0] > played.windows[0].n + 1:
+        first = [int(played.lengths[0]) - (keep or max_steps)]
+        played = play(agent, env, seed=seed, keep=keep or max_steps, max_steps=max_steps, first=first)
+    return played.windows[0]
+
+
+def greedy_windows(
+    agent: Any,
+    env: Any,
+    *,
+    episodes: int,
+    seed: int = 0,
+    end: End = "last",
+    cap: int = MAX_STEPS,
+    progress: Callable[[int], None] | None = None,
+) -> Iterator[Window]:
+    """Play greedy episodes side by side, one window each; a batch of episodes is in memory at a time.
+
+    Args:
+        agent: as for `greedy_window`.
+        env: ``ArcadeEnv`` of any batch size N. Batch b plays with a seed made of ``seed`` and b, so another N plays
+            other episodes.
+        episodes: number of windows.
+        seed: of the episodes and of the random ends; of held-out environments, as in an evaluation.
+        end: ``last``: the window ends with the frame on which the ending action was chosen; ``random``: with a frame
+            drawn uniformly from index 2 on. An episode longer than ``cap`` ends at a random frame in either case.
+        cap: longest window: the last so many frames before its end, with the recurrent state before them.
+        progress: called with the number of environment steps of every step of a batch.
+
+    Yields:
+        Windows.
+
+    Raises:
+        ValueError: a number is below 1, or ``end`` is unknown.
+    """
+    if end not in get_args(End):
+        raise ValueError(f"end must be one of {', '.join(get_args(End))}, got {end!r}")
+    if episodes < 1 or cap < MIN_STEPS:
+        raise ValueError(f"episodes must be at least 1 and the cap at least {MIN_STEPS}, got {episodes} and {cap}")
+    size = int(env.batch_size[0])
+    for group in range(-(-episodes // size)):
+        rng = np.random.default_rng([seed, group])
+        batch_seed = episode_seed(seed, group)
+        played = play(agent, env, seed=batch_seed, keep=cap, progress=progress)
+        ends = np.array([_end(int(length), end, cap, rng) for length in played.lengths])
+        if (late := ends >= cap).any():  # these windows begin later than what was kept: play the very same again
+            del played
+            first = np.where(late, ends - cap + 1, 0).tolist()
+            played = play(agent, env, seed=batch_seed, keep=cap, first=first, progress=progress)
+            ends = np.where(late, cap - 1, ends)
+        for window, n in zip(played.windows[: episodes - group * size], ends, strict=False):
+            yield window.up_to(int(n))
+
+
+def episode_seed(seed: int, group: int) -> int:
+    """Environment seed of a batch of episodes: held out from training, and different for every (seed, group)."""
+    from arcade_torch.agents.config import SEED_LIMIT
+    from arcade_torch.agents.evaluation import held_out_seed
+
+    drawn = np.random.SeedSequence([seed, group]).generate_state(1, np.uint32)[0]
+    return held_out_seed(int(drawn) % SEED_LIMIT)
+
+
+def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
+    """Index of the last frame of the window in an episode of ``length`` frames."""
+    last = length - 1
+    if end == "random":
+        return int(rng.integers(min(MIN_STEPS - 1, last), length))
+    return last if length <= cap else int(rng.integers(cap - 1, length))
+
+
+@dataclass(frozen=True)
+class Played:
+    """One episode of every env of a batch: what was kept of each, and all lengths int64 [N]."""
+
+    windows: list[Window]
+    lengths: np.ndarray[Any, np.dtype[np.int64]]
+
+
+@torch.no_grad()
+def play(
+    agent: Any,
+    env: Any,
+    *,
+    seed: int,
+    keep: int,
+    max_steps: int | None = None,
+    first: Sequence[int] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Played:
+    """Play the first episode of every env of a batch greedily.
+
+    Args:
+        agent: as for `greedy_window`.
+        env: ``ArcadeEnv`` [N].
+        seed: of the batch.
+        keep: frames of each episode to keep.
+        max_steps: episodes are cut after this many steps; never by default.
+        first: index of the first frame to keep, one for every env; 0 by default.
+        progress: called with N at every step.
+
+    Returns:
+        Windows and lengths. The frame after an ending action is never part of a window.
+    """
+    size = int(env.batch_size[0])
+    starts = torch.zeros(size, dtype=torch.int64) if first is None else torch.as_tensor(first)
+    lengths, ended = torch.zeros(size, dtype=torch.int64), torch.zeros(size, dtype=torch.bool)
     env.set_seed(seed)
-    obs, state = env.reset(), agent.initial_state(1)
-    columns: dict[str, list[Tensor]] = {"pixels": [], "last_action": [], "is_init": [], "action": [], "reward": []}
-    states: list[Any] = []
-    ended = False
-    with torch.no_grad():
-        for _ in range(max_steps):
-            states.append(state.clone())
-            action, _, state = agent.act(obs, state)
-            for name in ("pixels", "last_action", "is_init"):
-                columns[name].append(obs.get(name)[0].clone())
-            following = env.step(obs.clone(False).set("action", action)).get("next")
-            columns["action"].append(action[0].clone())
-            columns["reward"].append(following.get("reward").reshape(()).clone())
-            ended = bool(following.get("done").any())
-            if ended:
-                break
-            obs = following.exclude("reward")
-    first = 0 if keep is None else max(0, len(states) - keep)
-    parts = {name: torch.stack(values[first:]) for name, values in columns.items()}
-    return Window(
-        parts["pixels"],
-        parts["last_action"].reshape(-1),
-        parts["is_init"].reshape(-1),
-        parts["action"].reshape(-1),
-        parts["reward"],
-        states[first],
-        ended,
-        seed,
-    )
+    obs, state = env.reset(), agent.initial_state(size)
+    kept, states = _Kept(size, keep), [None] * size
+    playing, t = torch.ones(size, dtype=torch.bool), 0
+    while playing.any() and (max_steps is None or t < max_steps):
+        for row in (playing & (starts == t)).nonzero().flatten().tolist():
+            states[row] = None if state is None else state[row : row + 1].clone()
+        action, _, state = agent.act(obs, state)
+        rows = (playing & (starts <= t) & (t < starts + keep)).nonzero().flatten()
+        seen = {name: obs.get(name)[rows] for name in _COLUMNS} | {"action": action[rows]}
+        step, obs = env.step_and_maybe_reset(obs.set("action", action))
+        after = step.get("next")
+        kept.add(rows, t - starts[rows], seen | {"reward": after.get("reward")[rows]})
+        lengths += playing
+        ended |= playing & after.get("done").reshape(-1).cpu()
+        playing &= ~ended
+        t += 1
+        if progress is not None:
+            progress(size)
+    return Played(kept.windows(starts, lengths, ended, states, seed), lengths.numpy())
+
+
+class _Kept:
+    """Preallocated columns [N, keep, ...]; untouched memory is never really taken."""
+
+    def __init__(self, size: int, keep: int) -> None:
+        self.shape = size, keep
+        self.columns: dict[str, Tensor] = {}
+
+    def add(self, rows: Tensor, places: Tensor, values: dict[str, Tensor]) -> None:
+        """Keep one step of some rows."""
+        for name, value in values.items():
+            value = value if name == "pixels" else value.reshape(-1)
+            if name not in self.columns:
+                self.columns[name] = torch.empty(*self.shape, *value.shape[1:], dtype=value.dtype, device=value.device)
+            self.columns[name][rows, places] = value
+
+    def windows(self, starts: Tensor, lengths: Tensor, ended: Tensor, states: Sequence[Any], seed: int) -> list[Window]:
+        """What was kept of every row."""
+        found = []
+        for row, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
+            steps = max(0, min(self.shape[1], length - start))
+            c = {name: column[row, :steps] for name, column in self.columns.items()}
+            whole = bool(ended[row]) and start + steps == length
+            found.append(
+                Window(
+                    c["pixels"], c["last_action"], c["is_init"], c["action"], c["reward"], states[row], whole, seed, row
+                )
+            )
+        return found

@@ -28,8 +28,8 @@ class SaliencyCommand:
     """Sum of the actions' norms (the paper), or norm of the sum over actions."""
     norm: Literal["l2sq", "l2", "l1"] = "l2sq"
     """Norm over colour channels."""
-    target: Literal["q", "logits", "probs", "value"] = "q"
-    """What is differentiated."""
+    target: Literal["auto", "q", "logits", "probs", "value"] = "auto"
+    """What is differentiated; Q-values, or a policy's probabilities, by default."""
 
     def run(self) -> int:
         """Compute, draw, save."""

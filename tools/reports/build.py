@@ -1,6 +1,5 @@
 """Build the report of a study: numbers first, then one page that holds everything."""
 
-import shlex
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from arcade_torch.tools.analysis.curves import agent_name, learning_curves
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias
 from arcade_torch.tools.analysis.references import cached_references
+from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.files import write_csv, write_text
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.reports import sections, words
@@ -104,7 +104,7 @@ def page_context(
         "versions": record.get("versions", {}),
         "also": record.get("also", []),
         "command": record.get("command", ""),
-        "report_command": shlex.join(["arcade-torch", "report", str(folder.root)]),
+        "report_command": command_line(["report", str(folder.root)]),
         "seconds": sum(float(row.get("seconds") or 0) for row in rows),
     }
 

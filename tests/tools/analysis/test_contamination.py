@@ -1,0 +1,161 @@
+"""Contamination against models whose answer is known."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from arcade_torch.agents import Agent, preset
+from arcade_torch.agents.agent import build_network
+from arcade_torch.tools import Policy, contamination, shuffled_beginning
+from arcade_torch.tools.analysis.contamination_examples import noise_examples, shuffle_example
+from arcade_torch.tools.analysis.replay import disturbed_frames, shuffle_order
+from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
+
+ENV = (14, 20, 30)
+
+
+def test_a_linear_memory_forgets_noise_at_its_own_rate() -> None:
+    rho = 0.7
+    found = contamination(
+        linear_policy(rho, dtype=torch.float32), ToyEnv(ENV), sigmas=(0.1,), delays=(0, 1, 3), starts=40
+    )
+    moved = found.mean("change")[0]
+    spread = contamination(
+        linear_policy(rho, dtype=torch.float32), ToyEnv(ENV), sigmas=(0.2,), delays=(0, 1, 3), starts=40
+    )
+    np.testing.assert_allclose(spread.mean("change")[0], 2 * moved, rtol=1e-3)  # linear in sigma, same draw
+    assert moved[0] > moved[1] > moved[2] > 0
+
+
+def test_the_relative_change_is_rho_to_the_delay_over_the_spread_of_values() -> None:
+    rho, policy = 0.6, linear_policy(0.6, dtype=torch.float32)
+    w = window(8)
+    from arcade_torch.tools.analysis.replay import replayed
+
+    clean = policy.encode(w.frames)[None]
+    noisy = clean.clone()
+    noisy[0, 2] += 5.0
+    before, after = (replayed(policy, w, e, np.array([2]), False)[0] for e in (clean, noisy))
+    at_once, later = after[2] - before[2], after[6] - before[6]
+    torch.testing.assert_close(later, rho**4 * at_once, rtol=1e-3, atol=1e-2)
+    torch.testing.assert_close(after[:2], before[:2])
+
+
+def test_delays_beyond_the_end_of_an_episode_are_missing_and_counted_so() -> None:
+    found = contamination(linear_policy(0.9, dtype=torch.float32), ToyEnv([10]), delays=(0, 5, 9, 50), starts=40)
+    left = 9 - found.points[:, 1]
+    for k, delay in enumerate((0, 5, 9, 50)):
+        assert (np.isfinite(found.flip[:, 0, k]) == (left >= delay)).all()
+    assert found.counts()[0].tolist() == [(left >= delay).sum() for delay in (0, 5, 9, 50)]
+    assert np.isnan(found.mean("flip")[0, -1]) and np.isnan(found.kl).all()  # Q-values have no distribution
+
+
+def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode() -> None:
+    found = contamination(linear_policy(0.5, dtype=torch.float32), ToyEnv(ENV), starts=50, delays=(0,))
+    assert len(found.points) == 50
+    lengths = np.array(ENV)[found.points[:, 0] % len(ENV)]
+    assert (found.points[:, 1] < lengths - 1).all()
+    assert np.bincount(found.points[:, 0]).max() <= 4
+
+
+def test_noise_has_the_asked_strength_its_draw_is_shared_and_clipping_keeps_the_range() -> None:
+    o = torch.full((3, 64, 64, 3), 128, dtype=torch.uint8)
+    noisy = disturbed_frames(o, np.array([0, 2]), np.array([0.0, 0.1, 0.3]), False, seed=0).unflatten(0, (2, 3)) - 128
+    assert not noisy[:, 0].any()
+    assert noisy[:, 1].std().item() == pytest.approx(25.5, rel=0.02)
+    torch.testing.assert_close(noisy[:, 2], 3 * noisy[:, 1], rtol=1e-3, atol=1e-2)
+    assert not torch.equal(noisy[0, 1], noisy[1, 1])
+    clipped = disturbed_frames(o, np.array([0]), np.array([1.0]), True, seed=0)
+    assert clipped.min() == 0 and clipped.max() == 255
+
+
+def test_a_shuffle_moves_the_named_frames_only_and_always_moves_some() -> None:
+    for seed in range(30):
+        order = shuffle_order(12, 1, 3, np.random.default_rng(seed))
+        assert order[[0, 1, *range(4, 12)]].tolist() == [0, 1, *range(4, 12)]
+        assert sorted(order[2:4]) == [2, 3] and order[2] == 3
+    with pytest.raises(ValueError, match="cannot permute frames 2 to 3 of 3"):
+        shuffle_order(3, 1, 3, np.random.default_rng(0))
+
+
+def test_a_memory_that_adds_up_does_not_notice_the_order_and_one_that_forgets_does() -> None:
+    sums, fades = (linear_policy(rho, dtype=torch.float32) for rho in (1.0, 0.9))
+    same, moved = (shuffled_beginning(p, ToyEnv(ENV), delays=(0, 3), starts=12) for p in (sums, fades))
+    assert same.mean("change").max() < 1e-4 < moved.mean("change").min()
+    short = shuffled_beginning(fades, ToyEnv([5, 20]), starts=4, delays=(0,))
+    assert short.skipped >= 3 and len(short.points) == 4
+
+
+def acting_policy(inertia: float) -> Policy:
+    """Q depends on the frame and, by ``inertia``, on the previous action."""
+
+    def remember(e: Tensor, last_action: Tensor, is_init: Tensor, state: Any) -> tuple[Tensor, Any]:
+        return e + inertia * torch.nn.functional.one_hot(last_action, e.shape[-1]), state
+
+    return Policy(lambda o: o.float().flatten(-3)[..., :5] / 255, remember)
+
+
+def test_feedback_lets_a_flip_live_on_through_the_actions_and_teacher_forcing_does_not() -> None:
+    sticky = acting_policy(10.0)  # repeats its last action for ever
+    forced, free = (
+        contamination(sticky, ToyEnv(ENV), sigmas=(30.0,), delays=(0, 1, 4), starts=40, feedback=feedback)
+        for feedback in (False, True)
+    )
+    assert forced.mean("flip")[0, 0] > 0.2 and forced.mean("flip")[0, 1:].max() == 0
+    np.testing.assert_allclose(free.mean("flip")[0, 0], forced.mean("flip")[0, 0])
+    alive = np.isfinite(free.flip[:, 0, 2])
+    np.testing.assert_array_equal(free.flip[alive, 0, 2], free.flip[alive, 0, 0])
+
+
+def test_a_policy_has_a_divergence_that_is_zero_where_nothing_changes() -> None:
+    config = preset("smoke", env="MineSweeperEasy", memory="lru", algorithm="ppo")
+    agent = Agent(config, build_network(config).eval())
+    found = contamination(agent, sigmas=(0.0, 1.0), delays=(0, 1, 2), starts=6, cap=8)
+    assert found.target == "probs"
+    assert np.nanmax(np.abs(found.kl[:, 0])) < 1e-9 < found.mean("kl")[1, 0]
+    with pytest.raises(ValueError, match="target must be q, logits or probs, not value"):
+        contamination(agent, target="value", starts=1)
+
+
+def test_examples_hold_the_frames_and_the_values_of_every_version() -> None:
+    policy, w = linear_policy(0.9, dtype=torch.float32), window(13)
+    found = noise_examples(policy, w, [2, 8])
+    assert found.frames.shape == (3, 3, 4, 4, 3) and found.labels == ("clean", "noise on frame 2", "noise on frame 8")
+    np.testing.assert_array_equal(found.frames[0, 2], w.frames[12])
+    assert not np.array_equal(found.frames[1, 1], w.frames[2]) and np.array_equal(found.frames[1, 2], w.frames[12])
+    np.testing.assert_allclose(found.values.sum(1), 0, atol=1e-2)  # relative values
+    order = shuffle_example(policy, w)
+    assert order.frames.shape == (2, 5, 4, 4, 3) and np.array_equal(order.frames[0, 3:], order.frames[1, 3:])
+    with pytest.raises(ValueError, match="indices from 0 to 12"):
+        noise_examples(policy, w, [13])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sigmas": ()}, "sigmas must be numbers"),
+        ({"sigmas": (-1.0,)}, "sigmas must be numbers"),
+        ({"delays": (-1,)}, "delays must be whole numbers"),
+        ({"starts": 0}, "starts must be at least 1"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    policy = linear_policy(0.5, dtype=torch.float32)
+    with pytest.raises(ValueError, match=message):
+        contamination(policy, ToyEnv([5]), **options)
+    with pytest.raises(ValueError, match="at least two"):
+        shuffled_beginning(policy, ToyEnv([5]), first=1, last=2)
+    with pytest.raises(ValueError, match="long enough: 11 frames are needed"):
+        shuffled_beginning(policy, ToyEnv([5]), starts=1)
+
+
+def test_measuring_leaves_the_mode_and_the_weights_of_a_network_alone() -> None:
+    net = Net("gru", torch.float32).train()
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    policy = Policy(net.encode, net.remember, net.initial_state, module=net)
+    contamination(policy, ToyEnv([8]), starts=4, delays=(0, 1))
+    assert net.training and all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+    assert all(parameter.grad is None for parameter in net.parameters()) and frames(1).dtype == torch.uint8

@@ -1,0 +1,257 @@
+"""``arcade-torch figure``: every figure from runs or from the paper, numbers beside it, and what cannot be compared."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arcade_torch.agents import preset, train
+from arcade_torch.tools import cli
+from arcade_torch.tools.commands.figure import Figure
+from arcade_torch.tools.figures.registry import FIGURES
+from arcade_torch.tools.figures.style import AGENT_COLOURS
+from arcade_torch.tools.files import read_csv
+from arcade_torch.tools.studies.grid import RunSpec
+from tests.tools.fabricated import write_run
+
+AGENTS = {"mlp": 0.3, "lru": 0.5, "gru": 0.6}
+
+
+def fabricate(root: Path, seeds: Sequence[int] = (0, 1, 2), games: Sequence[str] = ("CartPoleEasy-v0",)) -> Path:
+    """Finished runs of three agents on both twins."""
+    for game in games:
+        for agent, score in AGENTS.items():
+            for twin in ("full", "partial"):
+                for seed in seeds:
+                    spec = RunSpec(game, twin, agent, "pqn", seed)
+                    write_run(root / spec.name, spec, score + 0.01 * seed - 0.1 * (twin == "partial"))
+    return root
+
+
+def change(run: Path, **values: Any) -> None:
+    """Change settings in a run's config.json."""
+    file = run / "config.json"
+    record = json.loads(file.read_text())
+    record["config"] |= values
+    file.write_text(json.dumps(record))
+
+
+def figure(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """Make a figure; what was printed."""
+    code = cli.main(["figure", *words])
+    out, err = capsys.readouterr()
+    assert code == cli.EXIT_OK, err
+    return out
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """The one line with which a command was refused."""
+    assert cli.main([*words]) == cli.EXIT_BAD_INPUT
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1
+    return err
+
+
+@pytest.mark.parametrize(
+    ("name", "style"), [("returns", "light"), ("gap-bias", "print"), ("human", "print"), ("hyperparameters", "light")]
+)
+def test_the_papers_numbers_make_pictures_and_tables(
+    name: str, style: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = figure(capsys, name, "--paper", "--out", str(tmp_path), "--style", style)
+    for ending, magic in ((".pdf", b"%PDF"), (".png", b"\x89PNG")):
+        assert (tmp_path / f"{name}{ending}").read_bytes().startswith(magic)
+    assert len(read_csv(tmp_path / f"{name}.csv")) >= 9
+    if name == "returns":
+        assert "GDN         0.522  0.469  +0.054  -0.150" in text and (tmp_path / "returns-without.png").exists()
+
+
+@pytest.mark.parametrize("name", ["returns", "gap-bias", "curves", "hyperparameters"])
+def test_run_folders_make_pictures_and_tables(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = fabricate(tmp_path / "runs", games=("CartPoleEasy-v0", "SkittlesEasy-v0"))
+    text = figure(capsys, name, "--runs", str(runs), "--out", str(tmp_path / "f"), "--metric", "eval_final")
+    assert "left out" not in text and "no interval" not in text
+    rows = read_csv(tmp_path / "f" / f"{name}.csv")
+    if name in ("returns", "gap-bias"):
+        lru = next(row for row in rows if row["agent"] == "lru" and not row["without"])
+        assert float(lru["gap"]) == pytest.approx(0.1) and float(lru["bias"]) == pytest.approx(0.2)
+        assert float(lru["gap_low"]) < 0.1 < float(lru["gap_high"]) and lru["seeds"] == "3"
+    if name == "curves":
+        assert {row["agent"] for row in rows} == set(AGENTS) and {row["seeds"] for row in rows} == {"3"}
+
+
+def test_a_size_sweep_names_layers_and_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = fabricate(tmp_path / "runs")
+    for layers, width in ((1, 512), (2, 128)):
+        for twin in ("full", "partial"):
+            for seed in (0, 1):
+                run = runs / f"big-{layers}-{width}-{twin}-{seed}"
+                write_run(run, RunSpec("CartPoleEasy-v0", twin, "lru", "pqn", seed), 0.4 + layers / 10)
+                change(run, network_options={"layers": layers, "hidden_size": width})
+    figure(capsys, "size-sweep", "--runs", str(runs), "--out", str(tmp_path / "f"))
+    rows = {row["agent"]: row for row in read_csv(tmp_path / "f" / "size-sweep.csv")}
+    assert set(rows) == {"mlp", "gru 2x512", "lru 2x512", "lru 1x512", "lru 2x128"}
+    assert float(rows["lru 1x512"]["bias"]) == pytest.approx(0.5 - 0.31)
+
+
+def test_a_single_seed_is_drawn_without_an_interval_and_said_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = fabricate(tmp_path / "runs", seeds=(0,))
+    text = figure(capsys, "returns", "--runs", str(runs), "--out", str(tmp_path / "f"))
+    assert "no interval, a single seed: gru on CartPoleEasy-v0 (full)" in text
+    assert read_csv(tmp_path / "f" / "returns.csv")[0]["gap_low"] == "nan"
+
+
+def test_unfinished_runs_and_missing_twins_are_left_out_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = fabricate(tmp_path / "runs")
+    write_run(runs / "slow", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9), 0.5, status="running")
+    write_run(runs / "alone", RunSpec("TetrisEasy-v0", "full", "lru", "pqn", 0), 0.5)
+    text = figure(capsys, "gap-bias", "--runs", str(runs), "--out", str(tmp_path / "f"))
+    assert "left out, not finished: slow" in text
+    assert "left out, some agent lacks one of its twins: TetrisEasy-v0" in text
+
+
+def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs, out = fabricate(tmp_path / "runs"), ["--out", str(tmp_path / "f")]
+    ask = ["figure", "returns", *out, "--runs", str(runs)]
+    write_run(runs / "new", RunSpec("CartPoleEasy-v1", "full", "lru", "pqn", 0), 0.5)
+    assert "CartPoleEasy-v0 and CartPoleEasy-v1 cannot be compared" in refused(capsys, *ask)
+    write_run(runs / "new", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 7), 0.5)
+    change(runs / "new", rules="reference")
+    change(runs / "CartPoleEasy-v0__full__lru__pqn__seed0", rules="default")
+    assert "runs with rules default and reference" in refused(capsys, *ask)
+    shutil.rmtree(runs / "new")
+    shutil.copytree(runs / "CartPoleEasy-v0__full__lru__pqn__seed0", runs / "twice")
+    assert "are the same cell" in refused(capsys, *ask)
+    shutil.rmtree(runs / "twice")
+    assert "memory-free agent 'none'" in refused(capsys, *ask, "--baseline", "none")
+    assert not (tmp_path / "f").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["figure", "retruns"], "unknown figure 'retruns': did you mean 'returns'?"),
+        (["figure", "curves"], "name the folder with the runs"),
+        (["figure", "curves", "--paper"], "there for returns, gap-bias, human, hyperparameters, not for curves"),
+        (["figure", "curves", "--runs", "nowhere"], "nowhere does not exist"),
+        (["figure", "curves", "--runs", "empty"], "empty holds no run"),
+        (["figure", "curves", "--runs", "file.csv"], "file.csv is a file"),
+        (["figure", "curves", "--runs", "point"], "point is a single checkpoint"),
+        (["figure", "curves", "--runs", "slow"], "none of the 1 runs below slow has finished"),
+        (["figure", "curves", "--runs", "odd"], "does not describe a run"),
+        (["figure", "returns", "--paper", "--confidence", "95"], "between 0 and 1"),
+        (["figure", "recall-density", "--runs", "slow", "--bins", "0"], "must be at least 1"),
+        (["analyze", "recall-density"], "name at least one run folder"),
+        (["analyze", "recall-density", "empty"], "holds no checkpoint"),
+        (["analyze", "recall-density", "empty", "--bins", "0"], "--bins must be whole numbers of at least 1"),
+        (["analyze", "contamination"], "name at least one run folder"),
+        (["analyze", "contamination", "slow"], "holds no checkpoint"),
+    ],
+)
+def test_bad_input_is_one_line(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "point", "odd"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "file.csv").write_text("a\n")
+    (tmp_path / "point" / "meta.json").write_text("{}")
+    (tmp_path / "odd" / "config.json").write_text("{}")
+    write_run(tmp_path / "slow", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9), 0.5, status="running")
+    assert message in refused(capsys, *words)
+    assert not (tmp_path / "figures").exists()
+
+
+def test_the_help_names_every_figure() -> None:
+    assert Figure.__doc__ is not None
+    listed = Figure.__doc__.split("Figures: ")[1].split(".")[0].split(", ")
+    assert listed == list(FIGURES)
+
+
+def test_colours_of_agents_stay_apart_for_people_who_see_red_and_green_alike() -> None:
+    names = [name for name in AGENT_COLOURS if name not in ("tttl", "feedforward")]
+    rgb = np.array([[int(AGENT_COLOURS[name][i : i + 2], 16) for i in (1, 3, 5)] for name in names]) / 255
+    # deuteranopia and protanopia, Machado et al. (2009), severity 1, applied to linear light
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    deutan = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
+    protan = np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]])
+    for matrix in (np.eye(3), deutan, protan):
+        seen = np.clip(linear @ matrix.T, 0, 1) ** (1 / 2.2)
+        apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1) + 9 * np.eye(len(names))
+        assert apart.min() > 0.12, [names[i] for i in np.unravel_index(apart.argmin(), apart.shape)]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds of an agent, too short to learn anything."""
+    root = tmp_path_factory.mktemp("runs")
+    for seed in (0, 1):
+        train(
+            preset("smoke", env="MineSweeperEasy", observability="full", memory="gru", seed=seed), root / f"gru-{seed}"
+        )
+    return root
+
+
+def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = [str(run) for run in sorted(trained.iterdir())]
+    words = ["analyze", "recall-density", *runs, "--episodes", "6", "--max-frames", "12", "--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    assert "of the gradient on the last frame" in capsys.readouterr().out
+    rows = read_csv(tmp_path / "recall-density-16.csv")
+    assert sum(float(row["mass"]) for row in rows) == pytest.approx(1) and {row["seeds"] for row in rows} == {"2"}
+    assert all(float(row["low"]) <= float(row["mass"]) <= float(row["high"]) for row in rows)
+    with np.load(tmp_path / "recall-density-3.npz") as kept:
+        assert kept["shares_1"].sum() == pytest.approx(len(kept["lengths_1"])) and kept["points"].shape == (2, 101)
+    monkeypatch.setattr("arcade_torch.tools.analysis.windows.play", None)
+    assert cli.main(words) == 0
+    assert read_csv(tmp_path / "recall-density-16.csv") == rows
+    file = next((trained / "gru-0" / "analysis").glob("recall_density-*.npz"))
+    file.write_bytes(b"junk")
+    assert cli.main(words) == cli.EXIT_BAD_INPUT
+    assert "is damaged" in capsys.readouterr().err
+    file.unlink()
+
+
+def test_contamination_of_checkpoints_is_drawn_with_an_example(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["analyze", "contamination", *map(str, sorted(trained.iterdir())), "--starts", "6", "--delays", "0", "1"]
+    assert cli.main([*words, "--sigmas", "0", "1", "--out", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "changed decisions in %" in text and "6 start points" in text
+    rows = read_csv(tmp_path / "contamination-noise-MineSweeperEasy-v0-full.csv")
+    assert [(row["sigma"], row["delay"]) for row in rows] == [("0.0", "0"), ("0.0", "1"), ("1.0", "0"), ("1.0", "1")]
+    assert float(rows[0]["change"]) < 1e-5 < float(rows[2]["change"])
+    assert (tmp_path / "contamination-noise-example-MineSweeperEasy-v0-full.png").exists()
+
+
+def test_two_checkpoints_of_one_seed_are_not_pooled_as_two_seeds(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = str(trained / "gru-0")
+    words = ["analyze", "contamination", run, run, "--starts", "2", "--delays", "0", "--out", str(tmp_path)]
+    assert "are both gru on MineSweeperEasy-v0 (full), seed 0" in refused(capsys, *words)
+
+
+def test_saliency_of_runs_has_a_row_for_every_agent(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figure(capsys, "saliency", "--runs", str(trained), "--out", str(tmp_path))
+    shares = [float(row["share"]) for row in read_csv(tmp_path / "saliency.csv")]
+    assert sum(shares) == pytest.approx(1)
+    with np.load(tmp_path / "saliency.npz") as kept:
+        assert kept["maps_0"].shape == kept["frames_0"].shape[:3] and "maps_1" not in kept

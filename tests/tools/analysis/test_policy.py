@@ -1,0 +1,69 @@
+"""What counts as a policy, and how its outputs are read."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from arcade_torch.agents import Agent, preset
+from arcade_torch.agents.agent import build_network
+from arcade_torch.tools import Policy
+from arcade_torch.tools.analysis.policy import outputs, policy_of, read_plain, resolve
+from tests.tools.analysis.toys import Net, linear_policy
+
+OUT = torch.tensor([[1.0, 3.0, 2.0]])
+
+
+def agent(algorithm: str) -> Agent:
+    config = preset("smoke", memory="gru", algorithm=algorithm)
+    return Agent(config, build_network(config).eval())
+
+
+def test_a_wrapped_pair_can_be_read_as_anything() -> None:
+    policy = linear_policy(0.5)
+    assert outputs(policy, "q")(OUT) is OUT and outputs(policy)(OUT) is OUT
+    torch.testing.assert_close(outputs(policy, "probs")(OUT), OUT.softmax(-1))
+    assert outputs((policy.encode, policy.remember), "value")(OUT).tolist() == [[3.0]]
+
+
+@pytest.mark.parametrize(("algorithm", "natural"), [("pqn", "q"), ("dqn", "q"), ("ppo", "probs")])
+def test_agents_say_what_they_offer(algorithm: str, natural: str) -> None:
+    asked = agent(algorithm)
+    assert resolve(asked, "auto") == natural and natural in policy_of(asked).offers
+    missing = "probs" if natural == "q" else "q"
+    with pytest.raises(ValueError, match=f"not '{missing}': choose one of these"):
+        outputs(asked, missing)
+
+
+def test_an_actor_critic_is_read_by_its_own_rules() -> None:
+    policy, out = policy_of(agent("ppo")), torch.tensor([1.0, 3.0, 2.0, 0.0, 0.5, 99.0])  # five logits and a value
+    assert outputs(policy, "value")(out).tolist() == [99.0]
+    torch.testing.assert_close(outputs(policy, "probs")(out), out[:-1].softmax(-1))
+    assert policy.greedy(out) == 1
+
+
+def test_a_policy_acts_greedily_and_carries_its_state() -> None:
+    policy, net = linear_policy(1.0, dtype=torch.float32), Net("gru", torch.float32)
+    for player in (policy, policy_of(net)):
+        state = player.initial_state(2)
+        frames = torch.randint(256, (2, 3, 4, 4, 3), dtype=torch.uint8)
+        picks = []
+        for t in range(3):
+            obs = {"pixels": frames[:, t], "last_action": torch.zeros(2, dtype=torch.int64)}
+            action, _, state = player.act(obs | {"is_init": torch.full((2, 1), t == 0)}, state)
+            picks.append(action)
+        starts = torch.tensor([[True, False, False]] * 2)
+        actions = torch.zeros(2, 3, dtype=torch.int64)
+        out, _ = player.remember(player.encode(frames.flatten(0, 1)).unflatten(0, (2, 3)), actions, starts, state)
+        assert torch.equal(torch.stack(picks, 1), out.argmax(-1))
+
+
+def test_what_is_no_policy_is_refused() -> None:
+    def encode(o: Tensor) -> Tensor:
+        return o
+
+    for wrong in (object(), (encode,), (encode, "remember"), torch.nn.Linear(2, 2)):
+        with pytest.raises(TypeError, match="model must be an agent"):
+            policy_of(wrong)
+    with pytest.raises(ValueError, match="target must be one of q, logits, probs, value or auto, got 'Q'"):
+        outputs(linear_policy(0.5), "Q")
+    assert policy_of(Policy(encode, lambda e, a, s, h: (e, h))).read is read_plain

@@ -1,0 +1,122 @@
+"""Recall density: bins, ends, what is dropped, reference lines, and agents of every algorithm."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arcade_torch.agents import Agent, preset
+from arcade_torch.agents.agent import build_network
+from arcade_torch.tools import recall_density, saliency
+from arcade_torch.tools.analysis.binning import binned, mean_points, no_memory, point_sampled, uniform_memory
+from arcade_torch.tools.analysis.recall_density import density_of_windows
+from arcade_torch.tools.analysis.windows import greedy_windows
+from tests.tools.analysis.toys import Net, ToyEnv, linear_policy, window
+
+RHO = linear_policy(0.8, dtype=torch.float32)
+
+
+@given(shares=st.lists(st.floats(0, 1), min_size=1, max_size=40), bins=st.integers(1, 20))
+def test_binning_keeps_the_mass_and_as_many_bins_as_steps_change_nothing(shares: list[float], bins: int) -> None:
+    mass = np.array(shares)
+    assert binned(mass, bins).sum() == pytest.approx(mass.sum(), abs=1e-9)
+    np.testing.assert_allclose(binned(mass, len(mass)), mass, atol=1e-9)
+    assert (binned(mass, bins) >= -1e-12).all()
+    np.testing.assert_allclose(binned(mass[::-1], bins), binned(mass, bins)[::-1], atol=1e-9)  # time runs either way
+
+
+@given(fine=st.integers(1, 6), coarse=st.integers(1, 6), steps=st.integers(1, 30))
+def test_fine_bins_add_up_to_coarse_ones(fine: int, coarse: int, steps: int) -> None:
+    mass = np.random.default_rng(steps).random(steps)
+    summed = binned(mass, fine * coarse).reshape(coarse, fine).sum(1)
+    np.testing.assert_allclose(summed, binned(mass, coarse), atol=1e-9)
+
+
+def test_the_papers_curve_reads_the_step_at_floor_tau_n() -> None:
+    shares = np.array([0.1, 0.2, 0.3, 0.4])
+    taus = np.array([0.0, 0.32, 1 / 3, 0.5, 0.99, 1.0])
+    assert point_sampled(shares, taus).tolist() == [0.1, 0.1, 0.2, 0.2, 0.3, 0.4]
+    uneven = [np.full(10, 0.1), np.full(2, 0.5)]  # does not integrate to one: that is why there are bins
+    assert mean_points(uneven, np.linspace(0, 1, 1001)).mean() == pytest.approx(0.3)
+
+
+def test_reference_lines_are_those_of_uniform_memory_and_of_none() -> None:
+    uniform = density_of_windows(linear_policy(1.0, dtype=torch.float32), [window(20), window(7)])
+    np.testing.assert_allclose(uniform.mass(16), uniform_memory(16), rtol=1e-4)
+    free = density_of_windows(linear_policy(0.0, dtype=torch.float32), [window(20), window(7)])
+    np.testing.assert_allclose(free.mass(16), no_memory([20, 7], 16), rtol=1e-6)
+    assert no_memory([7], 16)[-2:].sum() < 1  # one of 7 frames is longer than two of 16 bins
+
+
+def test_short_trajectories_are_dropped_and_counted() -> None:
+    found = recall_density(RHO, ToyEnv([1, 2, 3, 30]), episodes=8, seed=1)
+    assert found.dropped == 4 and sorted(set(found.lengths.tolist())) == [3, 30]
+    assert found.ended.all() and found.silent == 0
+    none = recall_density(RHO, ToyEnv([2]), episodes=3)
+    with pytest.raises(ValueError, match="3 had fewer than 3 frames"):
+        none.mass(3)
+
+
+def test_long_episodes_give_windows_of_the_cap_with_random_ends_and_short_ones_end_with_the_episode() -> None:
+    windows = list(greedy_windows(RHO, ToyEnv([40, 8]), episodes=40, cap=10))
+    ends = [int(w.frames[-1, 0, 0, 0]) for w in windows if w.row == 0]
+    assert min(ends) >= 9 and len(set(ends)) > 8 and all(w.n == 9 for w in windows if w.row == 0)
+    assert all(w.ended and w.n == 7 for w in windows if w.row == 1)
+
+
+def test_random_ends_are_uniform_from_the_third_frame_on() -> None:
+    windows = greedy_windows(RHO, ToyEnv([6] * 8), episodes=400, end="random")
+    counts = np.bincount([w.n for w in windows], minlength=6)
+    assert counts[:2].sum() == 0 and (counts[2:] > 60).all()
+
+
+def test_the_same_seed_plays_the_same_episodes_and_another_seed_others() -> None:
+    first, again, other = (
+        torch.cat([w.frames for w in greedy_windows(RHO, ToyEnv([9, 12]), episodes=4, seed=seed)]) for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert not torch.equal(first[:21], first[21:])  # nor are the episodes of one seed the same
+
+
+def test_a_window_gives_the_shares_of_its_saliency() -> None:
+    net, w = Net("mingru", torch.float32), window(6)
+    for norm, reduce in (("l1", "per_action"), ("l2sq", "sum"), ("l2", "per_action")):
+        one = density_of_windows(net, [w], norm=norm, reduce=reduce)  # type: ignore[arg-type]
+        two = saliency(net, w.frames, w.last_action, w.is_init, norm=norm, reduce=reduce)  # type: ignore[arg-type]
+        np.testing.assert_allclose(one.shares[0], two.shares(), rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize(("algorithm", "target"), [("pqn", "q"), ("ppo", "probs"), ("dqn", "q")])
+def test_agents_of_every_algorithm_have_a_density(algorithm: str, target: str) -> None:
+    config = preset("smoke", env="MineSweeperEasy", memory="gru", algorithm=algorithm)
+    agent = Agent(config, build_network(config).eval())
+    found = recall_density(agent, episodes=5, cap=8)
+    assert found.target == target
+    assert len(found.shares) + found.dropped + found.silent == 5 and found.lengths.max() <= 8
+    with pytest.raises(ValueError, match="offers"):
+        recall_density(agent, episodes=1, target="probs" if target == "q" else "q")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"end": "first"}, "end must be one of last, random"),
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"cap": 2}, "the cap at least 3"),
+        ({"norm": "l0"}, "norm must be one of"),
+        ({"observability": "full"}, "leave env out"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        recall_density(RHO, ToyEnv([5]), **options)
+    with pytest.raises(ValueError, match="hand over env as well"):
+        recall_density(RHO)
+    with pytest.raises(TypeError, match="got object"):
+        recall_density(object(), ToyEnv([5]))
+    with pytest.raises(RuntimeError, match="is not a folder"):
+        recall_density(Path("no/such/run"))

@@ -1,0 +1,164 @@
+"""What the analyses ask of a policy: two functions, and which of its outputs is meant.
+
+Saliency, recall density and contamination work on anything that can be cut in two: ``encode`` looks at single frames,
+``remember`` is everything behind it. Agents and networks of this package have both as methods; wrap any other module
+in a `Policy`.
+
+Example:
+    >>> encoder, head = torch.nn.Linear(12, 4), torch.nn.Linear(4, 5)
+    >>> policy = Policy(
+    ...     encode=lambda frames: encoder(frames.flatten(-3) / 255),
+    ...     remember=lambda features, last_action, is_init, state: (head(features.cumsum(1)), state),
+    ... )
+    >>> policy.encode(torch.zeros(7, 2, 2, 3)).shape
+    torch.Size([7, 4])
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+Target = Literal["auto", "q", "logits", "probs", "value"]
+Encode = Callable[[Tensor], Tensor]
+Remember = Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
+Outputs = Callable[[Tensor], Tensor]
+
+TARGETS = ("q", "logits", "probs", "value")
+"""Outputs that can be asked for by name."""
+
+
+def _no_state(batch_size: int) -> None:
+    return None
+
+
+def read_plain(out: Tensor, what: str) -> Tensor:
+    """Read outputs that are one number per action, or a single value.
+
+    Args:
+        out: float [..., A].
+        what: ``q`` and ``logits`` are the outputs as they are, ``probs`` their softmax, ``value`` their maximum.
+
+    Returns:
+        float [..., A], for ``value`` [..., 1].
+    """
+    if what == "probs":
+        return out.softmax(-1)
+    return out.amax(-1, keepdim=True) if what == "value" else out
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in two functions.
+
+    Attributes:
+        encode: frames, float or uint8 0..255 [N, H, W, C], to features [N, E]; each frame on its own.
+        remember: ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T], state) -> (out [B, T, A],
+            state)``, causal in time.
+        initial_state: batch size to the state before the first frame: a TensorDict [B], a tensor [B, ...] or None.
+        read: what its outputs mean: ``(out, one of TARGETS) -> [..., A or 1]``.
+        offers: which of `TARGETS` its outputs can be read as.
+        module: put into evaluation mode while an analysis runs.
+    """
+
+    encode: Encode
+    remember: Remember
+    initial_state: Callable[[int], Any] = _no_state
+    read: Callable[[Tensor, str], Tensor] = read_plain
+    offers: tuple[str, ...] = TARGETS
+    module: nn.Module | None = None
+
+    def greedy(self, out: Tensor) -> Tensor:
+        """The best action of outputs [..., R], int64 [...]."""
+        return self.read(out, "q" if "q" in self.offers else "logits").argmax(-1)
+
+    @torch.no_grad()
+    def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
+        """Greedy actions for a batch of observations, as an agent gives them.
+
+        Args:
+            obs: has ``pixels`` [N, H, W, C], ``last_action`` [N] and ``is_init`` [N, 1].
+            state: recurrent state of the batch.
+
+        Returns:
+            ``(action int64 [N], {}, new state)``.
+        """
+        steps = obs["pixels"].shape[0], 1
+        features = self.encode(obs["pixels"]).unsqueeze(1)
+        out, state = self.remember(features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state)
+        return self.greedy(out[:, 0]), {}, state
+
+
+def policy_of(model: Any) -> Policy:
+    """The two functions of whatever an analysis was given.
+
+    Args:
+        model: an agent with an attribute ``network``, a network with ``encode``, ``remember`` and ``initial_state``, a
+            `Policy`, or a pair ``(encode, remember)``.
+
+    Raises:
+        TypeError: ``model`` has none of these forms.
+    """
+    if isinstance(model, Policy):
+        return model
+    if isinstance(model, tuple) and len(model) == 2 and all(callable(part) for part in model):
+        return Policy(model[0], model[1])
+    network = getattr(model, "network", model)
+    if all(hasattr(network, name) for name in ("encode", "remember", "initial_state")):
+        module = network if isinstance(network, nn.Module) else None
+        read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
+        offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
+        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module)
+    raise TypeError(
+        "model must be an agent, a network with encode and remember, a Policy or a pair (encode, remember), "
+        f"got {type(model).__name__}"
+    )
+
+
+def resolve(model: Any, what: str) -> str:
+    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities.
+
+    Raises:
+        ValueError: there is no such output, or this model does not offer it.
+    """
+    if what not in get_args(Target):
+        raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {what!r}")
+    names = policy_of(model).offers
+    if what == "auto":
+        return next(name for name in ("q", "probs", *names) if name in names)
+    if what not in names:
+        raise ValueError(f"this agent offers {', '.join(names)}, not {what!r}: choose one of these as target")
+    return what
+
+
+def outputs(model: Any, what: str = "auto") -> Outputs:
+    """How the scalars that an analysis looks at follow from what ``remember`` returns.
+
+    Args:
+        model: see `policy_of`.
+        what: ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
+
+    Returns:
+        A function [..., R] -> [..., K].
+
+    Raises:
+        ValueError: see `resolve`.
+    """
+    policy, name = policy_of(model), resolve(model, what)
+    return lambda out: policy.read(out, name)
+
+
+@contextmanager
+def evaluation(policy: Policy) -> Iterator[None]:
+    """Evaluation mode for a while; the mode before comes back."""
+    training = policy.module is not None and policy.module.training
+    if policy.module is not None:
+        policy.module.eval()
+    try:
+        yield
+    finally:
+        if policy.module is not None and training:
+            policy.module.train()

@@ -1,0 +1,180 @@
+"""Recall density: how the gradient of a decision is spread over the past of its episode.
+
+For a trajectory o_0 ... o_n let ``g_t = sum_a || d Q(s_n, a) / d o_t ||_1`` and ``delta_t = g_t / sum_i g_i``. The
+density is the mean of delta over trajectories, in bins of normalised time (``binning``) or sampled at points as in the
+paper. On an MDP an ideal agent has all mass on the last frame. The last action is no pixel: what is remembered through
+it does not show.
+
+Source: POPGym Arcade (ICML 2026), recall density. Differs from its published code in the time axis (own length of
+each trajectory), in whole episodes instead of ten steps, and in gradients of single actions instead of their sum.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arcade_torch.tools.analysis.binning import mean_mass, mean_points
+from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, Target, frame_gradients
+from arcade_torch.tools.analysis.policy import resolve
+from arcade_torch.tools.analysis.subject import subject
+from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Window, greedy_windows
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class RecallDensity:
+    """Recall density of one checkpoint.
+
+    Attributes:
+        shares: one float64 [n_i + 1] a trajectory, delta of every frame, oldest first; each sums to 1.
+        ended: bool [m], whether the trajectory ends with the decision that ended its episode.
+        dropped: trajectories left out because they have fewer than three frames.
+        silent: trajectories left out because all their gradients vanish.
+        end: ``last`` or ``random``, see `greedy_windows`.
+        norm: of the gradients.
+        reduce: how actions were put together.
+        target: what was differentiated.
+    """
+
+    shares: tuple[Array, ...]
+    ended: NDArray[np.bool_]
+    dropped: int
+    silent: int
+    end: str
+    norm: str
+    reduce: str
+    target: str
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """int64 [m], frames of each trajectory."""
+        return np.array([share.size for share in self.shares], dtype=np.int64)
+
+    def mass(self, bins: int) -> Array:
+        """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1.
+
+        Raises:
+            ValueError: no trajectory is left, or ``bins`` is below 1.
+        """
+        return mean_mass(self._some(), bins)
+
+    def points(self, taus: Array) -> Array:
+        """The paper's point-sampled curve at ``taus`` in [0, 1]; does not integrate to 1."""
+        return mean_points(self._some(), taus)
+
+    def last_share(self) -> float:
+        """Mean share of the last frame."""
+        return float(np.mean([share[-1] for share in self._some()]))
+
+    def _some(self) -> tuple[Array, ...]:
+        if not self.shares:
+            raise ValueError(
+                f"no trajectory is left: {self.dropped} had fewer than {MIN_STEPS} frames, "
+                f"{self.silent} no gradient at all; play more episodes"
+            )
+        return self.shares
+
+
+def recall_density(
+    agent: Any,
+    env: Any = None,
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    observability: Literal["full", "partial"] | None = None,
+    end: End = "last",
+    cap: int = MAX_STEPS,
+    norm: Norm = "l1",
+    reduce: Reduce = "per_action",
+    target: Target = "auto",
+    chunk: int = 16,
+    progress: Progress | None = None,
+) -> RecallDensity:
+    """Recall density of an agent over whole greedy episodes.
+
+    Args:
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, any `Policy` or network.
+        env: ``ArcadeEnv`` whose episodes are played side by side; by default 16 of the agent's own game.
+        episodes: number of trajectories.
+        seed: of the episodes; training never sees them.
+        observability: another twin than the one trained on (without ``env``).
+        end: ``last``: n is the last frame before the terminating action, which is no typical decision (a failure may be
+            imminent); ``random``: n is drawn uniformly from index 2 on.
+        cap: longest trajectory; longer episodes give a window of that length with a random end.
+        norm: of the gradient of one action over all pixels and channels; ``l1`` is the paper's.
+        reduce: ``per_action`` sums the norms of single actions, ``sum`` takes the norm of the sum over actions.
+        target: what is differentiated, see `outputs`: Q-values or, for a policy, action probabilities by default.
+        chunk: frames pushed through the encoder at once; bounds memory.
+        progress: called with (trajectories done, episodes).
+
+    Returns:
+        Arrays.
+
+    Raises:
+        ValueError: an option is out of range, or this agent does not offer ``target``.
+    """
+    player, env = subject(agent, env, observability)
+    windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
+    done = (lambda count: progress(count, episodes)) if progress is not None else None
+    return density_of_windows(
+        player, windows, end=end, norm=norm, reduce=reduce, target=target, chunk=chunk, progress=done
+    )
+
+
+def density_of_windows(
+    model: Any,
+    windows: Iterable[Window],
+    *,
+    end: str = "last",
+    norm: Norm = "l1",
+    reduce: Reduce = "per_action",
+    target: Target = "auto",
+    chunk: int = 16,
+    progress: Callable[[int], None] | None = None,
+) -> RecallDensity:
+    """Recall density over windows of experience of your own; the last frame of each is explained.
+
+    Args:
+        model: see `policy_of`.
+        windows: consumed one by one. A start flag inside one leaves exactly nothing on the frames before it.
+        end: kept as a note.
+        norm: see `recall_density`.
+        reduce: see `recall_density`.
+        target: see `recall_density`.
+        chunk: see `recall_density`.
+        progress: called with the number of windows done.
+
+    Returns:
+        Arrays.
+    """
+    shares, ended, dropped, silent = [], [], 0, 0
+    for count, window in enumerate(windows, start=1):
+        if window.n + 1 < MIN_STEPS:
+            dropped += 1
+        else:
+            _, totals, _ = frame_gradients(
+                model,
+                window.frames,
+                window.last_action,
+                window.is_init,
+                window.state,
+                reduce,
+                norm,
+                target,
+                chunk,
+            )
+            mass = totals.double().cpu().numpy()
+            if mass.sum() > 0:
+                shares.append(mass / mass.sum())
+                ended.append(window.ended)
+            else:
+                silent += 1
+        if progress is not None:
+            progress(count)
+    what = resolve(model, target)
+    return RecallDensity(tuple(shares), np.array(ended, dtype=np.bool_), dropped, silent, end, norm, reduce, what)

@@ -1,0 +1,85 @@
+"""Replaying a recorded trajectory with something changed in it."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arcade_torch.tools.analysis.policy import policy_of
+from arcade_torch.tools.analysis.two_stage import repeated
+from arcade_torch.tools.analysis.windows import Window
+
+WHITE = 255.0
+"""Pixel value that stands for 1."""
+
+
+def disturbed_frames(
+    frames: Tensor, places: NDArray[np.int64], sigmas: NDArray[np.float64], clip: bool, seed: int
+) -> Tensor:
+    """Single frames with Gaussian noise; the strengths of one frame share its draw.
+
+    Args:
+        frames: uint8 [T, H, W, C].
+        places: int64 [M], which frames.
+        sigmas: float64 [S], standard deviations on the [0, 1] scale.
+        clip: whether pixels stay in 0..255.
+        seed: of the noise; the same on every device.
+
+    Returns:
+        float32 [M * S, H, W, C], values around 0..255; the strengths of a frame stand side by side.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    chosen = frames[torch.as_tensor(places)].to(torch.float32)
+    noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
+    scale = torch.as_tensor(WHITE * sigmas, dtype=torch.float32, device=chosen.device)
+    noisy = (chosen[:, None] + scale[:, None, None, None] * noise[:, None]).flatten(0, 1)
+    return noisy.clamp(0.0, WHITE) if clip else noisy
+
+
+def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Indices of ``total`` frames with those from first + 1 to last in another order.
+
+    Raises:
+        ValueError: fewer than two frames to permute, or more than there are.
+    """
+    if not 0 <= first <= last - 2 or last >= total:
+        raise ValueError(f"cannot permute frames {first + 1} to {last} of {total}")
+    order = np.arange(total)
+    part = order[first + 1 : last + 1]
+    while (order == np.arange(total)).all():  # the identity is no shuffle
+        order[first + 1 : last + 1] = rng.permutation(part)
+    return order
+
+
+@torch.no_grad()
+def replayed(model: Any, window: Window, features: Tensor, touched: NDArray[np.int64], feedback: bool) -> Tensor:
+    """What the memory says at every step of several versions of a trajectory.
+
+    Args:
+        model: see `policy_of`.
+        window: the recorded trajectory; start flags are taken from it.
+        features: float [R, T, E], the versions.
+        touched: int64 [M], where versions begin to differ (only for ``feedback``: from the first of them on the replay
+            chooses for itself).
+        feedback: use the best action of the replay itself as previous action; false: the recorded ones.
+
+    Returns:
+        Outputs of ``remember``, float [R, T, A].
+    """
+    policy, count = policy_of(model), features.shape[0]
+    state = repeated(policy.initial_state(1) if window.state is None else window.state, count)
+    actions = window.last_action.expand(count, -1)
+    starts = window.is_init.bool().expand(count, -1)
+    if not feedback:
+        return policy.remember(features, actions, starts, state)[0]
+    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions lead there.
+    free = int(touched.min(initial=features.shape[1] - 1))
+    out, state = policy.remember(features[:, : free + 1], actions[:, : free + 1], starts[:, : free + 1], state)
+    parts = [out]
+    for t in range(free + 1, features.shape[1]):
+        chosen = policy.greedy(out[:, -1:])
+        out, state = policy.remember(features[:, t : t + 1], chosen, starts[:, t : t + 1], state)
+        parts.append(out)
+    return torch.cat(parts, 1)

@@ -1,0 +1,1 @@
+"""The paper's figures from run folders, each with its numbers beside it."""

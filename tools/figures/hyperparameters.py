@@ -1,0 +1,75 @@
+"""Settings as a table, generated from the configs themselves so that it cannot go stale."""
+
+from collections.abc import Mapping
+from typing import Any, get_args, get_type_hints
+
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.tools.figures.registry import Made, Request
+from arcade_torch.tools.figures.runs import find_runs
+from arcade_torch.tools.figures.style import drawing, inches, save
+from arcade_torch.tools.files import write_csv, write_text
+from arcade_torch.tools.studies.grid import flatten
+
+CELL = ("env", "observability", "memory", "seed")
+"""Fields that tell runs apart; all others are settings."""
+
+NOT_SETTINGS = ("device", "threads", "checkpoint_every")
+
+
+def make(request: Request) -> Made:
+    """``hyperparameters``: CSV and Markdown, and the table as a picture; one column an algorithm."""
+    notes: list[str] = []
+    if request.paper:
+        from arcade_torch.agents import preset
+
+        algorithms = get_args(get_type_hints(TrainConfig)["algorithm"])
+        columns = {name: _settings(preset("paper", algorithm=name).to_dict()) for name in algorithms}
+        notes.append(f"total_frames is that of {TrainConfig().env}; the paper's budget depends on the game")
+    else:
+        found = find_runs(request.runs)
+        notes, columns = found.notes, {}
+        for run in found.runs:
+            columns.setdefault(str(run.config.get("algorithm", "pqn")), {})
+        for algorithm in columns:
+            runs = [run for run in found.runs if str(run.config.get("algorithm", "pqn")) == algorithm]
+            columns[algorithm] = _common([_settings(run.config) for run in runs])
+    names = list(dict.fromkeys(name for settings in columns.values() for name in settings))
+    rows = [{"setting": name} | {key: settings.get(name, "") for key, settings in columns.items()} for name in names]
+    head = ["setting", *columns]
+    base = request.out / "hyperparameters"
+    table = [[str(row[name]) for name in head] for row in rows]
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(f"| {' | '.join(line)} |" for line in table)]
+    files = [
+        write_csv(base.with_suffix(".csv"), rows, head),
+        write_text(base.with_suffix(".md"), "\n".join(lines) + "\n"),
+    ]
+    with drawing(request.style) as plt:
+        size = inches(request.style, 2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2))
+        figure, axis = plt.subplots(figsize=size, layout="constrained")
+        axis.set_axis_off()
+        drawn = axis.table(table, colLabels=head, bbox=(0, 0, 1, 1), cellLoc="left", edges="horizontal")
+        drawn.auto_set_font_size(False)
+        for (line, _), cell in drawn.get_celld().items():
+            cell.set_edgecolor("#d0d0d0")
+            if line == 0:
+                cell.set_text_props(weight="bold")
+        files += save(figure, base)
+    return Made(files, notes)
+
+
+def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Flat settings of one run, without those of other algorithms."""
+    algorithm = str(config.get("algorithm", "pqn"))
+    others = set(get_args(get_type_hints(TrainConfig)["algorithm"])) - {algorithm}
+    chosen = {key: value for key, value in config.items() if key not in (*CELL, *NOT_SETTINGS, *others)}
+    flat = {name.removeprefix(f"{algorithm}."): value for name, value in flatten(chosen).items()}
+    return {name: value for name, value in flat.items() if value != {} and name != "algorithm"}
+
+
+def _common(settings: list[dict[str, Any]]) -> dict[str, Any]:
+    """Each setting's value, or all its values where runs differ."""
+    found = {}
+    for name in dict.fromkeys(key for each in settings for key in each):
+        values = list(dict.fromkeys(str(each.get(name, "-")) for each in settings))
+        found[name] = values[0] if len(values) == 1 else " / ".join(sorted(values))
+    return found

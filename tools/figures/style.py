@@ -1,0 +1,183 @@
+"""How figures look, and how they are saved: the one place for colours, sizes and files."""
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from arcade_torch.tools.analysis.kept import write_npz
+from arcade_torch.tools.files import write_bytes, write_csv
+from arcade_torch.tools.optional import need
+
+STYLES = ("light", "print")
+"""``light`` for screens, ``print`` for a page: smaller, serif."""
+
+AGENT_COLOURS = {
+    "mlp": "#6b6b6b",
+    "feedforward": "#9c9c9c",
+    "lru": "#0072b2",
+    "gru": "#009e73",
+    "mingru": "#e69f00",
+    "fart": "#cc79a7",
+    "attention": "#d55e00",
+    "gdn": "#56b4e9",
+    "ttt": "#5e3c10",
+    "tttl": "#5e3c10",
+    "human": "#000000",
+}
+"""Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
+
+SPARE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#5e3c10", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+
+MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")
+POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
+"""Recall density: the darkest is the most recent third."""
+
+TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
+TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
+
+CLEAN_BEST, DISTURBED_BEST, OTHER_BAR = "#354e6a", "#a33a2f", "#b3b3b3"
+"""Bars of contamination examples."""
+
+NEUTRAL = "#555555"
+
+_RC: dict[str, dict[str, Any]] = {
+    "light": {
+        "font.size": 10,
+        "font.family": "sans-serif",
+        "lines.linewidth": 1.8,
+        "lines.markersize": 5,
+        "patch.linewidth": 1.6,
+        "grid.linewidth": 0.8,
+        "savefig.dpi": 160,
+    },
+    "print": {
+        "font.size": 7.5,
+        "font.family": "serif",
+        "lines.linewidth": 1.2,
+        "lines.markersize": 3.2,
+        "patch.linewidth": 1.0,
+        "grid.linewidth": 0.4,
+        "savefig.dpi": 400,
+        "axes.linewidth": 0.6,
+        "xtick.major.width": 0.6,
+        "ytick.major.width": 0.6,
+        "mathtext.fontset": "stix",
+    },
+}
+_SHARED = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": "#e4e4e4",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,
+    "figure.facecolor": "white",
+    "axes.titlesize": "medium",
+}
+_SCALE = {"light": 1.0, "print": 0.62}
+
+
+@contextmanager
+def drawing(style: str) -> Iterator[Any]:
+    """matplotlib.pyplot in one of `STYLES`, without a window.
+
+    Raises:
+        ValueError: there is no such style.
+        MissingPackage: matplotlib is not installed.
+    """
+    if style not in STYLES:
+        raise ValueError(f"unknown style {style!r}: allowed are {', '.join(STYLES)}")
+    need("matplotlib").use("Agg")
+    plt = need("matplotlib.pyplot")
+    with plt.rc_context(_SHARED | _RC[style]):
+        try:
+            yield plt
+        finally:
+            plt.close("all")
+
+
+def inches(style: str, width: float, height: float) -> tuple[float, float]:
+    """Size of a figure, given for a screen, in a style."""
+    return width * _SCALE[style], height * _SCALE[style]
+
+
+def agent_colour(name: str, place: int = 0) -> str:
+    """Colour of an agent: that of its memory, or a spare one by its place in the figure."""
+    memory = name.lower().split()[0].rpartition("-")[2]
+    return AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
+
+
+def whiskers(low: Any, value: Any, high: Any) -> Any:
+    """Lengths of error bars [2, n] for matplotlib; 0 where there is no interval."""
+    import numpy as np
+
+    ends = np.array([np.asarray(value) - np.asarray(low), np.asarray(high) - np.asarray(value)])
+    return np.nan_to_num(np.maximum(ends, 0.0))
+
+
+def footnote(figure: Any, text: str) -> None:
+    """What stands under a figure: how many, and which interval; wrapped to the width of the figure."""
+    label = figure.supxlabel(" ", fontsize="small", color=NEUTRAL)
+    letters = int(figure.get_figwidth() * 72 / (0.56 * label.get_fontsize()))
+    label.set_text("\n".join(line for part in text.split("\n") for line in textwrap.wrap(part, letters)))
+
+
+def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:
+    """How many seeds, which interval, and what it is worth.
+
+    Args:
+        seeds: number of seeds behind each value.
+        confidence: nominal.
+        what: how the interval is drawn.
+
+    Example:
+        >>> seeds_note([1], 0.95)
+        'n = 1 seed, no interval (needs two)'
+    """
+    from arcade_torch.tools.analysis.bootstrap import seed_coverage
+
+    low, high = min(seeds), max(seeds)
+    count = f"n = {low} seed{'s' * (low > 1)}" if low == high else f"n = {low} to {high} seeds"
+    if high < 2:
+        return f"{count}, no interval (needs two)"
+    share = seed_coverage(max(low, 2), confidence)
+    return (
+        f"{count}; {what}: {100 * confidence:g} % bootstrap interval over seeds, "
+        f"measured coverage with {max(low, 2)} seeds {100 * share:.0f} %"
+    )
+
+
+def save(
+    figure: Any,
+    base: Path,
+    rows: Sequence[Mapping[str, Any]] = (),
+    arrays: Mapping[str, Any] | None = None,
+) -> list[Path]:
+    """Write a figure as PDF and PNG, and its numbers beside it.
+
+    Args:
+        figure: from matplotlib.
+        base: path without ending.
+        rows: numbers for a CSV file.
+        arrays: numbers for an npz file.
+
+    Returns:
+        What was written.
+    """
+    written = []
+    for ending in (".pdf", ".png"):
+        buffer = BytesIO()
+        figure.savefig(buffer, format=ending[1:])
+        written.append(write_bytes(base.with_name(base.name + ending), buffer.getvalue()))
+    if rows:
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        written.append(write_csv(base.with_name(base.name + ".csv"), rows, columns))
+    if arrays:
+        written.append(write_npz(base.with_name(base.name + ".npz"), arrays))
+    return written
