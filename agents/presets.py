@@ -25,7 +25,6 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core with PQN.
       Time limits end like terminations: what comes after them is no part of the score. Which of the two learns better
       in runs this short is not settled.
-    * ``demo``: ``small`` on MineSweeperEasy for 400 k frames.
     * ``smoke``: ``small`` cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -155,9 +154,6 @@ _PRESETS: dict[str, TrainConfig] = {
         dqn=DQNConfig(time_limit="terminal", targets="stored"),
     ),
     "small": _SMALL,
-    "demo": dataclasses.replace(
-        _SMALL, env="MineSweeperEasy", total_frames=400_000, eval_every=80_000, checkpoint_every=40_000
-    ),
     "smoke": dataclasses.replace(
         _SMALL,
         total_frames=512,

@@ -23,7 +23,7 @@ _WHOLE = re.compile(r"\d+(\.\d*)?[eE]\+?\d+")
 class Train:
     """Train one agent into a run folder: settings, logs, checkpoints, final evaluation.
 
-    Options start from a preset (paper, reference, small, demo, smoke); the resolved settings are kept in the folder's
+    Options start from a preset (paper, reference, small, smoke); the resolved settings are kept in the folder's
     config.json. Numbers of the learner are --pqn.*, --ppo.* or --dqn.*, whichever --algorithm names.
 
     Example: arcade-torch train --preset small --env MineSweeperEasy --observability partial --out runs/one
