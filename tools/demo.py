@@ -7,7 +7,7 @@ from pathlib import Path
 from arcade_torch.tools.studies.grid import Study
 from arcade_torch.tools.studies.progress import clock
 
-GAME = "SignpostMedium"
+GAME = "SignpostEasy"
 FRAMES = 100_000
 
 
@@ -38,7 +38,7 @@ def demo_study(frames: int = FRAMES, seeds: int = 4, game: str = GAME) -> Study:
 
 
 _QUESTIONS = {
-    "SignpostMedium": (
+    "SignpostEasy": (
         "A sign says which of four ways to take at the end of a corridor. Does a memory let an agent take it when the "
         "sign is shown in the first frame alone (POMDP), and what does memory cost where the sign stays in view (MDP)? "
         "Whoever forgets the sign can expect a return of 0.25 and no more."

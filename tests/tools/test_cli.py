@@ -137,7 +137,7 @@ def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], m
 
     monkeypatch.setattr(command.Demo, "run", interrupted)
     said = one_error(capsys, ["demo", "--frames", "4096", "--out", "runs/a b"], cli.EXIT_INTERRUPTED)
-    again = "arcade-torch demo --game SignpostMedium --frames 4096 --seeds 4 --out 'runs/a b'"
+    again = "arcade-torch demo --game SignpostEasy --frames 4096 --seeds 4 --out 'runs/a b'"
     assert f"go on from their checkpoints with: {again}" in said
 
 

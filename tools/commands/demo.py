@@ -16,7 +16,7 @@ class Demo:
     Example: arcade-torch demo --game MineSweeperEasy --frames 400000 --seeds 2 --out runs/mines
     """
 
-    game: str = "SignpostMedium"
+    game: str = "SignpostEasy"
     """Game to play; of the ten, MineSweeperEasy learns something in 400000 frames."""
     frames: int = 100_000
     """Environment steps of each run."""
