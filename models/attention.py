@@ -92,7 +92,8 @@ def window_attention(
     """Attend to the last ``window`` steps of the same episode.
 
     Queries are taken in blocks, each of which sees one stretch of window - 1 + block keys, so the mask and the weights
-    need O(T (window + block)) numbers, and the angles O(window + block).
+    need O(T (window + block)) numbers, and the angles O(window + block). A NaN or infinity among the values reaches the
+    queries that see it and no others.
 
     Args:
         query: float [B, T, H].
@@ -116,6 +117,9 @@ def window_attention(
     if spare:
         query, key, value = (F.pad(x, (0, 0, 0, spare)) for x in (query, key, value))
         episode = F.pad(episode, (0, spare), value=-2)
+    bad = ~value.sum(-1).isfinite() if length > 1 else None  # acting: what is not seen has been zeroed
+    if bad is not None:
+        value = value.masked_fill(bad.unsqueeze(-1), 0)  # a weight of zero would not stop it
     queries = rotate(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
     keys, values = (x.unfold(1, stretch, size).mT for x in (key, value))
     episodes = episode.unfold(1, stretch, size)
@@ -123,6 +127,8 @@ def window_attention(
     seen = (distance >= 0) & (distance < window) & (episodes[..., past:, None] == episodes[..., None, :])
     # Spelled out: on a CPU as fast as scaled_dot_product_attention with a mask, which vmap runs row by row.
     score = queries / math.sqrt(query.shape[-1]) @ rotate(keys, cosine, sine).mT
+    if bad is not None:
+        score = score + torch.where(bad, torch.nan, 0.0).to(score.dtype).unfold(1, stretch, size).unsqueeze(-2)
     y = torch.where(seen, score, -torch.inf).softmax(-1) @ values
     return y.flatten(1, 2)[:, :length]
 

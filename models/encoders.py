@@ -24,6 +24,8 @@ class Encoder(nn.Module):
     def __init__(self, obs_size: int, stored_size: int, feature_size: int) -> None:
         super().__init__()
         self.obs_size, self.stored_size, self.feature_size = obs_size, stored_size, feature_size
+        self.amp = False
+        """Whether convolutions and products are taken in bfloat16; weights and features stay as they are."""
 
     def compress(self, pixels: Tensor) -> Tensor:
         """The part of a frame that the encoder looks at; here the frame itself.
@@ -52,7 +54,13 @@ class Encoder(nn.Module):
             ValueError: the last three dimensions are neither.
         """
         frames = self._frames(pixels)
-        return self.features(frames).reshape(*pixels.shape[:-3], self.feature_size)
+        if self.amp:
+            with torch.autocast(frames.device.type, torch.bfloat16):
+                features = self.features(frames)
+            features = features.to(next(self.parameters()).dtype)
+        else:
+            features = self.features(frames)
+        return features.reshape(*pixels.shape[:-3], self.feature_size)
 
     def features(self, frames: Tensor) -> Tensor:
         """Encode compressed frames [N, s, s, 3] -> [N, E]."""

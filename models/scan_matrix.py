@@ -45,8 +45,8 @@ class MatrixSteps(NamedTuple):
 def matrix_scan(steps: MatrixSteps, start: Tensor, h0: Tensor, *, chunk: int = CHUNK) -> tuple[Tensor, Tensor]:
     """Run the recurrence over a sequence, starting afresh (from zeros) wherever ``start`` is set.
 
-    Nothing finite crosses a start, nor does anything in ``h0`` cross one at index 0. (A NaN or infinity *inside* the
-    sequence does reach later episodes of its chunk: a matrix product multiplies it by zero.)
+    Nothing crosses a start, be it a NaN or infinity; one in what is written (or in ``h0``) loses the rest of its
+    episode, whose outputs and states become NaN.
 
     Args:
         steps: what each step does.
@@ -144,6 +144,7 @@ def _step(step: list[Tensor | None], state: Tensor, erase_values: bool = False) 
 def _chunked(steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
     """(o [B, T, V], the rows u [B, T, V] that were written, the last state [B, K, V])."""
     length = start.shape[1]
+    steps, h0, lost = _contained(steps, start, h0)
     count = math.ceil(length / chunk)
     size = math.ceil(length / count)
     spare = count * size - length  # steps that write, erase and forget nothing
@@ -176,7 +177,33 @@ def _chunked(steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int) -> tuple
         state = torch.baddbmm(left * state, keys, u)
     u = torch.stack(written, dim=1)
     out = attention @ u + (query * fade) @ torch.stack(befores, dim=1)
-    return out.flatten(1, 2)[:, :length], u.flatten(1, 2)[:, :length], state
+    out, u = (x.flatten(1, 2)[:, :length].masked_fill(lost, torch.nan) for x in (out, u))
+    return out, u, state.masked_fill(lost[:, -1:], torch.nan)
+
+
+def _contained(steps: MatrixSteps, start: Tensor, h0: Tensor) -> tuple[MatrixSteps, Tensor, Tensor]:
+    """Zeros for what is not finite, which a product with zero would not stop, and which steps have lost their state.
+
+    Queries stay: each has a part in its own output alone.
+
+    Returns:
+        (steps, h0, bool [B, T, 1]: something since the episode began was not finite).
+    """
+    _, key, value, erase, log_decay = steps
+    total = key.sum(-1) + value.sum(-1)
+    if erase is not None:
+        total = total + erase.squeeze(-1)
+    if log_decay is not None:
+        total = total + log_decay.exp().squeeze(-1)
+    bad, bad_h0 = ~total.isfinite(), ~h0.sum((-1, -2)).isfinite()
+    index = torch.arange(start.shape[1], device=start.device)
+    last_bad = torch.where(bad, index, -1 - (~bad_h0).long().unsqueeze(-1)).cummax(dim=1).values
+    lost = last_bad >= torch.where(start, index, -1).cummax(dim=1).values
+    bad = bad.unsqueeze(-1)
+    key, value = key.masked_fill(bad, 0), value.masked_fill(bad, 0)
+    erase, log_decay = (None if x is None else x.masked_fill(bad, 0) for x in (erase, log_decay))
+    h0 = h0.masked_fill(bad_h0[:, None, None], 0)
+    return MatrixSteps(steps.query, key, value, erase, log_decay), h0, lost.unsqueeze(-1)
 
 
 def _decays(episode: Tensor, log_decay: Tensor | None, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arcade_torch.tools.files import read_csv, write_csv, write_text
+from arcade_torch.tools.files import read_csv, write_between, write_csv
 
 PLAYERS = ("random", "state", "frames")
 """Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
@@ -139,11 +138,7 @@ def insert(page: Path, table: str) -> Path:
     Raises:
         ValueError: the page has no such marks.
     """
-    text = page.read_text(encoding="utf-8")
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"{page} needs one line {BEGIN!r} and one line {END!r}; the table goes between them")
-    between = re.compile(f"(?<={re.escape(BEGIN)}).*(?={re.escape(END)})", re.DOTALL)
-    return write_text(page, between.sub(lambda _: f"\n\n{table}\n\n", text))
+    return write_between(page, BEGIN, END, table)
 
 
 def _plain(row: Baseline) -> dict[str, object]:

@@ -40,6 +40,25 @@ def write_text(path: Path, text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
+def write_between(page: Path, begin: str, end: str, text: str) -> Path:
+    """Put text between two marks of a page, in the place of what stood there.
+
+    Args:
+        page: an existing file in UTF-8.
+        begin: the first mark, which the page holds once.
+        end: the second one.
+        text: goes between them, with an empty line on both sides.
+
+    Raises:
+        ValueError: the page has no such marks.
+    """
+    old = page.read_text(encoding="utf-8")
+    if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
+        raise ValueError(f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes between them")
+    before, after = old.partition(begin)[0], old.partition(end)[2]
+    return write_text(page, f"{before}{begin}\n\n{text}\n\n{end}{after}")
+
+
 def write_json(path: Path, value: Any) -> Path:
     """Write JSON atomically, indented, with a final newline."""
     return write_text(path, json.dumps(value, indent=2, default=str) + "\n")

@@ -7,6 +7,7 @@ import arcade_torch
 from arcade_torch.agents.actor import EpsilonGreedyActor
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.targets import q_lambda_return
+from arcade_torch.models import memory_names
 from arcade_torch.models.networks import make_network
 from tests.agents.fakes import Stream, replay
 
@@ -31,7 +32,7 @@ def collect(env, memory, context, windows=2, final_frames="all"):
     return network, batch
 
 
-@pytest.mark.parametrize("memory", ["lru", "mingru", "gru", "mlp"])
+@pytest.mark.parametrize("memory", memory_names())
 @pytest.mark.parametrize("context", [0, 4])
 def test_q_values_of_acting_and_learning_agree(env, memory, context):
     network, batch = collect(env, memory, context)
@@ -42,7 +43,7 @@ def test_q_values_of_acting_and_learning_agree(env, memory, context):
     assert batch["q_value"].std() > 1e-4
 
 
-@pytest.mark.parametrize("memory", ["lru", "mingru", "gru"])
+@pytest.mark.parametrize("memory", [name for name in memory_names() if name != "mlp"])
 def test_targets_at_truncations_equal_a_step_by_step_replay_of_the_true_frames(env, memory):
     network, batch = collect(env, memory, context=4)
     terminated, truncated = (batch["next", k].squeeze(-1) for k in ("terminated", "truncated"))

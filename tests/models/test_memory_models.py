@@ -124,6 +124,26 @@ def test_what_was_before_a_start_has_exactly_no_influence(name, start):
     assert all(torch.equal(changed_after[key], leaf) for key, leaf in after.items())
 
 
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", NAMES)
+@torch.no_grad()
+def test_not_even_a_nan_or_infinity_crosses_a_start(name, bad):
+    memory, x, state, flags = problem(name, 3, 60, torch.float32, resets=0.0)
+    flags[:2, [20, 45]] = True
+    clean, clean_after = memory(x, state, flags)
+    x, poisoned = x.clone(), state.clone()
+    x[0, 30, 2] = bad
+    for leaf in poisoned.values():
+        if leaf.is_floating_point():
+            leaf[1] = bad
+    y, after = memory(x, poisoned, flags)
+    assert torch.equal(y[0, :30], clean[0, :30]) and torch.equal(y[:2, 45:], clean[:2, 45:])
+    assert torch.equal(y[1, 20:], clean[1, 20:]) and torch.equal(y[2], clean[2])
+    assert all(torch.equal(after[key], leaf) for key, leaf in clean_after.items())
+    if bad != bad:
+        assert y[0, 30].isnan().any() and (name == "mlp" or y[1, :20].isnan().any())
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_parameters_under_vmap_equals_one_model_after_another(name):
     models = [make_memory(name, 3, 6).double() for _ in range(3)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from arcade_torch.tools.bench.timing import Measure, interleaved
+from arcade_torch.tools.bench.timing import Measure, interleaved, no_check, torch_threads
 
 __all__ = ["MemoryCost", "MemoryTime", "memory_cost", "time_memories"]
 
@@ -73,18 +73,12 @@ def time_memories(names: Sequence[str], size: int, *, seconds: float = 0.3, repe
     Returns:
         name -> times.
     """
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        measures = {}
+    measures = {}
+    with torch_threads(1):
         for name in names:
-            measures[f"act {name}"] = Measure(_work(name, size, 1, False), _no_check, BATCH)
-            measures[f"learn {name}"] = Measure(_work(name, size, STEPS, True), _no_check, BATCH * STEPS)
+            measures[f"act {name}"] = Measure(_work(name, size, 1, False), no_check, BATCH)
+            measures[f"learn {name}"] = Measure(_work(name, size, STEPS, True), no_check, BATCH * STEPS)
         found = interleaved(measures, seconds, repeats)
-    finally:
-        torch.set_num_threads(threads)
     best = {key: 1e6 / max(measured.rates) for key, measured in found.items()}
     return {name: MemoryTime(best[f"act {name}"], best[f"learn {name}"]) for name in names}
 
@@ -108,8 +102,3 @@ def _work(name: str, size: int, steps: int, learn: bool) -> Callable[[], object]
         return y
 
     return work
-
-
-def _no_check(_: object) -> int:
-    """Eager torch computes what it is asked for; there is nothing to consume."""
-    return 0

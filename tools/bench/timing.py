@@ -1,9 +1,23 @@
 """Timing that interleaves what it compares, so that a slow minute of the machine hits all of it alike."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many threads inside, and as many as before afterwards."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass
@@ -48,13 +62,21 @@ class Measure:
     units: int
 
 
-def interleaved(measures: Mapping[str, Measure], seconds: float, repeats: int) -> dict[str, Measured]:
+def no_check(_: object) -> int:
+    """The check of eager torch on a CPU, which computes all that it is asked for: there is nothing to consume."""
+    return 0
+
+
+def interleaved(
+    measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 2
+) -> dict[str, Measured]:
     """Time several measures in turns.
 
     Args:
-        measures: name -> measure; each is warmed up twice first.
+        measures: name -> measure.
         seconds: time for each measure in each repeat.
         repeats: turns.
+        warm_ups: how often each is done before, untimed.
 
     Returns:
         name -> what was measured.
@@ -65,7 +87,7 @@ def interleaved(measures: Mapping[str, Measure], seconds: float, repeats: int) -
     if seconds <= 0 or repeats < 1:
         raise ValueError(f"seconds must be above 0 and repeats at least 1, got {seconds} and {repeats}")
     for measure in measures.values():
-        for _ in range(2):
+        for _ in range(warm_ups):
             measure.check(measure.work())
     found = {name: Measured([], []) for name in measures}
     for _ in range(repeats):

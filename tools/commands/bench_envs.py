@@ -1,5 +1,6 @@
 """``arcade-torch bench envs``."""
 
+import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,12 +53,33 @@ class BenchEnvs:
                     [_cells(row, NAMES) for row in chosen],
                     left=2,
                 )
+        self._summary(rows, games)
         print("frames/s without the checksum's time, and with it; medians of", self.repeats, "turns")
         print(", ".join(f"{name} {value}" for name, value in about.items() if value))
         if self.out is not None:
             _save(self.out, as_dicts(rows), about)
             print(self.out)
         return 0
+
+    def _summary(self, rows: Sequence[Any], games: Sequence[str]) -> None:
+        """Print one line a game: its rate at the batch size nearest to 128, and what its first call costs."""
+        from arcade_torch.tools.bench.first_call import first_call
+
+        count = min(self.batches, key=lambda batch: abs(batch - 128))
+        for size in self.sizes:
+            _tell(f"first calls at {size} px")
+            drawn = [r for r in rows if (r.obs_size, r.num_envs, r.measure) == (size, count, "step+draw")]
+            firsts = [first_call(game, size, count) for game in games]
+            lines = [
+                (row.game, f"{row.frames_per_s:,.0f}", f"{first.compile_s:.1f} s", f"{first.share_of_frames:.2f}")
+                for row, first in zip(drawn, firsts, strict=True)
+            ]
+            mean = statistics.geometric_mean(row.frames_per_s for row in drawn)
+            show_table(
+                f"step, auto-reset and drawing, {count} envs, {size} px",
+                ("game", "frames/s", "trace and compile", "working memory / frames"),
+                [*lines, ("geometric mean", f"{mean:,.0f}", "", "")],
+            )
 
 
 COMMAND = BenchEnvs

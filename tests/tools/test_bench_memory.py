@@ -1,0 +1,69 @@
+"""`arcade-torch bench memory`: what is compared computes the same, and memory is counted exactly."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from arcade_torch.models import linear_scan, lru
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, forms, looped, peak_bytes
+from arcade_torch.tools.bench.scans import FORMS, unbind_loop
+from arcade_torch.tools.files import read_csv
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.complex128])
+@pytest.mark.parametrize("name", FORMS)
+def test_every_form_of_the_scan_gives_the_same_values_and_gradients(name: str, dtype: torch.dtype) -> None:
+    a, b = (torch.randn(2, 11, 3, dtype=dtype, requires_grad=True) for _ in "ab")
+    weight = torch.randn(2, 11, 3, dtype=dtype)
+    h, expected = FORMS[name](a, b), linear_scan(a, b)
+    torch.testing.assert_close(h, expected)
+    for ours, theirs in zip(
+        torch.autograd.grad(h, (a, b), weight), torch.autograd.grad(expected, (a, b), weight), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_model_and_the_same_with_its_loop_agree(name: str) -> None:
+    compared = forms([name], 2, 9)
+    x, is_init = torch.randn(2, 20, 9), torch.rand(2, 20) < 0.1
+    torch.testing.assert_close(compared[name, "scan"](x, is_init), compared[name, "loop"](x, is_init))
+    assert compared[TORCH_GRU, "torch"](x, is_init).shape == (2, 20, 9)
+
+
+def test_the_loop_is_the_scan_inside_only() -> None:
+    with pytest.raises(RuntimeError), looped("lru"):
+        assert lru.linear_scan is unbind_loop
+        raise RuntimeError
+    assert lru.linear_scan is linear_scan
+
+
+def test_peak_memory_is_what_was_held_at_a_time_and_not_what_was_allocated() -> None:
+    def work() -> object:
+        for _ in range(5):
+            x = torch.zeros(1000)
+            y = x + 1
+            del x, y
+        return None
+
+    assert 8000 <= peak_bytes(work) < 8200
+
+
+def test_the_command_prints_both_tables_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["bench", "memory", "mingru", "gru", "--steps", "6", "--layers", "1", "--size", "8", "--seconds", "0.001"]
+    assert cli.main([*words, "--repeats", "1", "--out", str(tmp_path / "m")]) == cli.EXIT_OK
+    out = capsys.readouterr().out
+    assert "torch threads: 1" in out and "torch.nn.GRU" in out and "serial operator (in use)" in out
+    rows = read_csv(tmp_path / "m_models.csv")
+    assert [(row["model"], row["form"]) for row in rows] == [
+        ("mingru", "scan"),
+        ("mingru", "loop"),
+        ("gru", "own"),
+        (TORCH_GRU, "torch"),
+    ]
+    assert all(float(row[key]) > 0 for row in rows for key in ("forward_ms", "both_ms", "peak_mib"))
+    scans = read_csv(tmp_path / "m_scans.csv")
+    assert len(scans) == 2 * len(FORMS) and all(float(row["error"]) < 1e-3 for row in scans)
+    assert cli.main([*words, "--threads", "0"]) == cli.EXIT_BAD_INPUT

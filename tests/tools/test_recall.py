@@ -1,0 +1,104 @@
+"""Delayed recall: what is asked can be known, who has no memory guesses, and windows reach as far as theory says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arcade_torch.models import MemoryBlock, memory_names
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench import recall
+from arcade_torch.tools.bench.recall import ASK, CAPACITY, UNLABELLED, Entry, Recall, Setting, train, windows
+
+QUICK = Setting(hidden_size=32, seconds=20, answers=400)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize("delay", [1, 4, 32])
+def test_the_answer_is_the_symbol_at_the_last_start_and_distractors_stand_between(delay: int, mixed: bool) -> None:
+    batch = windows(np.random.default_rng(0), 64, delay, mixed=mixed)
+    waits = []
+    for tokens, is_init, answers in zip(batch.tokens, batch.is_init, batch.answers, strict=True):
+        starts = is_init.nonzero().flatten()
+        assert starts[0] == 0
+        for asked in (answers != UNLABELLED).nonzero().flatten():
+            begin = starts[starts <= asked][-1]
+            assert tokens[asked] == ASK and answers[asked] == tokens[begin] < 4
+            between = tokens[begin + 1 : asked]
+            assert ((between >= 4) & (between < ASK)).all()
+            waits.append(len(between))
+            assert asked == len(tokens) - 1 or is_init[asked + 1]
+        assert (tokens < 4).eq(is_init).all() and (tokens == ASK).eq(answers != UNLABELLED).all()
+    assert max(waits) == delay and (min(waits) == delay) is (delay == 1 or not mixed)
+
+
+def test_a_quarter_of_the_episodes_ends_before_the_question_and_symbols_are_even() -> None:
+    batch = windows(np.random.default_rng(1), 4000, 4)
+    first_asked = batch.answers[:, 5] != UNLABELLED
+    in_time = first_asked & ~batch.is_init[:, 1:6].any(1)
+    assert in_time.double().mean() == pytest.approx(0.75, abs=0.03)
+    shares = torch.bincount(batch.answers[batch.answers != UNLABELLED]) / (batch.answers != UNLABELLED).sum()
+    assert shares.numpy() == pytest.approx(np.full(4, 0.25), abs=0.03)
+    with pytest.raises(ValueError, match="at least 1 step, got 0"):
+        windows(np.random.default_rng(0), 2, 0)
+
+
+def test_one_model_learns_it() -> None:
+    row = train(Entry("mingru"), 4, QUICK)
+    assert row.solved and row.answers >= 400 and row.steps % QUICK.check_every == 0
+    assert row.state_numbers == 32
+
+
+def test_the_stateless_cell_guesses() -> None:
+    row = train(Entry("mlp"), 4, Setting(hidden_size=16, seconds=0.5, answers=1000))
+    assert row.accuracy < 0.32 and not row.solved and row.state_numbers == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in memory_names() if name != "mlp"])
+def test_every_memory_remembers_for_eight_steps(name: str) -> None:
+    assert train(Entry(name), 8, Setting(seconds=60)).solved
+
+
+@pytest.mark.parametrize(("entry", "delay"), CAPACITY, ids=str)
+def test_the_question_is_out_of_reach_exactly_where_theory_says(entry: Entry, delay: int) -> None:
+    block = MemoryBlock(3, 8, "attention", layers=entry.layers, memory_options=dict(entry.options))
+    x, is_init = torch.randn(1, delay + 2, 3, requires_grad=True), torch.zeros(1, delay + 2, dtype=torch.bool)
+    y, _ = block(x, block.initial_state(1), is_init)
+    (gradient,) = torch.autograd.grad(y[:, -1].square().sum(), x)
+    in_reach = entry.layers * (entry.options["window"] - 1) >= delay + 1
+    assert bool((gradient[:, 0] != 0).any()) is in_reach
+
+
+def test_the_command_keeps_its_rows_and_writes_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, out = tmp_path / "page.md", tmp_path / "r.csv"
+    page.write_text(f"before\n{recall.BEGIN}old{recall.END}\nafter\n")
+    words = ["bench", "recall", "gdn", "--delays", "1", "2", "--hidden-size", "8", "--seconds", "0.2"]
+    words += ["--out", str(out), "--page", str(page)]
+    threads = torch.get_num_threads()
+    assert cli.main(words) == cli.EXIT_OK
+    assert torch.get_num_threads() == threads and "training gdn, delay 2" in capsys.readouterr().err
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
+    assert "| `gdn` | " in text and "| delay 1 | delay 2 |" in text
+    monkeypatch.setattr(recall, "train", None)
+    assert cli.main(words) == cli.EXIT_OK and page.read_text() == text
+    out.write_text("a,b\n1,2\n")
+    assert cli.main(words) == cli.EXIT_BAD_INPUT
+    assert "is no table of delayed recall" in capsys.readouterr().err
+    assert cli.main(["bench", "recall", "--seconds", "0"]) == cli.EXIT_BAD_INPUT
+
+
+def test_the_table_says_what_was_not_solved() -> None:
+    rows = [
+        Recall("lru", 8, 64, 0, 0.995, 2000, 50, 0.3, 100, 128),
+        Recall("mlp", 8, 64, 0, 0.25, 2000, 900, 120.0, 90, 0),
+        Recall("lru", 32, 64, 0, 1.0, 2000, 75, 1.6, 100, 128),
+    ]
+    assert recall.markdown(rows).splitlines()[2:] == [
+        "| `lru` | 99.5 % (50 steps, 0.3 s) | 100.0 % (75 steps, 1.6 s) | 100 | 128 |",
+        "| `mlp` | 25.0 % (not solved: 900 steps, 120 s) |  | 90 | 0 |",
+    ]
