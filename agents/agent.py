@@ -9,6 +9,7 @@ from torch import Tensor
 from arcade_torch.agents.algorithms import ALGORITHMS, Network
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.models.actor_critic import ActorCriticNetwork
+from arcade_torch.models.encoders import Encoder
 
 
 @dataclass(frozen=True)
@@ -88,4 +89,7 @@ def build_network(config: TrainConfig) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(config.seed)
         network = make(config.network, memory=config.memory, obs_size=config.obs_size, **dict(config.network_options))
+    for module in network.modules():
+        if isinstance(module, Encoder):
+            module.amp = config.amp
     return network.to(config.device)

@@ -13,7 +13,7 @@ from arcade_torch.agents.ppo import PPOConfig
 from arcade_torch.agents.pqn import PQNConfig
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
-RESUME_MAY_CHANGE = ("checkpoint_every", "threads")  # fields that do not belong to a run's identity
+RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
 """The algorithms, and the class of the field with their numbers."""
 
@@ -49,6 +49,9 @@ class TrainConfig:
     """Seed of everything random in the run, in [0, 2**30)."""
     device: str = "cpu"
     """Torch device of the network and the learner."""
+    amp: bool = False
+    """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the rest stays float32.
+    Agents act as they were trained."""
     threads: int = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
     eval_every: int = 1_000_000
@@ -57,6 +60,9 @@ class TrainConfig:
     """Episodes of each evaluation, one in each of as many fresh environments."""
     checkpoint_every: int = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""
+    logger: Literal["none", "tensorboard", "wandb"] = "none"
+    """Where the rows of ``metrics.csv`` and ``eval.csv`` go beside the files; needs the extra ``loggers``.
+    ``"wandb"`` works offline (``wandb sync`` uploads) unless the environment says ``WANDB_MODE=online``."""
     pqn: PQNConfig = field(default_factory=PQNConfig)
     """Numbers of the PQN learner."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -76,6 +82,8 @@ class TrainConfig:
         require(self.observability in twins, "observability", self.observability, "'full', 'partial' or 'mixed'")
         require(self.rules in ("default", "reference"), "rules", self.rules, "'default' or 'reference'")
         require(self.algorithm in GROUPS, "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
+        loggers = ("none", "tensorboard", "wandb")
+        require(self.logger in loggers, "logger", self.logger, "'none', 'tensorboard' or 'wandb'")
         require(self.obs_size >= 1, "obs_size", self.obs_size, "a number of pixels >= 1")
         require(0 <= self.seed < SEED_LIMIT, "seed", self.seed, f"in [0, {SEED_LIMIT})")
         for name in ("threads", "eval_every", "checkpoint_every"):
@@ -162,6 +170,8 @@ def coerce(name: str, value: Any, kind: Any) -> Any:
         return float(value)
     if kind is str:
         require(isinstance(value, str), name, value, "a string")
+    if kind is bool:
+        require(isinstance(value, bool), name, value, "true or false")
     return value
 
 

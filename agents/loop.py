@@ -21,6 +21,7 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
 from arcade_torch.agents.files import CsvLog, read_csv, write_json
 from arcade_torch.agents.learner import NonFiniteError
+from arcade_torch.agents.loggers import RunLogger, check_logger, open_logger
 from arcade_torch.agents.metrics import paper_score
 from arcade_torch.agents.run_folder import RunFolder
 from arcade_torch.agents.trainer import Trainer
@@ -63,7 +64,8 @@ def train(
         run_dir: folder of the run; must be empty or absent unless ``resume``.
         resume: go on with the run in the folder (from the start if it has no checkpoint yet); a finished run returns
             its result at once, an absent one is started.
-        progress: called after every update with the row of ``metrics.csv`` and ``total_frames``.
+        progress: called after every update with the row of ``metrics.csv``, ``total_frames``, and ``eval_return``, the
+            mean of the last greedy evaluation (None before the first).
 
     Returns:
         How it ended.
@@ -72,18 +74,22 @@ def train(
         RunFolderError: the folder is taken, holds another run, or cannot be written. Nothing was changed.
         CheckpointError: ``resume`` found only damaged checkpoints.
         NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last checkpoint is good.
+        LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
         ValueError: the game, the memory model or the network does not exist.
     """
     config = dataclasses.replace(config, env=resolve_id(config.env))
     folder = RunFolder(Path(run_dir))
     folder.check(config, resume)
+    check_logger(config.logger)
     if (result := folder.finished()) is not None:
         return _result_from(folder.path, result)
     with _threads(config.threads):
         trainer = Trainer(config, folder.replay)
         try:
-            folder.claim(config)
-            return _Run(config, folder, trainer, progress).go()
+            with folder.claim(config):
+                if (result := folder.finished()) is not None:  # by another process, a moment ago
+                    return _result_from(folder.path, result)
+                return _Run(config, folder, trainer, progress).go()
         finally:
             trainer.close()
 
@@ -94,6 +100,8 @@ class _Run:
     def __init__(self, config: TrainConfig, folder: RunFolder, trainer: Trainer, progress: Progress | None) -> None:
         self.config, self.folder, self.trainer, self.progress = config, folder, trainer, progress
         self.eval_env: Any = None
+        self.logger = RunLogger()
+        self.last_eval: float | None = None
         self.saved_at = -1
 
     def go(self) -> TrainResult:
@@ -101,6 +109,7 @@ class _Run:
         trainer = self.trainer
         self._start()
         metrics, evals = self.folder.open_logs(trainer.frames)
+        self.logger = open_logger(self.config, self.folder.path, trainer.frames)
         self._report("running")
         try:
             with _stop_signals() as stopped:
@@ -123,6 +132,7 @@ class _Run:
         finally:
             metrics.close()
             evals.close()
+            self.logger.close()
 
     def _start(self) -> None:
         """From the newest whole checkpoint, or from the beginning."""
@@ -140,13 +150,14 @@ class _Run:
         trainer = self.trainer
         row = trainer.update()
         metrics.append(row)
+        self.logger.log("train", row)
         if self._crossed(self.config.eval_every) and not trainer.done:
             self._evaluate(evals)
         if self._crossed(self.config.checkpoint_every):
             self._save()
         self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
         if self.progress is not None:
-            self.progress(row | {"total_frames": trainer.total_frames})
+            self.progress(row | {"total_frames": trainer.total_frames, "eval_return": self.last_eval})
 
     def _crossed(self, every: int) -> bool:
         """Whether the last update passed a multiple of ``every`` frames."""
@@ -158,13 +169,17 @@ class _Run:
             self.eval_env = make_eval_env(self.config, self.config.eval_episodes)
         agent = Agent(self.config, self.trainer.network, self.trainer.frames)
         result = evaluate(agent, env=self.eval_env)
-        evals.append({"frames": agent.frames, "mean": result.mean, "std": result.std, "n": len(result.returns)})
+        row = {"frames": agent.frames, "mean": result.mean, "std": result.std, "n": len(result.returns)}
+        evals.append(row)
+        self.logger.log("eval", row)
+        self.last_eval = result.mean
         return result
 
     def _save(self) -> None:
         trainer = self.trainer
         if self.saved_at == trainer.frames:
             return
+        self.folder.lease.confirm()
         weights = trainer.network.state_dict()
         save_checkpoint(self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict())
         self.saved_at = trainer.frames

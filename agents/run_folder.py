@@ -3,6 +3,7 @@
 import importlib.metadata
 import os
 import platform
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import arcade_torch
 from arcade_torch.agents.config import TrainConfig, differing_fields
 from arcade_torch.agents.files import CsvLog, read_json, write_json
+from arcade_torch.agents.lease import LOCK, Lease
 
 METRIC_COLUMNS = (
     "frames",
@@ -59,6 +61,7 @@ class RunFolder:
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.replay = path / "replay"
+        self.lease = Lease(path / LOCK)
         self._reported = 0.0
 
     def check(self, config: TrainConfig, resume: bool) -> None:
@@ -74,27 +77,48 @@ class RunFolder:
         file = self.path / "config.json"
         if file.is_file() and resume:
             self._check_same(file, config)
-        elif self.path.is_dir() and any(self.path.iterdir()):
+        elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
             hint = "pass resume=True to continue it, or " if file.is_file() else ""
             raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
         existing = next(p for p in (self.path, *self.path.absolute().parents) if p.exists())
         if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
             raise RunFolderError(f"cannot write to {self.path}: {existing} is not a writable folder")
 
-    def claim(self, config: TrainConfig) -> None:
-        """Create the folder and write ``config.json``, unless it is there already.
+    def claim(self, config: TrainConfig) -> Lease:
+        """Create the folder, take its lock, sweep out what a killed process left half written, and write
+        ``config.json`` unless it is there already.
+
+        Returns:
+            The lock; use it as a context manager.
 
         Raises:
-            RunFolderError: the folder cannot be written.
+            RunFolderError: another process trains here, or the folder cannot be written.
         """
         file = self.path / "config.json"
-        if file.is_file():
-            return
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            write_json(file, {"config": config.to_dict(), "versions": versions(), "command": sys.argv})
+            if not self.lease.take():
+                owner = self.lease.owner() or "another process"
+                raise RunFolderError(f"{self.path} is being trained by {owner}: wait for it, or stop it")
+            self._sweep()
+            if file.is_file():
+                self._check_same(file, config)  # another process may have come first
+            else:
+                write_json(file, {"config": config.to_dict(), "versions": versions(), "command": sys.argv})
         except OSError as error:
+            self.lease.release()
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror or error}") from error
+        except BaseException:
+            self.lease.release()
+            raise
+        return self.lease
+
+    def _sweep(self) -> None:
+        """Remove drafts of files and checkpoints: only the owner of the lock writes here, and it has just begun."""
+        for draft in self.path.glob(".*.[0-9]*"):
+            draft.unlink(missing_ok=True)
+        for draft in self.checkpoints.glob(".frames-*"):
+            shutil.rmtree(draft, ignore_errors=True)
 
     def _check_same(self, file: Path, config: TrainConfig) -> None:
         try:
@@ -105,11 +129,14 @@ class RunFolder:
             raise RunFolderError(f"{self.path} holds another run; differing fields: {', '.join(fields)}")
 
     def finished(self) -> dict[str, Any] | None:
-        """The final ``eval.json`` if the run is finished."""
+        """The final ``eval.json`` if the run is finished; a damaged one is made again from the last checkpoint."""
         file = self.path / "eval.json"
         if not file.is_file():
             return None
-        result = read_json(file)
+        try:
+            result = read_json(file)
+        except ValueError:
+            return None
         return result if isinstance(result, dict) and result.get("status") == "finished" else None
 
     def open_logs(self, frames: int) -> tuple[CsvLog, CsvLog]:
@@ -121,6 +148,7 @@ class RunFolder:
 
     def report(self, frames: int, total_frames: int, status: str, **more: Any) -> None:
         """Replace ``progress.json``; while running at most about once a second."""
+        self.lease.confirm()
         now = time.monotonic()
         if status == "running" and now - self._reported < 1.0:
             return

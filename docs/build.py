@@ -21,7 +21,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     "index": ROOT / "README.md",
     "environments": ROOT / "docs/environments.md",
+    "memories": ROOT / "docs/memories.md",
     "play": ROOT / "docs/play.md",
+    "cluster": ROOT / "docs/cluster.md",
     "differences": ROOT / "docs/differences.md",
     "conformance": ROOT / "docs/conformance.md",
     "parity": ROOT / "results/parity.md",

@@ -67,6 +67,9 @@ COMMANDS: dict[str, Command] = {
     "play": Command("play", "play a game by hand, in a window or in the terminal"),
     "record": Command("record", "a GIF or MP4 of a random, scripted or trained player"),
     "bench envs": Command("bench_envs", "frames per second of the games, every frame consumed"),
+    "bench train": Command("bench_train", "frames per second of training, and where the time goes"),
+    "bench memory": Command("bench_memory", "time and memory of the memory models and of the scans behind them"),
+    "bench recall": Command("bench_recall", "delayed recall: which model remembers one symbol for how long"),
 }
 
 

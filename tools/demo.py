@@ -62,6 +62,7 @@ def demo(out: Path, study_of: Study, workers: int, command: str) -> int:
     Returns:
         Exit code: 1 if a run failed.
     """
+    from arcade_torch.tools.count_bar import CountBar
     from arcade_torch.tools.reports.build import report
     from arcade_torch.tools.studies.runner import study
 
@@ -72,7 +73,8 @@ def demo(out: Path, study_of: Study, workers: int, command: str) -> int:
         print(f"failed: {name}: {error}", file=sys.stderr)
     if not result.finished:
         return 1
-    print("drawing saliency, playing the oracles, writing the report ...", file=sys.stderr, flush=True)
-    page = report(out)
+    print("looking into the agents, playing the oracles, writing the report ...", file=sys.stderr, flush=True)
+    with CountBar() as bar:
+        page = report(out, progress=bar.update)
     print(f"report after {clock(time.monotonic() - started)}: {page.resolve()}")
     return 1 if result.errors else 0

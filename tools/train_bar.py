@@ -8,6 +8,16 @@ from typing import Any
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.studies.progress import LINE_EVERY_S, Speed, clock
 
+_SHOWN = {
+    "return {:.3f}": "train_return_ewm",
+    "of last episodes {:.3f}": "train_return_last",
+    "greedy {:.3f}": "eval_return",
+    "loss {:.3g}": "loss",
+    "epsilon {:.2f}": "epsilon",
+    "entropy {:.2f}": "entropy",
+    "lr {:.1e}": "lr",
+}
+
 
 class TrainBar:
     """Shows the rows of ``metrics.csv`` as they come; use it as a context manager and give `update` to ``train``."""
@@ -45,8 +55,7 @@ class TrainBar:
         Args:
             row: of ``metrics.csv``, with ``total_frames``.
         """
-        frames, total, score = int(row["frames"]), int(row["total_frames"]), row.get("train_return_ewm")
-        reached = "" if score is None else f"return {float(score):.3f}"
+        frames, total, reached = int(row["frames"]), int(row["total_frames"]), standing(row)
         if self._bar is not None:
             if not self._bar.total:
                 self._bar.total = total
@@ -60,4 +69,18 @@ class TrainBar:
             self._last_s = now
             left = f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
             pace = f", {speed:,.0f} frames/s" if speed > 0 else ""
-            print(f"{frames:,} of {total:,} frames{pace}{left} {reached}", file=self._stream, flush=True)
+            print(f"{frames:,} of {total:,} frames{pace}{left}; {reached}", file=self._stream, flush=True)
+
+
+def standing(row: Mapping[str, Any]) -> str:
+    """How a run stands, in a few words: returns, loss, exploration, step size; what there is not yet is left out.
+
+    Args:
+        row: of ``metrics.csv``, with ``eval_return``.
+
+    Example:
+        >>> standing({"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "epsilon": 0.2, "lr": 5e-5})
+        'return 0.500, loss 0.0123, epsilon 0.20, lr 5.0e-05'
+    """
+    found = {words: row.get(key) for words, key in _SHOWN.items()}
+    return ", ".join(words.format(float(value)) for words, value in found.items() if value is not None)

@@ -40,11 +40,18 @@ class Checker(HTMLParser):
         super().__init__()
         self.open: list[str] = []
         self.count: dict[str, int] = {}
+        self.ids: list[str] = []
+        self.wanted: set[str] = set()
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
         for name, value in attributes:
-            assert name not in ("src", "href") or str(value).startswith("data:"), f"{tag} loads {value}"
+            assert name not in ("src", "href") or str(value).startswith(("data:", "#")), f"{tag} loads {value}"
+            if name == "id":
+                assert value not in self.ids
+                self.ids.append(str(value))
+            if name == "href" and str(value).startswith("#"):
+                self.wanted.add(str(value)[1:])
         if tag not in ("meta", "br", "img", "path", "circle"):
             self.open.append(tag)
 
@@ -57,6 +64,7 @@ def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
     checker = Checker()
     checker.feed(page)
     assert not checker.open
+    assert checker.wanted <= set(checker.ids)
     assert checker.count["svg"] == 8  # greedy and training curves of two twins, four panels of gap and bias
     assert not re.search(r"https?://|@import|url\(", page)
 

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores, make_engine
+from arcade_torch.tools.studies.engine_names import make_engine
+from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Jobs, Processes, available_cores
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from arcade_torch.tools.studies.progress import Display, Speed, Watcher
@@ -28,8 +29,9 @@ class Fabricator:
         self.runs, self.fail, self.stop_after = {run.name: run for run in what.runs()}, fail, stop_after
         self.done: list[str] = []
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+    def run(self, jobs: Jobs) -> Iterator[JobResult]:
         for job in jobs:
+            assert job is not None
             if len(self.done) == self.stop_after:
                 raise KeyboardInterrupt
             assert job.words[-1] == "--resume"
@@ -83,7 +85,7 @@ def test_a_study_is_read_from_toml_and_its_settings_become_options(tmp_path: Pat
     words = " ".join(what.arguments(what.runs()[0], Path("here")))
     assert words == (
         "train --preset paper --env CartPoleEasy --observability full --memory mlp --algorithm pqn --seed 0 "
-        "--total-frames 4096 --eval-every 512 --pqn.learning-rate 0.001 --env-option wind=True --out here"
+        "--total-frames 4096 --threads 1 --eval-every 512 --pqn.learning-rate 0.001 --env-option wind=True --out here"
     )
 
 
@@ -175,16 +177,47 @@ def test_versions_of_the_first_runs_stay_on_record(tmp_path: Path, monkeypatch: 
     assert record["command"] == "second" and len(record["runs"]) == 12
 
 
-def test_two_processes_cannot_work_on_one_study(tmp_path: Path) -> None:
-    fcntl = pytest.importorskip("fcntl")
-    with (tmp_path / ".s.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(FileExistsError, match="another process"):
-            carry_out(small_study(), tmp_path / "s", Fabricator(small_study()))
-
-
 def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
     return [Job(f"job{i}", (textwrap.dedent(text),), tmp_path / f"job{i}.log") for i, text in enumerate(scripts)]
+
+
+def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_path: Path) -> None:
+    what = small_study()
+    rows = carry_out(what, tmp_path / "s", Fabricator(what))
+    assert "seconds" not in rows[0]
+    assert {row["run"]: row["seconds"] for row in read_csv(tmp_path / "s" / "timings.csv")} == {
+        run.name: "95.0" for run in what.runs()
+    }
+
+
+def test_sizes_are_an_axis_of_their_own_that_the_memory_free_agent_does_not_have() -> None:
+    what = small_study(sizes=["1x64", "2x128"], seeds=1)
+    assert [run.agent for run in what.runs() if run.observability == "full"] == ["mingru 1x64", "mingru 2x128", "mlp"]
+    run = what.runs()[2]
+    assert run.name == "MineSweeperEasy__full__mingru-2x128__pqn__seed0"
+    words = " ".join(what.arguments(run, Path("here")))
+    assert "--network-option layers=2 --network-option hidden_size=128" in words
+    with pytest.raises(ValueError, match="layers x width"):
+        small_study(sizes=["128"])
+
+
+def test_a_damaged_final_evaluation_is_made_again(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    carry_out(what, root, Fabricator(what))
+    broken = StudyFolder(root).run(what.runs()[3]).path
+    (broken / "eval.json").write_text('{"status": "fini')
+    again = Fabricator(what)
+    assert all(row["status"] == "finished" for row in carry_out(what, root, again))
+    assert again.done == [broken.name]
+
+
+def test_a_damaged_record_of_the_study_is_written_anew(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    carry_out(what, root, Fabricator(what))
+    (root / "study.json").write_text("")
+    again = Fabricator(what)
+    carry_out(what, root, again)
+    assert again.done == [] and StudyFolder(root).load() == what
 
 
 def python_engine(workers: int = 2) -> Processes:
@@ -305,10 +338,12 @@ def test_inline_runs_one_after_the_other_and_survives_exceptions(tmp_path: Path)
 def test_engines_are_made_by_name() -> None:
     assert isinstance(make_engine("inline"), Inline)
     assert isinstance(make_engine("processes", 3), Processes)
-    with pytest.raises(ValueError, match="auto, inline, processes"):
+    with pytest.raises(ValueError, match="auto, inline, processes, ray"):
         make_engine("cluster")
     with pytest.raises(ValueError, match="workers"):
         make_engine("processes", -1)
+    with pytest.raises(ValueError, match="--address is for --engine ray"):
+        make_engine("processes", address="auto")
 
 
 def test_speed_is_that_of_the_last_seconds() -> None:

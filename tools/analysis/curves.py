@@ -40,7 +40,7 @@ class Curve:
 
 def agent_name(study: Study, run: RunSpec) -> str:
     """What a run's agent is called in tables: its memory, with the algorithm where there are several."""
-    return run.memory if len(study.algorithms) == 1 else f"{run.algorithm}-{run.memory}"
+    return run.agent if len(study.algorithms) == 1 else f"{run.algorithm}-{run.agent}"
 
 
 def learning_curves(folder: StudyFolder, study: Study, kind: str = "eval", confidence: float = 0.95) -> list[Curve]:

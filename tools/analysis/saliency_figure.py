@@ -1,5 +1,6 @@
 """The saliency figure: a row of frames a trajectory, heat over each."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,8 @@ def saliency_figure(
     Raises:
         MissingPackage: matplotlib is not installed.
     """
-    need("matplotlib").use("Agg")
+    if "matplotlib.pyplot" not in sys.modules:  # a notebook keeps the windows it has chosen
+        need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
     columns = min(show, max(frames.shape[0] for _, frames, _ in rows))
     figure = plt.figure(figsize=(1.7 * columns, 2.2 * len(rows)), layout="constrained")

@@ -11,7 +11,8 @@ import tyro
 class Figure:
     """Draw one of the paper's figures from run folders, as PDF and PNG with its numbers beside it.
 
-    Figures: returns, gap-bias, curves, saliency, recall-density, contamination, size-sweep, human, hyperparameters.
+    Figures: returns, gap-bias, curves, saliency, recall-density, contamination, size-sweep, throughput, human,
+    hyperparameters.
 
     Example: arcade-torch figure returns --runs runs/study --out figures --style print
     """
@@ -19,7 +20,7 @@ class Figure:
     name: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
     """Which figure."""
     runs: tuple[Path, ...] = ()
-    """Folders with runs: studies, run folders, or folders that hold such."""
+    """Folders with runs: studies, run folders, or folders that hold such; for throughput the file of `bench envs`."""
     paper: bool = False
     """Draw the paper's published numbers; returns, gap-bias, human and hyperparameters have them."""
     out: Path = Path("figures")

@@ -22,14 +22,29 @@ class Report:
     """Score of a run that the headline is based on."""
     saliency: bool = True
     """Draw saliency strips."""
+    recall: bool = True
+    """Measure recall density: how decisions spread over the past."""
+    contamination: bool = True
+    """Measure state contamination: what one noisy past frame changes."""
     references: bool = True
     """Draw the returns of the random policy and of the oracles."""
 
     def run(self) -> int:
         """Write the page."""
+        from arcade_torch.tools.count_bar import CountBar
         from arcade_torch.tools.reports.build import report
 
-        page = report(self.study, self.out, metric=self.metric, saliency=self.saliency, references=self.references)
+        with CountBar() as bar:
+            page = report(
+                self.study,
+                self.out,
+                metric=self.metric,
+                saliency=self.saliency,
+                recall=self.recall,
+                contamination=self.contamination,
+                references=self.references,
+                progress=bar.update,
+            )
         print(f"report: {page}")
         return 0
 

@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from arcade_torch.tools.extensions import command_line
+
+if TYPE_CHECKING:
+    from arcade_torch.tools.studies.engines import Engine
+    from arcade_torch.tools.studies.grid import Study
 
 
 @dataclass
@@ -14,51 +18,104 @@ class StudyCommand:
     """Run a grid of trainings described by one TOML file; type the same again to go on after an interruption.
 
     The file names games, memories and seeds, and optionally observability, algorithms, preset, total_frames, baseline,
-    question and a table [settings] with options of train.
+    sizes, question and a table [settings] with options of train. Several such processes, on any machines that see the
+    folder, may work on one study together.
 
     Example: arcade-torch study examples/study.toml --out runs/mine --workers 4
     """
 
-    file: tyro.conf.Positional[Path]
+    file: tyro.conf.Positional[Path | None] = None
     """The study."""
+    preset: Literal["demo", "paper-easy", "paper", "size-sweep"] | None = None
+    """A ready-made study in the place of a file."""
     out: Path | None = None
     """Folder of the study; runs/NAME by default."""
-    engine: Literal["auto", "inline", "processes"] = "auto"
+    engine: Literal["auto", "inline", "processes", "ray"] = "auto"
     """Where the runs are carried out; auto takes processes where there is more than one core."""
     workers: int = 0
-    """Processes at once; 0 for one a core."""
+    """Runs at once; 0 for one a core, or for what the Ray cluster has room for."""
+    address: str = ""
+    """Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this machine."""
+    cpus_per_run: float = 1.0
+    """Ray: cores that a run keeps busy."""
+    gpus_per_run: float = 0.0
+    """Ray: GPUs, or the part of one, that a run keeps busy."""
+    retries: int = 2
+    """Ray: further attempts at a run whose process or machine was lost."""
     dry_run: bool = False
-    """Only print the command of every run."""
+    """Only print the command of every run and the frames of all together."""
     report: bool = True
     """Write the HTML report at the end."""
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""
-        from arcade_torch.tools.studies.folder import StudyFolder
-        from arcade_torch.tools.studies.grid import Study
-        from arcade_torch.tools.studies.runner import study
+        from arcade_torch.tools.studies.runner import DiskFullError, study
 
-        what = Study.load(self.file)
+        what = self.study()
         out = self.out or Path("runs") / what.name
         if self.dry_run:
-            for spec in what.runs():
-                print(what.command(spec, StudyFolder(out).run(spec).path))
-            return 0
-        result = study(what, out, self.engine, self.workers, self.command())
+            return self._list(what, out)
+        try:
+            result = study(what, out, self._engine(), command=self.command())
+        except DiskFullError as error:
+            print(f"stopped: {error}; finished runs are kept: {self.command()}")
+            return 1
         print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
-        for name, error in result.errors.items():
-            print(f"failed: {name}: {error}")
+        for name, reason in result.errors.items():
+            print(f"failed: {name}: {reason} (log: {result.root / 'logs' / f'{name}.log'})")
         if self.report and result.finished:
             from arcade_torch.tools.reports.build import report
 
             print(f"report: {report(result.root)}")
         return 1 if result.errors else 0
 
+    def study(self) -> "Study":
+        """What to run.
+
+        Raises:
+            ValueError: neither or both of a file and a preset were given, or the file is no study.
+            FileNotFoundError: there is no such file.
+        """
+        from arcade_torch.tools.studies.grid import Study
+        from arcade_torch.tools.studies.presets import STUDY_PRESETS, study_preset
+
+        if (self.file is None) == (self.preset is None):
+            raise ValueError(f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the two")
+        return study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
+
+    def _engine(self) -> "Engine":
+        from arcade_torch.tools.studies.engine_names import make_engine
+
+        return make_engine(
+            self.engine,
+            self.workers,
+            address=self.address,
+            cpus_per_run=self.cpus_per_run,
+            gpus_per_run=self.gpus_per_run,
+            retries=self.retries,
+        )
+
+    def _list(self, what: "Study", out: Path) -> int:
+        import sys
+
+        from arcade_torch.tools.studies.folder import StudyFolder
+        from arcade_torch.tools.studies.presets import total_frames
+
+        for spec in what.runs():
+            print(what.command(spec, StudyFolder(out).run(spec).path))
+        print(f"{len(what.runs()):,} runs, {total_frames(what):,} frames in all", file=sys.stderr)
+        return 0
+
     def command(self) -> str:
         """The line that starts this study."""
-        words = ["study", str(self.file)]
+        words = ["study", *([str(self.file)] if self.file else ["--preset", str(self.preset)])]
         words += ["--out", str(self.out)] if self.out else []
-        return command_line([*words, "--engine", self.engine, "--workers", str(self.workers)])
+        words += ["--engine", self.engine, "--workers", str(self.workers)]
+        if self.engine == "ray":
+            words += ["--address", self.address] if self.address else []
+            words += ["--cpus-per-run", f"{self.cpus_per_run:g}", "--gpus-per-run", f"{self.gpus_per_run:g}"]
+            words += ["--retries", str(self.retries)]
+        return command_line(words)
 
     def how_to_go_on(self) -> str:
         """What to type after an interruption."""

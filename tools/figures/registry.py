@@ -16,7 +16,7 @@ class Request:
     """What a figure is asked for.
 
     Attributes:
-        runs: folders with runs.
+        runs: folders with runs; for throughput the file of ``arcade-torch bench envs``.
         out: folder for the files.
         style: ``light`` or ``print``.
         paper: the paper's published numbers in place of runs.
@@ -73,6 +73,7 @@ FIGURES = {
     "recall-density": Entry("recall_density", "how decisions spread over the past: thirds as bars, 16 bins as curves"),
     "contamination": Entry("contamination", "what one noisy or shuffled past frame does to later decisions"),
     "size-sweep": Entry("size_sweep", "Gap and Bias by depth and width of the memory"),
+    "throughput": Entry("throughput", "frames per second by number of envs, from the file of bench envs"),
     "human": Entry("human", "returns of people beside those of the memory-free agent", True),
     "hyperparameters": Entry("hyperparameters", "table of the settings of runs, or of the paper's preset", True),
 }

@@ -1,7 +1,8 @@
 """Build the report of a study: numbers first, then one page that holds everything."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,43 @@ from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.files import write_csv, write_text
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.reports import sections, words
+from arcade_torch.tools.reports.chosen import Cell, chosen_cells
+from arcade_torch.tools.reports.memory import (
+    BINS,
+    DENSITY,
+    NOISE,
+    MemorySection,
+    contamination_section,
+    recall_section,
+)
 from arcade_torch.tools.reports.strips import Strip, saliency_strips
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
+
+
+MANY_PANELS = 8
+"""From here on learning curves are small multiples with one legend."""
+
+MANY_ROWS = 24
+"""From here on long tables are folded away behind a short one."""
+
+MANY_RUNS = 48
+"""From here on the runs stand in one table, without their commands."""
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Inside:
+    """What was found inside the agents: cells looked into, why not others, and the sections made from them."""
+
+    cells: list[Cell]
+    note: str = ""
+    strips: list[Strip] = field(default_factory=list)
+    recall: MemorySection | None = None
+    contamination: MemorySection | None = None
 
 
 def report(
@@ -27,18 +60,25 @@ def report(
     *,
     metric: str = "eval_final",
     saliency: bool = True,
+    recall: bool = True,
+    contamination: bool = True,
     references: bool = True,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the page of a study: one HTML file that loads nothing.
 
-    Missing analyses are made on the way and kept in the study's folder under ``analysis``.
+    Missing analyses are made on the way and kept, in the study's folder or in those of its runs, under ``analysis``. Of
+    a large study only a few agents and games are looked into, and the page says which.
 
     Args:
         root: folder of the study.
         out: the page; ``report.html`` in the folder by default.
         metric: score of a run that headline and table rest on, ``eval_final`` or ``train_max_ewm``.
         saliency: whether to draw saliency strips.
+        recall: whether to measure recall density.
+        contamination: whether to measure state contamination.
         references: whether to draw the returns of the random policy and the oracles.
+        progress: called with (what, done, total).
 
     Returns:
         Path of the page.
@@ -54,11 +94,23 @@ def report(
     rows = folder.write_results(study)
     if not any(row["status"] == "finished" for row in rows):
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
-    levels = _levels(folder, study) if references else {}
-    strips = saliency_strips(folder, study) if saliency else []
-    context = page_context(folder, study, rows, levels, strips, metric)
+    levels = _levels(folder, study, progress) if references else {}
+    cells, note = chosen_cells(folder, study, rows, _finals(study, rows))
+    colour = sections.colours(_agents(study), study.baseline)
+    inside = Inside(
+        cells,
+        note,
+        saliency_strips(folder, cells, progress) if saliency else [],
+        recall_section(cells, colour, progress) if recall else None,
+        contamination_section(cells, colour, progress) if contamination else None,
+    )
+    context = page_context(folder, study, rows, levels, inside, metric)
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=True, undefined=jinja2.StrictUndefined
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters["commas"] = lambda value: f"{int(value):,}"
     page = environment.get_template("report.html.j2").render(context)
@@ -70,43 +122,63 @@ def page_context(
     study: Study,
     rows: list[dict[str, Any]],
     levels: Mapping[str, Mapping[str, Mapping[str, float]]],
-    strips: list[Strip],
+    inside: Inside,
     metric: str = "eval_final",
 ) -> dict[str, Any]:
     """Everything the template shows, computed from the files of a study."""
     table, trouble = _table(folder, study, metric)
-    other = "train_max_ewm" if metric == "eval_final" else "eval_final"
-    second, _ = _table(folder, study, other)
-    agents = list(dict.fromkeys(agent_name(study, run) for run in study.runs()))
+    second, _ = _table(folder, study, "train_max_ewm" if metric == "eval_final" else "eval_final")
+    agents = _agents(study)
     colours = sections.colours(agents, study.baseline)
     finals = _finals(study, rows)
     record = folder.record()
+    settings = sections.all_settings(folder, study)
+    shared = sections.shared_settings(settings)
+    small = len(finals) > MANY_PANELS
+    learning = [words.learning_sentence(*key, finals[key], _means(levels, key[0])) for key in finals]
+    headlines = _headlines(table)
     return {
         "study": study,
         "made": time.strftime("%Y-%m-%d %H:%M"),
-        "headlines": _headlines(table, agents),
+        "headlines": headlines[:3],
+        "more": headlines[3:],
         "trouble": trouble,
-        "learning": [words.learning_sentence(*key, finals[key], _means(levels, key[0])) for key in finals],
+        "learning": [sentence for sentence in learning if sentence],
         "caution": words.coverage_sentence(table) if table else "",
         "unfinished": [row for row in rows if row["status"] != "finished"],
         "rows": rows,
         "finals": sections.final_rows(finals, levels),
+        "overviews": sections.overviews(finals, agents) if len(study.games) > 2 else [],
         "levels": levels,
-        "curves": sections.curve_panels(learning_curves(folder, study, "eval"), levels, colours),
-        "train_curves": sections.curve_panels(learning_curves(folder, study, "train"), levels, colours),
+        "small": small,
+        "curves": sections.curve_panels(learning_curves(folder, study, "eval"), levels, colours, small),
+        "train_curves": []
+        if small
+        else sections.curve_panels(learning_curves(folder, study, "train"), levels, colours),
         "table": table,
         "second": second,
         "whiskers": sections.whisker_panels(table, colours) if table else [],
-        "strips": strips,
+        "inside": inside,
+        "looked": {f"{cell.game}-{cell.twin}" for cell in inside.cells} if inside.strips else set(),
+        "density": DENSITY,
+        "noise": NOISE,
+        "bins": BINS,
         "colours": colours,
-        "runs": sections.run_details(folder, study, rows),
-        "shared": sections.shared_settings(folder, study),
+        "palette": sections.PALETTE,
+        "runs": sections.run_details(folder, study, rows, settings, shared),
+        "shared": shared,
+        "many_rows": MANY_ROWS,
+        "many_runs": MANY_RUNS,
         "versions": record.get("versions", {}),
         "also": record.get("also", []),
         "command": record.get("command", ""),
         "report_command": command_line(["report", str(folder.root)]),
         "seconds": sum(float(row.get("seconds") or 0) for row in rows),
     }
+
+
+def _agents(study: Study) -> list[str]:
+    return list(dict.fromkeys(agent_name(study, run) for run in study.runs()))
 
 
 def _table(folder: StudyFolder, study: Study, metric: str) -> tuple[GapBias | None, str]:
@@ -121,11 +193,12 @@ def _table(folder: StudyFolder, study: Study, metric: str) -> tuple[GapBias | No
     return table, ""
 
 
-def _headlines(table: GapBias | None, agents: list[str]) -> list[str]:
+def _headlines(table: GapBias | None) -> list[str]:
+    """Three sentences on each agent with memory; the one with the highest POMDP return first."""
     if table is None:
         return []
     found = []
-    for row in table.rows[1:]:
+    for row in sorted(table.rows[1:], key=lambda row: -row.pomdp.value):
         found += [
             words.gap_sentence(table, row.agent),
             words.pomdp_sentence(table, row.agent),
@@ -144,9 +217,14 @@ def _finals(study: Study, rows: list[dict[str, Any]]) -> dict[tuple[str, str], d
     return found
 
 
-def _levels(folder: StudyFolder, study: Study) -> dict[str, dict[str, dict[str, float]]]:
+def _levels(folder: StudyFolder, study: Study, progress: Progress | None) -> dict[str, dict[str, dict[str, float]]]:
     rules = str(study.settings.get("rules", "default"))
-    return {game: cached_references(game, folder.analysis, rules=rules) for game in study.games}
+    found = {}
+    for done, game in enumerate(study.games, start=1):
+        found[game] = cached_references(game, folder.analysis, rules=rules)
+        if progress is not None:
+            progress("random policy and oracles", done, len(study.games))
+    return found
 
 
 def _means(levels: Mapping[str, Mapping[str, Mapping[str, float]]], game: str) -> dict[str, float]:

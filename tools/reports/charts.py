@@ -1,6 +1,6 @@
 """Charts as inline SVG that take their colours from the page, so that they follow its light and dark form."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -9,8 +9,34 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-WIDTH, HEIGHT = 560, 340
-LEFT, RIGHT, TOP, BOTTOM = 52, 108, 30, 40
+TOP = 30  # of charts with rows
+
+
+@dataclass(frozen=True)
+class Box:
+    """Size of a chart and its margins, in units of its own; whether lines are named at their right ends."""
+
+    width: int
+    height: int
+    left: int
+    right: int
+    top: int
+    bottom: int
+    named: bool
+
+    def x(self, share: float) -> float:
+        """Place of a share of the x axis."""
+        return self.left + (self.width - self.left - self.right) * share
+
+    def y(self, value: float, y_range: tuple[float, float]) -> float:
+        """Place of a value on the y axis."""
+        height = self.height - self.top - self.bottom
+        return self.top + height * (1 - (value - y_range[0]) / (y_range[1] - y_range[0]))
+
+
+FULL = Box(560, 340, 52, 108, 30, 40, True)
+SMALL = Box(320, 210, 44, 12, 26, 38, False)
+"""For small multiples: names of lines stand in a legend of the page."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +125,9 @@ def _overlap(above: tuple[float, list[int]], below: tuple[float, list[int]], gap
     return below[0] - above[0] < half
 
 
-def line_chart(title: str, lines: Sequence[Line], levels: Sequence[Level], y_range: tuple[float, float]) -> str:
+def line_chart(
+    title: str, lines: Sequence[Line], levels: Sequence[Level], y_range: tuple[float, float], box: Box = FULL
+) -> str:
     """Curves with bands, thin lines for single seeds, and dashed reference lines with their names at the right.
 
     Args:
@@ -107,58 +135,107 @@ def line_chart(title: str, lines: Sequence[Line], levels: Sequence[Level], y_ran
         lines: curves; the x axis is frames.
         levels: reference lines.
         y_range: of the y axis, shared by charts side by side.
+        box: size; a small chart has neither names nor single seeds.
 
     Returns:
         An ``<svg>`` element.
     """
     x_high = max((float(line.x[-1]) for line in lines), default=1.0)
+    parts = [_open(box.width, box.height, title), _text(box.left, 16, title, "title"), *_y_axis(box, y_range)]
+    unit, name = (1e6, "million frames") if x_high >= 2e6 else (1e3, "thousand frames")
+    for value in ticks(0.0, x_high / unit, 5 if box.named else 3):
+        parts.append(_x_tick(box, value * unit / x_high, f"{value:g}"))
+    parts += [_x_name(box, name), *_levels(box, levels, y_range)]
+    parts += _lines(box, lines, lambda x: box.x(x / x_high), y_range, singles=box.named)
+    return "".join([*parts, *(_labels(box, lines, levels, y_range) if box.named else []), "</svg>"])
+
+
+def category_chart(
+    title: str,
+    lines: Sequence[Line],
+    names: Sequence[str],
+    axis: str,
+    y_range: tuple[float, float],
+    level: float | None = None,
+    box: Box = SMALL,
+) -> str:
+    """Values at named places, joined by lines.
+
+    Args:
+        title: above the chart.
+        lines: x counts the names from 0; where y is NaN there is no point.
+        names: of the places; an empty name leaves its place unlabelled.
+        axis: what the names are.
+        y_range: of the y axis.
+        level: value of a dashed reference line.
+        box: size.
+
+    Returns:
+        An ``<svg>`` element.
+    """
 
     def px(x: float) -> float:
-        return LEFT + (WIDTH - LEFT - RIGHT) * x / x_high
+        return box.x((x + 0.5) / len(names))
 
-    def py(y: float) -> float:
-        return TOP + (HEIGHT - TOP - BOTTOM) * (1 - (y - y_range[0]) / (y_range[1] - y_range[0]))
+    parts = [_open(box.width, box.height, title), _text(box.left, 16, title, "title"), *_y_axis(box, y_range)]
+    parts += [_x_tick(box, (place + 0.5) / len(names), name) for place, name in enumerate(names) if name]
+    parts += [_x_name(box, axis), *_levels(box, [] if level is None else [Level("", level)], y_range)]
+    return "".join([*parts, *_lines(box, lines, px, y_range, singles=False), "</svg>"])
 
-    parts = [_open(WIDTH, HEIGHT, title), _text(LEFT, 16, title, "title")]
-    parts += _axes(px, py, x_high, y_range)
-    for level in levels:
-        parts.append(_path([(LEFT, py(level.value)), (WIDTH - RIGHT, py(level.value))], "level"))
+
+def _lines(
+    box: Box, lines: Sequence[Line], px: Callable[[float], float], y_range: tuple[float, float], singles: bool
+) -> list[str]:
+    """Bands below, then single seeds, then means; points where there are few."""
+
+    def places(x: Floats, y: Floats) -> list[tuple[float, float]]:
+        return [(px(a), box.y(b, y_range)) for a, b in zip(x, y, strict=True) if np.isfinite(b)]
+
+    parts = []
     for line in lines:
         if np.isfinite(line.low).any():
-            band = [(px(x), py(y)) for x, y in zip(line.x, line.high, strict=True)]
-            band += [(px(x), py(y)) for x, y in zip(line.x[::-1], line.low[::-1], strict=True)]
+            band = places(line.x, line.high) + places(line.x, line.low)[::-1]
             parts.append(_path(band, f"band {line.colour}", close=True))
-        for single in line.singles if len(line.singles) > 1 else []:
-            parts.append(_path([(px(x), py(y)) for x, y in zip(line.x, single, strict=True)], f"single {line.colour}"))
+        for single in line.singles if singles and len(line.singles) > 1 else []:
+            parts.append(_path(places(line.x, single), f"single {line.colour}"))
     for line in lines:
-        points = [(px(x), py(y)) for x, y in zip(line.x, line.y, strict=True)]
+        points = places(line.x, line.y)
         parts.append(_path(points, f"line {line.colour}"))
         if len(points) <= 12:
-            parts += [f'<circle class="dot {line.colour}" cx="{x:.1f}" cy="{y:.1f}" r="3"/>' for x, y in points]
-    parts += _labels(lines, levels, py)
-    return "".join([*parts, "</svg>"])
-
-
-def _axes(px: object, py: object, x_high: float, y_range: tuple[float, float]) -> list[str]:
-    assert callable(px) and callable(py)
-    parts = []
-    for value in ticks(*y_range):
-        parts.append(_path([(LEFT, py(value)), (WIDTH - RIGHT, py(value))], "grid"))
-        parts.append(_text(LEFT - 8, py(value) + 4, f"{value:g}", "tick", "end"))
-    unit, name = (1e6, "million frames") if x_high >= 2e6 else (1e3, "thousand frames")
-    for value in ticks(0.0, x_high / unit):
-        parts.append(_text(px(value * unit), HEIGHT - BOTTOM + 18, f"{value:g}", "tick", "middle"))
-    parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 5, name, "tick", "middle"))
+            size = 3 if box.named else 2.4
+            parts += [f'<circle class="dot {line.colour}" cx="{x:.1f}" cy="{y:.1f}" r="{size}"/>' for x, y in points]
     return parts
 
 
-def _labels(lines: Sequence[Line], levels: Sequence[Level], py: object) -> list[str]:
-    assert callable(py)
+def _levels(box: Box, levels: Sequence[Level], y_range: tuple[float, float]) -> list[str]:
+    heights = [box.y(level.value, y_range) for level in levels]
+    return [_path([(box.left, height), (box.width - box.right, height)], "level") for height in heights]
+
+
+def _y_axis(box: Box, y_range: tuple[float, float]) -> list[str]:
+    parts = []
+    for value in ticks(*y_range, 5 if box.named else 3):
+        height = box.y(value, y_range)
+        parts.append(_path([(box.left, height), (box.width - box.right, height)], "grid"))
+        parts.append(_text(box.left - 8, height + 4, f"{value:g}", "tick", "end"))
+    return parts
+
+
+def _x_tick(box: Box, share: float, text: str) -> str:
+    return _text(box.x(share), box.height - box.bottom + 17, text, "tick", "middle")
+
+
+def _x_name(box: Box, text: str) -> str:
+    return _text(box.x(0.5), box.height - 5, text, "tick", "middle")
+
+
+def _labels(box: Box, lines: Sequence[Line], levels: Sequence[Level], y_range: tuple[float, float]) -> list[str]:
     entries = [(float(line.y[-1]), line.name, f"label {line.colour}") for line in lines]
     entries += [(level.value, level.name, "label level") for level in levels]
-    places = spread([py(value) for value, _, _ in entries], 14.0, TOP, HEIGHT - BOTTOM)
+    wanted = [box.y(value, y_range) for value, _, _ in entries]
+    places = spread(wanted, 14.0, box.top, box.height - box.bottom)
     return [
-        _text(WIDTH - RIGHT + 8, place + 4, name, style)
+        _text(box.width - box.right + 8, place + 4, name, style)
         for place, (_, name, style) in zip(places, entries, strict=True)
     ]
 

@@ -9,22 +9,26 @@ import numpy as np
 from arcade_torch.tools.analysis.bootstrap import percentile_interval, resampled_means
 from arcade_torch.tools.analysis.curves import Curve
 from arcade_torch.tools.analysis.gap_bias import GapBias
-from arcade_torch.tools.reports.charts import Level, Line, Whisker, line_chart, whisker_chart
+from arcade_torch.tools.analysis.normalise import normalise
+from arcade_torch.tools.reports.charts import FULL, SMALL, Level, Line, Whisker, line_chart, whisker_chart
+from arcade_torch.tools.reports.chosen import Finals, is_baseline
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study, flatten
 
 Levels = Mapping[str, Mapping[str, Mapping[str, float]]]
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 LEVEL_NAMES = {"random": "random", "state": "oracle", "frames": "frames oracle"}
-PALETTE = 6
+PALETTE = 9
+"""Colours of the page; the first is the memory-free agent's."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A chart and what stands below it."""
+    """A chart, what stands below it, and the task it is of, as ``GAME-TWIN`` (empty where there are several)."""
 
     svg: str
     caption: str
+    task: str = ""
 
 
 def colours(agents: Sequence[str], baseline: str) -> dict[str, str]:
@@ -32,7 +36,7 @@ def colours(agents: Sequence[str], baseline: str) -> dict[str, str]:
     found: dict[str, str] = {}
     free = 1
     for agent in agents:
-        if agent == baseline or agent.endswith(f"-{baseline}"):
+        if is_baseline(agent, baseline):
             found[agent] = "c0"
         else:
             found[agent] = f"c{1 + (free - 1) % (PALETTE - 1)}"
@@ -40,8 +44,10 @@ def colours(agents: Sequence[str], baseline: str) -> dict[str, str]:
     return found
 
 
-def curve_panels(curves: Sequence[Curve], levels: Levels, colour: Mapping[str, str]) -> list[Panel]:
-    """One chart a task; the twins of a game share their y axis."""
+def curve_panels(
+    curves: Sequence[Curve], levels: Levels, colour: Mapping[str, str], small: bool = False
+) -> list[Panel]:
+    """One chart a task; the twins of a game share their y axis. Small ones have a common legend elsewhere."""
     panels = []
     for game in dict.fromkeys(curve.game for curve in curves):
         of_game = [curve for curve in curves if curve.game == game]
@@ -55,12 +61,16 @@ def curve_panels(curves: Sequence[Curve], levels: Levels, colour: Mapping[str, s
                 [_line(curve, colour) for curve in here],
                 [Level(LEVEL_NAMES[kind], means[kind]) for kind in shown],
                 y_range,
+                SMALL if small else FULL,
             )
-            counts = sorted({len(curve.seeds) for curve in here})
-            seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
-            band = "; band: interval over seeds, thin lines: single seeds" if counts != [1] else ""
-            panels.append(Panel(chart, f"mean of {seeds}{band}"))
+            panels.append(Panel(chart, "" if small else _seeds(here), f"{game}-{twin}"))
     return panels
+
+
+def _seeds(curves: Sequence[Curve]) -> str:
+    counts = sorted({len(curve.seeds) for curve in curves})
+    seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
+    return f"mean of {seeds}" + ("; band: interval over seeds, thin lines: single seeds" if counts != [1] else "")
 
 
 def _line(curve: Curve, colour: Mapping[str, str]) -> Line:
@@ -100,7 +110,7 @@ def whisker_panels(table: GapBias, colour: Mapping[str, str]) -> list[Panel]:
     return panels
 
 
-def final_rows(finals: Mapping[tuple[str, str], Mapping[str, Sequence[float]]], levels: Levels) -> list[dict[str, Any]]:
+def final_rows(finals: Finals, levels: Levels) -> list[dict[str, Any]]:
     """Rows of the table of final greedy returns."""
     found = []
     for (game, twin), agents in finals.items():
@@ -117,6 +127,7 @@ def final_rows(finals: Mapping[tuple[str, str], Mapping[str, Sequence[float]]], 
                 {
                     "game": game,
                     "twin": TWIN_NAMES[twin],
+                    "task": f"{game}-{twin}",
                     "agent": agent,
                     "mean": mean,
                     "interval": "" if np.isnan(interval.low) else f"[{interval.low:.3f}, {interval.high:.3f}]",
@@ -127,24 +138,46 @@ def final_rows(finals: Mapping[tuple[str, str], Mapping[str, Sequence[float]]], 
     return found
 
 
-def run_details(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """For every run: its command, its resolved settings where they differ from the shared ones, and its numbers."""
-    shared = shared_settings(folder, study)
+def overviews(finals: Finals, agents: Sequence[str]) -> list[dict[str, Any]]:
+    """For each twin a table of games by agents: mean return, its share of [0, 1] after normalising, which is best."""
     found = []
-    for run, row in zip(study.runs(), rows, strict=True):
-        path = folder.run(run).path
-        settings = _settings(folder, study, run.name)
-        own = {key: value for key, value in settings.items() if shared.get(key, _MISSING) != value}
-        found.append({"row": row, "name": run.name, "command": study.command(run, path), "own": own})
+    for twin in dict.fromkeys(key[1] for key in finals):
+        rows = []
+        for game in (key[0] for key in finals if key[1] == twin):
+            means = {agent: float(np.mean(values)) for agent, values in finals[game, twin].items()}
+            best = max(means.values())
+            cells = [
+                None
+                if agent not in means
+                else {
+                    "value": means[agent],
+                    "heat": round(100 * min(1.0, max(0.0, float(normalise(game, means[agent]))))),
+                    "best": means[agent] == best,
+                }
+                for agent in agents
+            ]
+            rows.append({"game": game, "task": f"{game}-{twin}", "cells": cells})
+        found.append({"twin": TWIN_NAMES[twin], "agents": list(agents), "rows": rows})
     return found
 
 
+Settings = Mapping[str, Mapping[str, Any]]
 _MISSING = object()
 
 
-def shared_settings(folder: StudyFolder, study: Study) -> dict[str, Any]:
+def all_settings(folder: StudyFolder, study: Study) -> dict[str, dict[str, Any]]:
+    """Resolved settings of every run that was started, by its name."""
+    found = {}
+    for run in study.runs():
+        here = folder.run(run)
+        if (here.path / "config.json").exists():
+            found[run.name] = flatten(here.config())
+    return found
+
+
+def shared_settings(settings: Settings) -> dict[str, Any]:
     """Resolved settings that all runs have in common."""
-    every = [settings for run in study.runs() if (settings := _settings(folder, study, run.name))]
+    every = list(settings.values())
     if not every:
         return {}
     return {
@@ -152,7 +185,13 @@ def shared_settings(folder: StudyFolder, study: Study) -> dict[str, Any]:
     }
 
 
-def _settings(folder: StudyFolder, study: Study, name: str) -> dict[str, Any]:
-    run = next(run for run in study.runs() if run.name == name)
-    file = folder.run(run).path / "config.json"
-    return flatten(folder.run(run).config()) if file.exists() else {}
+def run_details(
+    folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]], settings: Settings, shared: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """For every run: its command, its resolved settings where they differ from the shared ones, and its numbers."""
+    found = []
+    for run, row in zip(study.runs(), rows, strict=True):
+        own = {key: value for key, value in settings.get(run.name, {}).items() if shared.get(key, _MISSING) != value}
+        command = study.command(run, folder.run(run).path)
+        found.append({"row": row, "name": run.name, "command": command, "own": own})
+    return found

@@ -1,6 +1,7 @@
 """Saliency strips of a study: one greedy episode of each agent and twin, its last frames under heat."""
 
 from base64 import b64encode
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.analysis.curves import agent_name
 from arcade_torch.tools.analysis.images import SIGMA_PX, overlay, png, scaled
 from arcade_torch.tools.analysis.saliency_figure import last_frames, step_title
 from arcade_torch.tools.files import write_bytes
+from arcade_torch.tools.reports.chosen import Cell
 from arcade_torch.tools.studies.folder import StudyFolder
-from arcade_torch.tools.studies.grid import RunSpec, Study
 
 SHOW = 8
 EPISODES_TRIED = 10
@@ -42,22 +42,30 @@ class Strip:
     tiles: list[Tile]
 
 
-def saliency_strips(folder: StudyFolder, study: Study) -> list[Strip]:
-    """One strip for each agent and task, from its first finished seed.
+def saliency_strips(
+    folder: StudyFolder, cells: Sequence[Cell], progress: Callable[[str, int, int], None] | None = None
+) -> list[Strip]:
+    """One strip for each cell, from its first finished seed.
 
     The arrays are kept in ``analysis/saliency/RUN.npz`` and reused while the run's final evaluation is older.
+
+    Args:
+        folder: the study on disk.
+        cells: whom to look into.
+        progress: called with (what, done, total).
     """
-    chosen: dict[tuple[str, str, str], RunSpec] = {}
-    for run in study.runs():
-        if folder.run(run).final() is not None:
-            chosen.setdefault((run.game, run.observability, agent_name(study, run)), run)
-    return [_strip(agent, run, _arrays(folder, run)) for (_, _, agent), run in chosen.items()]
+    found = []
+    for done, cell in enumerate(cells, start=1):
+        found.append(_strip(cell, _arrays(folder, cell.runs[0])))
+        if progress is not None:
+            progress("saliency", done, len(cells))
+    return found
 
 
-def _arrays(folder: StudyFolder, run: RunSpec) -> dict[str, NDArray[Any]]:
+def _arrays(folder: StudyFolder, run: Path) -> dict[str, NDArray[Any]]:
     file = folder.analysis / "saliency" / f"{run.name}.npz"
-    if not (file.exists() and file.stat().st_mtime >= (folder.run(run).path / "eval.json").stat().st_mtime):
-        _compute(folder.run(run).path, file)
+    if not (file.exists() and file.stat().st_mtime >= (run / "eval.json").stat().st_mtime):
+        _compute(run, file)
     with np.load(file, allow_pickle=False) as kept:
         return {name: kept[name] for name in kept.files}
 
@@ -91,7 +99,7 @@ def _compute(run: Path, file: Path) -> None:
     write_bytes(file, buffer.getvalue())
 
 
-def _strip(agent: str, run: RunSpec, arrays: dict[str, NDArray[Any]]) -> Strip:
+def _strip(cell: Cell, arrays: dict[str, NDArray[Any]]) -> Strip:
     frames, per_frame = arrays["frames"], arrays["per_frame"].astype(np.float64)
     total = per_frame.sum()
     shares = 100 * per_frame / total if total > 0 else per_frame
@@ -102,7 +110,7 @@ def _strip(agent: str, run: RunSpec, arrays: dict[str, NDArray[Any]]) -> Strip:
         Tile(data_address(png(picture)), step_title(t, len(frames) - 1), float(shares[t]))
         for t, picture in zip(keep, pictures, strict=True)
     ]
-    return Strip(agent, run.game, run.observability, run.name, len(frames), peak, float(shares[-1]), tiles)
+    return Strip(cell.agent, cell.game, cell.twin, cell.runs[0].name, len(frames), peak, float(shares[-1]), tiles)
 
 
 def data_address(data: bytes) -> str:

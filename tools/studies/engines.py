@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -29,11 +29,17 @@ class Job:
         name: of the run.
         words: what follows ``arcade-torch`` on the command line.
         log: file that takes what the run prints.
+        folder: of the run, as it stands among the words.
     """
 
     name: str
     words: tuple[str, ...]
     log: Path
+    folder: Path | None = None
+
+
+Jobs = Iterable[Job | None]
+"""Jobs to start, taken one by one as there is room; None: nothing at the moment, ask again later."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class JobResult:
 class Engine(Protocol):
     """Carries out jobs; closing the iterator stops what still runs, in an orderly way."""
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+    def run(self, jobs: Jobs) -> Iterator[JobResult]:
         """Yield the result of each job when it ends, in any order."""
         ...
 
@@ -56,18 +62,22 @@ class Engine(Protocol):
 class Inline:
     """One job after the other in this process."""
 
-    def __init__(self, run_words: Callable[[Sequence[str]], int] | None = None) -> None:
+    def __init__(self, run_words: Callable[[Sequence[str]], int] | None = None, poll_s: float = 0.5) -> None:
         """Make the engine.
 
         Args:
             run_words: called with a job's words, returns an exit code; the command line by default.
+            poll_s: seconds to wait where there is nothing to do at the moment.
         """
-        self._run_words = run_words
+        self._run_words, self._poll_s = run_words, poll_s
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+    def run(self, jobs: Jobs) -> Iterator[JobResult]:
         """Run the jobs in order; an exception of one becomes its result."""
         run_words = self._run_words or _command_line
         for job in jobs:
+            if job is None:
+                time.sleep(self._poll_s)
+                continue
             try:
                 code, error = run_words(job.words), ""
             except Exception as caught:
@@ -101,6 +111,7 @@ class Processes:
         environment: variables set for the workers.
         poll_s: seconds between two looks at the workers.
         grace_s: seconds an interrupted worker has for its checkpoint.
+        pin: whether a worker gets a core of its own and one thread; where there are enough cores by default.
     """
 
     workers: int = 0
@@ -108,6 +119,7 @@ class Processes:
     environment: Mapping[str, str] = field(default_factory=dict)
     poll_s: float = 0.1
     grace_s: float = GRACE_S
+    pin: bool | None = None
 
     def __post_init__(self) -> None:
         """Check the number of workers.
@@ -118,17 +130,24 @@ class Processes:
         if self.workers < 0:
             raise ValueError(f"workers must be at least 1 (or 0 for one a core), got {self.workers}")
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
+    def run(self, jobs: Jobs) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
         cores = available_cores()
-        count = min(self.workers or len(cores), max(1, len(jobs)))
+        count = self.workers or len(cores)
         free = [cores[index % len(cores)] for index in range(count)]
-        pin = count <= len(cores)
-        waiting, active = list(jobs), list[_Worker]()
+        pin = count <= len(cores) if self.pin is None else self.pin
+        waiting, more, active = iter(jobs), True, list[_Worker]()
         try:
-            while waiting or active:
-                while waiting and free:
-                    active.append(self._start(waiting.pop(0), free.pop(0), pin))
+            while more or active:
+                while more and free:
+                    try:
+                        job = next(waiting)
+                    except StopIteration:
+                        more = False
+                        break
+                    if job is None:
+                        break
+                    active.append(self._start(job, free.pop(0), pin))
                 for worker in [item for item in active if item.process.poll() is not None]:
                     active.remove(worker)
                     free.append(worker.core)
@@ -165,25 +184,6 @@ def available_cores() -> list[int]:
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
-
-
-def make_engine(name: str, workers: int = 0) -> Engine:
-    """An engine by its name.
-
-    Args:
-        name: ``inline``, ``processes``, or ``auto`` (processes where there is more than one core).
-        workers: for ``processes``: how many at once, 0 for one a core.
-
-    Raises:
-        ValueError: there is no such engine.
-    """
-    if name == "auto":
-        name = "processes" if len(available_cores()) > 1 else "inline"
-    if name == "inline":
-        return Inline()
-    if name == "processes":
-        return Processes(workers)
-    raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes")
 
 
 def watch_parent(variable: str = PARENT_VARIABLE, every_s: float = 2.0) -> None:

@@ -3,17 +3,23 @@
 ::
 
     study.json    the study, its versions, the command of every run
-    results.csv   one row a run, in the order of the grid
+    results.csv   one row a run, in the order of the grid; the same to the bit on every engine, interrupted or not
+    timings.csv   seconds of every run
     runs/NAME/    one run folder each (see `arcade_torch.agents`)
     logs/NAME.log what the run printed
+    locks/NAME/   which process carries the run out at the moment
+    failures/NAME.json why the last attempt at a run failed; gone when it succeeds
     analysis/     numbers and figures made from the runs
     report.html
 """
 
+import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.lease import LOCK, Lease
 from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.versions import versions
@@ -23,17 +29,18 @@ RESULT_COLUMNS = (
     "game",
     "observability",
     "memory",
+    "agent",
     "algorithm",
     "seed",
     "status",
     "frames",
-    "seconds",
     "eval_mean",
     "eval_std",
     "eval_n",
     "train_max_ewm",
     "error",
 )
+TIMING_COLUMNS = ("run", "frames", "seconds")
 
 
 @dataclass(frozen=True)
@@ -56,9 +63,11 @@ class RunFolder:
         return (self.path / "config.json").exists() or (self.path / "progress.json").exists()
 
     def final(self) -> dict[str, Any] | None:
-        """The content of ``eval.json`` if the run has finished, else None."""
-        file = self.path / "eval.json"
-        values = read_json(file) if file.exists() else None
+        """The content of ``eval.json`` if the run has finished, else None; a damaged file counts as none."""
+        try:
+            values = read_json(self.path / "eval.json")
+        except (OSError, ValueError):
+            return None
         return values if isinstance(values, dict) and values.get("status", "finished") == "finished" else None
 
     def progress(self) -> Progress | None:
@@ -99,6 +108,32 @@ class StudyFolder:
         """File with what the run printed."""
         return self.root / "logs" / f"{spec.name}.log"
 
+    def reservation(self, spec: RunSpec) -> Lease:
+        """The right to carry out a run of this study."""
+        return Lease(self.root / "locks" / spec.name)
+
+    def training(self, spec: RunSpec) -> Lease:
+        """The lock of whoever trains in the run's folder, for looking at."""
+        return Lease(self.run(spec).path / LOCK)
+
+    def failure(self, spec: RunSpec) -> tuple[int, str] | None:
+        """When (in file time, nanoseconds) and why the last attempt at a run failed; None if it did not."""
+        file = self._failure(spec)
+        try:
+            return file.stat().st_mtime_ns, str(read_json(file)["error"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def note_failure(self, spec: RunSpec, error: str) -> None:
+        """Keep why a run failed, or forget it where ``error`` is empty."""
+        if error:
+            write_json(self._failure(spec), {"error": error})
+        else:
+            self._failure(spec).unlink(missing_ok=True)
+
+    def _failure(self, spec: RunSpec) -> Path:
+        return self.root / "failures" / f"{spec.name}.json"
+
     @property
     def analysis(self) -> Path:
         """Folder for numbers and figures made from the runs."""
@@ -127,57 +162,71 @@ class StudyFolder:
     def claim(self, study: Study, command: str = "") -> None:
         """Write ``study.json``, or go on where the same study stands already.
 
-        The grid may grow between two invocations; what decides a run's result may not change.
+        The grid may grow between two invocations; what decides a run's result may not change. A ``study.json`` that is
+        not even JSON is written anew: the run folders know what they hold and refuse other settings themselves.
 
         Raises:
             FileExistsError: the folder holds other files, or a study with other settings.
         """
         file = self.root / "study.json"
+        old: dict[str, Any] = {}
         if file.exists():
-            before = self.load()
-            for key, old in before.fixed().items():
-                if old != study.fixed()[key]:
-                    raise FileExistsError(
-                        f"{self.root} holds study {before.name!r} with {key} = {old!r}, not {study.fixed()[key]!r}: "
-                        "choose another --out"
-                    )
-            names = {run.name for run in study.runs()}
-            gone = [run.name for run in before.runs() if run.name not in names]
-            if gone:
-                raise FileExistsError(f"{self.root} holds run {gone[0]}, which this study lacks: choose another --out")
-        elif self.root.exists() and any(self.root.iterdir()):
+            old = self._old(file)
+            if old:
+                self._check_same(self.load(), study)
+        elif self.root.exists() and any(not _ours(entry) for entry in self.root.iterdir()):
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
         commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
-        first, also = versions(), list[dict[str, str]]()
-        if file.exists():  # what the first runs were made with stays on record
-            old = self.record()
-            first, also = old.get("versions", first), list(old.get("also", []))
-            also += [] if versions() in (first, *also) else [versions()]
+        # What the first runs were made with stays on record.
+        first, also = old.get("versions", versions()), list(old.get("also", []))
+        also += [] if versions() in (first, *also) else [versions()]
         made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
-        write_json(file, made)
+        if made != old:
+            write_json(file, made)
 
-    def write_results(self, study: Study, errors: dict[str, str] | None = None) -> list[dict[str, Any]]:
-        """Write ``results.csv`` from the run folders.
+    def _old(self, file: Path) -> dict[str, Any]:
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError:
+            return {}
+        return values if isinstance(values, dict) else {}
+
+    def _check_same(self, before: Study, study: Study) -> None:
+        for key, old in before.fixed().items():
+            if old != study.fixed()[key]:
+                raise FileExistsError(
+                    f"{self.root} holds study {before.name!r} with {key} = {old!r}, not {study.fixed()[key]!r}: "
+                    "choose another --out"
+                )
+        names = {run.name for run in study.runs()}
+        gone = [run.name for run in before.runs() if run.name not in names]
+        if gone:
+            raise FileExistsError(f"{self.root} holds run {gone[0]}, which this study lacks: choose another --out")
+
+    def write_results(self, study: Study) -> list[dict[str, Any]]:
+        """Write ``results.csv`` and ``timings.csv`` from the run folders.
 
         Args:
             study: gives the order of the rows.
-            errors: run name -> why it failed in this invocation.
 
         Returns:
-            The rows.
+            The rows of both, joined.
         """
-        rows = [self._row(run, (errors or {}).get(run.name, "")) for run in study.runs()]
+        rows = [self._row(run) for run in study.runs()]
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
+        write_csv(self.root / "timings.csv", [row for row in rows if row.get("seconds") is not None], TIMING_COLUMNS)
         return rows
 
-    def _row(self, run: RunSpec, error: str) -> dict[str, Any]:
+    def _row(self, run: RunSpec) -> dict[str, Any]:
         folder = self.run(run)
-        final, progress = folder.final(), folder.progress()
-        row: dict[str, Any] = dict.fromkeys(RESULT_COLUMNS) | {
+        final, progress, failure = folder.final(), folder.progress(), self.failure(run)
+        error = failure[1] if failure and not final else ""
+        row: dict[str, Any] = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS)) | {
             "run": run.name,
             "game": run.game,
             "observability": run.observability,
             "memory": run.memory,
+            "agent": run.agent,
             "algorithm": run.algorithm,
             "seed": run.seed,
             "status": "finished" if final else "failed" if error else "unfinished" if folder.exists() else "waiting",
@@ -197,3 +246,8 @@ class StudyFolder:
                 "train_max_ewm": final.get("train_max_ewm"),
             }
         return row
+
+
+def _ours(entry: os.PathLike[str]) -> bool:
+    """Whether a file is the draft of another process that begins this very study."""
+    return os.path.basename(entry).startswith(".study.json.")

@@ -24,6 +24,7 @@ class RunSpec:
         memory: name of the memory model.
         algorithm: name of the learner.
         seed: of everything random in the run.
+        size: of the memory block, ``LAYERSxWIDTH``; empty for that of the preset.
     """
 
     game: str
@@ -31,11 +32,18 @@ class RunSpec:
     memory: str
     algorithm: str
     seed: int
+    size: str = ""
+
+    @property
+    def agent(self) -> str:
+        """The memory with its size, ``lru 2x512``."""
+        return f"{self.memory} {self.size}".strip()
 
     @property
     def name(self) -> str:
         """Name of the run's folder: the same for the same cell, whatever else is in the grid."""
-        return f"{self.game}__{self.observability}__{self.memory}__{self.algorithm}__seed{self.seed}"
+        memory = f"{self.memory}-{self.size}" if self.size else self.memory
+        return f"{self.game}__{self.observability}__{memory}__{self.algorithm}__seed{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,7 @@ class Study:
         total_frames: environment steps of each run; None keeps the preset's.
         settings: further options of ``arcade-torch train``, for example ``{"pqn": {"gamma": 0.9}}``.
         baseline: the memory-free agent, against which Bias is measured.
+        sizes: of the memory block, ``LAYERSxWIDTH`` such as ``2x512``; the memory-free agent keeps the preset's.
         question: what the study asks, a sentence for its report.
     """
 
@@ -66,6 +75,7 @@ class Study:
     total_frames: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     baseline: str = "mlp"
+    sizes: tuple[str, ...] = ()
     question: str = ""
 
     def __post_init__(self) -> None:
@@ -79,6 +89,11 @@ class Study:
             raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
         for axis in _AXES:
             _check_axis(axis, getattr(self, axis), int if axis == "seeds" else str)
+        for size in self.sizes:
+            if not isinstance(size, str) or not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
+                raise ValueError(f"sizes are layers x width, such as '2x512', got {size!r}")
+        if len(set(self.sizes)) != len(self.sizes):
+            raise ValueError(f"sizes names something twice: {', '.join(self.sizes)}")
         unknown = [value for value in self.observability if value not in OBSERVABILITIES]
         if unknown:
             raise ValueError(f"observability must be among {', '.join(OBSERVABILITIES)}, got {unknown[0]!r}")
@@ -105,7 +120,7 @@ class Study:
         if missing:
             raise ValueError(f"a study needs {', '.join(missing)}")
         ready = dict(values)
-        for axis in _AXES:
+        for axis in (*_AXES, "sizes"):
             if axis in ready:
                 ready[axis] = _as_tuple(axis, ready[axis])
         return cls(**ready)
@@ -120,13 +135,26 @@ class Study:
         """
         path = Path(path)
         try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-            values.setdefault("name", path.stem)
-            return cls.from_dict(values)
+            return cls.parse(path.read_text(encoding="utf-8"), path.stem)
         except FileNotFoundError:
             raise FileNotFoundError(f"no study at {path}: give a TOML file with games, memories and seeds") from None
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def parse(cls, text: str, name: str) -> "Study":
+        """Read a study from TOML text.
+
+        Args:
+            text: the TOML.
+            name: of the study, where the text gives none.
+
+        Raises:
+            ValueError: it is not TOML or not a study.
+        """
+        values = tomllib.loads(text)
+        values.setdefault("name", name)
+        return cls.from_dict(values)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
@@ -139,8 +167,12 @@ class Study:
 
     def runs(self) -> list[RunSpec]:
         """All cells; seeds vary slowest, so that an unfinished study holds every agent once before any twice."""
-        cells = product(self.seeds, self.games, self.algorithms, self.memories, self.observability)
-        return [RunSpec(game, twin, memory, algorithm, seed) for seed, game, algorithm, memory, twin in cells]
+        agents = [(memory, size) for memory in self.memories for size in self._sizes_of(memory)]
+        cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
+        return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
+
+    def _sizes_of(self, memory: str) -> tuple[str, ...]:
+        return ("",) if memory == self.baseline or not self.sizes else self.sizes
 
     def arguments(self, run: RunSpec, out: Path) -> list[str]:
         """The words after ``arcade-torch`` that train one run of this study."""
@@ -148,7 +180,11 @@ class Study:
         words += ["--memory", run.memory, "--algorithm", run.algorithm, "--seed", str(run.seed)]
         if self.total_frames is not None:
             words += ["--total-frames", str(self.total_frames)]
-        for key, value in flatten(self.settings).items():
+        settings = {"threads": 1} | flatten(self.settings)  # equal results whatever the engine gives a run
+        if run.size:
+            layers, width = run.size.split("x")
+            settings |= {"network_options.layers": layers, "network_options.hidden_size": width}
+        for key, value in settings.items():
             group = key.partition(".")[0]
             if group in self.algorithms and group != run.algorithm:
                 continue  # numbers of another learner of the grid

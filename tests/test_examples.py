@@ -1,0 +1,86 @@
+"""Every example runs in a short form, and each shows something that is true of all of it."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def example(name: str) -> Any:
+    """Import a script without running it."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module: ModuleType = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torchrls_trainer_begins_with_the_policy_that_acted(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = example("torchrl_ppo_trainer")
+    monkeypatch.setattr(script, "EPOCHS", 1)
+    seen: list[int] = []
+    largest = script.largest_log_ratio
+    monkeypatch.setattr(script, "largest_log_ratio", lambda policy, b: (seen.append(b.numel()), largest(policy, b))[1])
+    result = script.main(frames=2 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")
+    assert result.log_ratio < 1e-5 and seen == [script.MINIBATCH]
+    assert len(result.returns) == 2 and all(-1 <= value <= 1 for value in result.returns)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_loop_replays_every_window_as_it_was_acted() -> None:
+    script = example("a2c_loop")
+    result = script.main(frames=4 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")
+    assert 0 <= result.log_ratio < 1e-5  # over all four windows, each before its own update
+    assert len(result.returns) == 4 and all(-1 <= value <= 1 for value in result.returns)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("theirs", [False, True], ids=["ours", "theirs"])
+def test_one_line_makes_our_environment_instead_of_theirs(theirs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if theirs:
+        pytest.importorskip("pygame", reason="needs the play extra: pip install 'arcade-torch[play]'")
+    script = example("stock_pixels_ppo")
+    monkeypatch.setattr(script, "EPOCHS", 1)
+    monkeypatch.setattr(script, "WINDOW", 32)
+    monkeypatch.setattr(script, "MINIBATCH", 16)
+    env = script.make_env(theirs)
+    assert env.observation_spec["pixels"].dtype is torch.uint8 and env.observation_spec["pixels"].shape[-1] == 3
+    env.close()
+    returns = script.main(frames=64, theirs=theirs)
+    assert len(returns) == 2
+    for value in returns:
+        assert math.isnan(value) or (value >= 8 if theirs else -1 <= value <= 1)
+
+
+def test_ppo_in_one_file_begins_with_the_policy_that_acted(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = example("cleanrl_style_ppo")
+    monkeypatch.setattr(script, "NUM_ENVS", 8)
+    monkeypatch.setattr(script, "NUM_STEPS", 10)
+    monkeypatch.setattr(script, "EPOCHS", 1)
+    first: list[float] = []
+    minimum = torch.minimum
+
+    def gain(one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
+        if not first:  # ratio 1 everywhere: nothing is clipped
+            first.append(float((one - two).detach().abs().max()))
+        return minimum(one, two)
+
+    monkeypatch.setattr(script.torch, "minimum", gain)
+    history = script.main(frames=160)
+    assert first == [0.0]
+    assert len(history) == 2 and all(-1 <= value <= 1 for value in history)
+
+
+@pytest.mark.slow
+def test_stable_baselines3_takes_the_environment() -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'")
+    assert -1 <= example("cleanrl_style_ppo").stable_baselines3(frames=640) <= 1

@@ -1,0 +1,112 @@
+"""The notebooks: every cell runs, what they say of their figures holds, and what is committed came from the sources."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "examples/notebooks"
+
+
+def _build() -> Any:
+    spec = importlib.util.spec_from_file_location("build_notebooks", FOLDER / "build.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+build = _build()
+SHORT = 128  # frames, with the preset that learns nothing in seconds
+WINDOW = 1280  # the least that the collector of torchrl_pipeline gives
+
+
+@pytest.fixture(autouse=True)
+def forget_registered_memories(monkeypatch: pytest.MonkeyPatch) -> None:
+    from arcade_torch.models import registry
+
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+
+
+def run(name: str, frames: int | None) -> dict[str, Any]:
+    """The namespace of a notebook after its last cell; some cell has drawn something."""
+    cells = build.read_cells(FOLDER / f"{name}.py")
+    if frames is not None:
+        cells = [cell._replace(text=cell.text.replace('"small"', '"smoke"')) for cell in cells]
+    namespace, outputs = build.run_cells(cells, frames)
+    assert any("image/png" in item.get("data", {}) for found in outputs for item in found)
+    return dict(namespace)
+
+
+def laws(name: str, namespace: dict[str, Any]) -> None:
+    """What each notebook says that holds however little an agent was trained."""
+    if name == "saliency":
+        np.testing.assert_allclose(namespace["shares"]["no memory, POMDP"], [0, 0, 0, 0, 1])
+    if name == "recall_density":
+        np.testing.assert_allclose(namespace["found"]["no memory, POMDP"].mass(5), [0, 0, 0, 0, 1])
+    if name == "own_memory":
+        shares = namespace["shares"]
+        assert shares[0] > 0 and shares[-1] > 0 and (shares[1:-1] == 0).all()
+    if name == "contamination":
+        assert np.nanmax(namespace["found"]["no memory"].mean("flip")[:, 1:]) == 0
+    if name == "torchrl_pipeline":
+        assert namespace["density"].mass(5).sum() == pytest.approx(1) and namespace["density"].mass(5)[0] > 0
+
+
+@pytest.mark.parametrize("name", build.NAMES)
+def test_every_cell_runs(name: str) -> None:
+    laws(name, run(name, WINDOW if name == "torchrl_pipeline" else SHORT))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", build.NAMES)
+def test_the_long_form_shows_what_it_says(name: str) -> None:
+    namespace = run(name, None)
+    laws(name, namespace)
+    if name == "saliency":
+        shares = namespace["shares"]
+        assert shares["LRU, POMDP"][0] > 0.05 > shares["LRU, MDP"][0]
+    if name == "recall_density":
+        mass = namespace["found"]["LRU, POMDP"].mass(5)
+        assert mass[0] > max(mass[1:4]) and mass[4] > 0.2
+    if name == "own_memory":
+        assert namespace["result"].evaluation.mean > 0.9
+    if name == "contamination":
+        assert namespace["found"]["LRU"].mean("flip")[-1, 1] > 0.05
+    if name == "torchrl_pipeline":
+        assert namespace["returns"][-1] > 0.8
+
+
+@pytest.mark.parametrize("name", build.NAMES)
+def test_the_committed_notebook_was_built_from_its_source(name: str) -> None:
+    file = FOLDER / f"{name}.ipynb"
+    made = json.loads(file.read_text())
+    cells = [build.Cell(cell["cell_type"], "".join(cell["source"])) for cell in made["cells"]]
+    assert cells == build.read_cells(FOLDER / f"{name}.py"), f"run: python examples/notebooks/build.py {name}"
+    assert any(cell.get("outputs") for cell in made["cells"]) and file.stat().st_size < 200_000
+
+
+def test_a_source_without_a_title_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.py").write_text("# %%\n1\n")
+    with pytest.raises(ValueError, match="no docstring"):
+        build.read_cells(tmp_path / "x.py")
+
+
+def test_cells_become_a_notebook_with_what_they_printed_and_drew(tmp_path: Path) -> None:
+    source = '"""# T"""\n\n# %%\nimport matplotlib.pyplot as plt\nFRAMES = 5  # n\nprint(FRAMES)\n_ = plt.figure()\n'
+    (tmp_path / "x.py").write_text(source + "# %% [markdown]\n# a\n#\n# b\n")
+    cells = build.read_cells(tmp_path / "x.py")
+    assert [cell.kind for cell in cells] == ["markdown", "code", "markdown"] and cells[2].text == "a\n\nb"
+    _, outputs = build.run_cells(cells, 7)
+    made = json.loads(build.notebook(cells, outputs))
+    printed, picture = made["cells"][1]["outputs"]
+    assert printed["text"] == ["7\n"] and picture["data"]["image/png"].startswith("iVBOR")
+    assert "outputs" not in made["cells"][2] and made["nbformat"] == 4
+
+
+def test_an_unknown_notebook_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert build.main(["salienci"]) == 2
+    assert "unknown notebook 'salienci': there are saliency," in capsys.readouterr().err

@@ -1,0 +1,137 @@
+"""The report of a large study, and what it shows of the inside of agents."""
+
+from pathlib import Path
+
+import pytest
+
+from arcade_torch.agents import preset, train
+from arcade_torch.tools import cli, report
+from arcade_torch.tools.files import read_csv
+from arcade_torch.tools.reports import build, memory
+from arcade_torch.tools.reports.chosen import chosen_cells, representatives
+from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.grid import Study
+from tests.tools.fabricated import write_run
+from tests.tools.test_report import LEVELS, Checker
+
+GAMES = ("CartPoleEasy-v0", "MineSweeperEasy-v0", "SkittlesEasy-v0", "TetrisEasy-v0", "NavigatorEasy-v0")
+SCORES = {"mlp": 0.2, "lru": 0.5, "gru": 0.4}
+
+
+def large_study(root: Path, games: tuple[str, ...] = GAMES, seeds: int = 2) -> tuple[StudyFolder, Study]:
+    """Finished runs of three agents; the agents with memory are further ahead on later games."""
+    study = Study.from_dict(
+        {"name": "large", "games": list(games), "memories": list(SCORES), "seeds": list(range(seeds))}
+    )
+    folder = StudyFolder(root)
+    folder.claim(study, "arcade-torch study large.toml")
+    for run in study.runs():
+        ahead = SCORES[run.memory] * (0.5 + 0.1 * games.index(run.game))
+        write_run(folder.run(run).path, run, ahead + 0.01 * run.seed - 0.1 * (run.observability == "partial"))
+    return folder, study
+
+
+def check(page: str) -> Checker:
+    """The page is well formed, loads nothing, and every link has a place."""
+    checker = Checker()
+    checker.feed(page)
+    assert not checker.open and checker.wanted <= set(checker.ids)
+    return checker
+
+
+def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "cached_references", lambda game, folder, rules: LEVELS)
+    folder, _ = large_study(tmp_path / "s")
+    page = report(folder.root, saliency=False, recall=False, contamination=False).read_text()
+    assert len(page) < 400_000
+    count = check(page).count
+    assert count["svg"] == 2 * len(GAMES) + 4  # no training curves, which would double it
+    assert "60 runs</summary>" in page and "study.json" in page
+    assert page.count("arcade-torch train") == 1
+    assert 'class="heat best" style="--v:' in page and 'href="#curve-TetrisEasy-v0-partial"' in page
+    first = page.index("Partial observability costs the memory-free agent")
+    assert "and lru 0.07" in page[first : first + 200] and "The same for every other agent" in page
+
+
+def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: Path) -> None:
+    folder, study = large_study(tmp_path / "s", seeds=4)
+    for run in study.runs():
+        (folder.run(run).path / "checkpoints").mkdir()
+    rows = folder.write_results(study)
+    cells, note = chosen_cells(folder, study, rows, build._finals(study, rows))
+    assert {cell.agent for cell in cells} == {"mlp", "lru"}
+    assert {cell.game for cell in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
+    assert all(len(cell.runs) == 3 for cell in cells)
+    assert "Shown: mlp and lru on" in note and "out of 3 agents and 5 games" in note and "first 3 of 4 seeds" in note
+
+
+def test_representatives_without_a_control_are_the_best_agent() -> None:
+    finals = {("A", "full"): {"lru": [0.1], "gru": [0.4]}, ("B", "full"): {"lru": [0.2], "gru": [0.3]}}
+    assert representatives(finals, "mlp") == (["gru"], ["A", "B"])
+    both = {
+        ("A", "partial"): {"pqn-mlp": [0.3], "pqn-lru": [0.1]},
+        ("B", "partial"): {"pqn-mlp": [0.3], "pqn-lru": [0.9]},
+    }
+    assert representatives(both, "mlp") == (["pqn-mlp", "pqn-lru"], ["B", "A"])
+
+
+def test_runs_without_checkpoints_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder, _ = large_study(tmp_path / "s", games=GAMES[:1], seeds=1)
+    page = report(folder.root, references=False).read_text()
+    assert "6 runs without a checkpoint cannot be looked into" in page
+    check(page)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of two tiny real runs on the POMDP of SignpostEasy."""
+    root = tmp_path_factory.mktemp("real") / "s"
+    study = Study.from_dict(
+        {
+            "name": "real",
+            "games": ["SignpostEasy"],
+            "observability": ["partial"],
+            "memories": ["lru", "mlp"],
+            "seeds": [0],
+            "preset": "smoke",
+        }
+    )
+    folder = StudyFolder(root)
+    folder.claim(study, "arcade-torch study real.toml")
+    for run in study.runs():
+        config = preset("smoke", env=run.game, observability="partial", memory=run.memory)
+        train(config, folder.run(run).path)
+    return root
+
+
+def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
+    trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[str, int, int]] = []
+    page = report(trained, saliency=False, references=False, progress=lambda *step: told.append(step)).read_text()
+    check(page)
+    assert ("recall density, mlp on SignpostEasy", 16, 16) in told
+    assert ("contamination, lru on SignpostEasy", memory.NOISE["starts"], memory.NOISE["starts"]) in told
+    recall = page[page.index('id="recall"') : page.index('id="contamination"')]
+    rows = [row.split("<td>")[1:] for row in recall.split("<tr>")[2:]]
+    assert rows[1][3].startswith("100.0 %") and rows[1][4].startswith("0.0 %")  # no memory: all on the last frame
+    assert not rows[0][3].startswith("100.0 %")
+    noise = page[page.index('id="contamination"') : page.index('id="repeat"')]
+    free = [row.split("<td>")[1:] for row in noise.split("<tr>")[2:]][1]
+    assert free[3].startswith("0.0 %") and free[4].startswith("0.0 %")
+    told.clear()
+    report(trained, saliency=False, references=False, progress=lambda *step: told.append(step))
+    assert told == []  # kept in the run folders
+
+
+def test_each_analysis_can_be_skipped_from_the_command_line(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ask = ["report", str(trained), "--out", str(tmp_path / "r.html"), "--no-saliency", "--no-references"]
+    assert cli.main([*ask, "--no-recall"]) == cli.EXIT_OK
+    page = (tmp_path / "r.html").read_text()
+    assert 'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
+    assert cli.main([*ask, "--no-contamination"]) == cli.EXIT_OK
+    page = (tmp_path / "r.html").read_text()
+    assert 'id="contamination"' not in page and 'id="recall"' in page
+    assert not (tmp_path / "analysis").exists() and read_csv(trained / "results.csv")

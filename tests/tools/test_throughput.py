@@ -1,0 +1,90 @@
+"""``arcade-torch figure throughput``: from the file of ``bench envs`` to two panels and their numbers."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench import others
+from arcade_torch.tools.figures import throughput
+from arcade_torch.tools.files import read_csv, write_csv
+
+RATES = {"step+draw": 100.0, "step": 1000.0, "env": 60.0, "collector": 80.0, "fill": 5000.0, "copy": 4000.0}
+
+
+def write_bench(path: Path, **changes: Any) -> Path:
+    """A file as ``bench envs`` writes it: two games, two batch sizes, the second game twice as fast."""
+    rows = [
+        {"game": game, "obs_size": 128, "num_envs": count, "measure": name, "frames": 10}
+        | {"frames_per_s": 2 * rate * times * count, "frames_per_s_with_check": rate * times * count}
+        | throughput.this_machine()
+        | changes
+        for times, game in ((1, "AEasy"), (2, "BEasy"))
+        for count in (1, 16)
+        for name, rate in RATES.items()
+    ]
+    return write_csv(path, rows, list(rows[0]))
+
+
+def figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, list[dict[str, str]]]:
+    assert cli.main(["figure", "throughput", "--runs", str(tmp_path / "b.csv"), "--out", str(tmp_path)]) == cli.EXIT_OK
+    return capsys.readouterr().out, read_csv(tmp_path / "throughput.csv")
+
+
+def rate(rows: list[dict[str, str]], series: str, kind: str, envs: int) -> float:
+    key = (series, kind, str(envs))
+    return next(float(row["frames_per_s"]) for row in rows if (row["series"], row["kind"], row["num_envs"]) == key)
+
+
+def test_rates_are_those_with_every_frame_consumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(throughput, "installed", list)
+    write_bench(tmp_path / "b.csv")
+    text, rows = figure(tmp_path, capsys)
+    assert "not compared, not installed: gymnax, ale_py" in text
+    assert (tmp_path / "throughput.png").read_bytes().startswith(b"\x89PNG")
+    assert rate(rows, "BEasy", "drawing", 16) == 3200 and rate(rows, "BEasy", "no drawing", 16) == 32000
+    assert rate(rows, "compiled step", "mean or other", 1) == 150
+    assert rate(rows, "writing the same bytes", "mean or other", 16) == 120_000
+
+
+def test_other_packages_join_only_on_the_machine_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(throughput, "installed", lambda: ["gymnax"])
+    fake = [others.Other("gymnax CartPole-v1", False, [7.0, 9.0])]
+    monkeypatch.setattr(throughput, "bench_others", lambda packages, batches: iter(fake))
+    write_bench(tmp_path / "b.csv")
+    text, rows = figure(tmp_path, capsys)
+    assert "not compared, not installed: ale_py" in text
+    assert rate(rows, "gymnax CartPole-v1 (no pixels)", "mean or other", 16) == 9
+    write_bench(tmp_path / "b.csv", cores=4096)
+    text, rows = figure(tmp_path, capsys)
+    assert "measured elsewhere (its cores is '4096'" in text and not any("gymnax" in row["series"] for row in rows)
+
+
+@pytest.mark.parametrize("package", list(others.PACKAGES))
+def test_other_packages_are_measured_where_they_are_installed(package: str) -> None:
+    pytest.importorskip(package)
+    for found in others.bench_others([package], [1, 2], seconds=0.01, repeats=1):
+        assert len(found.rates) == 2 and min(found.rates) > 0
+
+
+def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_bench(tmp_path / "b.csv")
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    (tmp_path / "e.csv").write_text(",".join(throughput.NEEDED) + "\n")
+    wrong = {
+        "throughput is drawn from one file": [],
+        "b.csv does not exist": ["--runs", str(tmp_path / "nowhere" / "b.csv")],
+        "is a folder: give the CSV file": ["--runs", str(tmp_path)],
+        "x.csv has no column game": ["--runs", str(tmp_path / "x.csv")],
+        "e.csv has no column game": ["--runs", str(tmp_path / "e.csv")],
+        "are there for returns": ["--paper"],
+    }
+    for message, words in wrong.items():
+        assert cli.main(["figure", "throughput", "--out", str(tmp_path / "f"), *words]) == cli.EXIT_BAD_INPUT
+        err = capsys.readouterr().err
+        assert (message in err or "numbers are there for" in err) and err.count("\n") == 1, err
