@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -80,14 +80,14 @@ def _prepare(shape: Shape) -> Callable[[], Any]:
     layout = torch.channels_last if last else torch.contiguous_format
     x = torch.rand(shape.size, dtype=weight.dtype, device=weight.device).contiguous(memory_format=layout)
     bias = None if conv.bias is None else conv.bias.detach()
-    arguments: Any = (conv.stride, conv.padding, conv.dilation)
+    stride, padding, dilation = conv.stride, cast(tuple[int, ...], conv.padding), conv.dilation
 
     def run() -> Any:
-        out = torch.nn.functional.conv2d(x, weight, bias, *arguments, conv.groups)
+        out = torch.nn.functional.conv2d(x, weight, bias, stride, padding, dilation, conv.groups)
         sizes = None if bias is None else list(bias.shape)
         wanted = [not shape.first, True, bias is not None]
         return torch.ops.aten.convolution_backward(
-            out, x, weight, sizes, *arguments, False, [0, 0], conv.groups, wanted
+            out, x, weight, sizes, stride, padding, dilation, False, [0, 0], conv.groups, wanted
         )
 
     return run
