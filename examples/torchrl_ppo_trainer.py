@@ -10,6 +10,9 @@
 Whether all are closed is one number: before the first update the replayed log-probabilities are those of the rollout.
 
     python examples/torchrl_ppo_trainer.py --memory mingru --frames 60000
+
+prints a difference of 0.0e+00 and returns of 0.83 after 21,760 frames (without memory 0.25 is the most that can be
+expected), 0.98 after 32,000 and 0.99 after 52,480; 83 s of one CPU core.
 """
 
 import argparse

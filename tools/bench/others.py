@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from arcade_torch.tools.bench.timing import Measure, interleaved
+from arcade_torch.tools.optional import need
 
 PACKAGES = {"gymnax": ("CartPole-v1", "Breakout-MinAtar"), "ale_py": ("ALE/Pong-v5",)}
 """Import name -> which of its environments are measured."""
@@ -61,10 +62,9 @@ def _read(observation: Any) -> int:
 
 def _gymnax(name: str, count: int) -> Measure:
     """A vectorised and compiled step with auto-reset; new random actions and keys every step."""
-    import gymnax
     import jax
 
-    env, params = gymnax.make(name)
+    env, params = need("gymnax").make(name)
 
     @jax.jit
     def step(key: Any, state: Any) -> Any:
@@ -86,10 +86,8 @@ def _gymnax(name: str, count: int) -> Measure:
 
 def _gymnasium(name: str, count: int) -> Measure:
     """Gymnasium's synchronous vector of environments, as the paper ran Atari."""
-    import ale_py
-    import gymnasium
-
-    gymnasium.register_envs(ale_py)
+    gymnasium = need("gymnasium")
+    gymnasium.register_envs(need("ale_py"))
     env = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make(name)] * count)
     env.reset(seed=0)
     env.action_space.seed(0)

@@ -49,7 +49,9 @@ class BenchTrain:
 
         from arcade_torch.tools.bench.envs import machine
         from arcade_torch.tools.bench.train import bench_train
+        from arcade_torch.tools.keep_memory import keep_freed_memory
 
+        keep_freed_memory()  # as in training
         if self.threads:
             torch.set_num_threads(self.threads)
         told = bench_train(

@@ -51,9 +51,11 @@ class Train:
     def run(self) -> int:
         """Train."""
         from arcade_torch.agents import train
+        from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.studies.engines import watch_parent
 
         watch_parent()
+        keep_freed_memory()
         with TrainBar(str(self.folder())) as bar:
             result = train(self.config, self.folder(), resume=self.resume, progress=bar.update)
         if result.status == "interrupted":

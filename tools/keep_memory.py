@@ -1,0 +1,27 @@
+"""Freed memory stays with the process: without this a training on the CPU spends much of its time on page faults."""
+
+import ctypes
+import platform
+
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # of <malloc.h>
+_TRIM_BYTES, _PAD_BYTES = 2**31 - 1, 2**28
+
+
+def keep_freed_memory() -> bool:
+    """Have the C library use freed memory again instead of handing it back to the system.
+
+    The feature maps of one minibatch take hundreds of megabytes. By default glibc maps every such tensor anew, and the
+    system fills each of its pages with zeros before it is written; this process then keeps what it once had. No number
+    that is computed changes. A gradient step of the paper's network with LRU took 0.46 s of one core instead of 0.66 s,
+    and the process 1.3 GB instead of 0.85 GB. Elsewhere than on glibc nothing happens.
+
+    Returns:
+        Whether it was done.
+
+    Source: ``mallopt(3)``, ``M_MMAP_MAX`` and ``M_TRIM_THRESHOLD``.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt = ctypes.CDLL(None).mallopt
+    settings = {_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: _TRIM_BYTES, _M_TOP_PAD: _PAD_BYTES}
+    return all(mallopt(name, value) == 1 for name, value in settings.items())
