@@ -176,7 +176,7 @@ def test_bad_input_is_one_line(
 
 def test_the_help_names_every_figure() -> None:
     assert Figure.__doc__ is not None
-    listed = Figure.__doc__.split("Figures: ")[1].split(".")[0].split(", ")
+    listed = " ".join(Figure.__doc__.split()).split("Figures: ")[1].split(".")[0].split(", ")
     assert listed == list(FIGURES)
 
 
