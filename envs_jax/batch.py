@@ -4,6 +4,7 @@ Every env carries its own random key, so env ``i`` of a large batch walks the ve
 then resetting by mask gives the same bits as the fused step.
 """
 
+import abc
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -71,7 +72,44 @@ def _where(mask: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(choose, yes, no)
 
 
-class BatchedGame(Generic[State]):
+class Steps(abc.ABC):
+    """What a batch of one game and a batch of several do alike, put together from stepping, resetting and drawing."""
+
+    @abc.abstractmethod
+    def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
+        """Take one action in every env."""
+
+    @abc.abstractmethod
+    def _reset_where(self, batch: Batch, mask: Array) -> Batch:
+        """Begin a new episode where ``mask`` (bool [N]) is true."""
+
+    @abc.abstractmethod
+    def _render(self, batch: Batch) -> Array:
+        """Draw every env: uint8 [N, S, S, 3]."""
+
+    def _step_auto(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
+        """Step, begin anew where an episode ended, then draw once.
+
+        Returns:
+            The batch to go on with, the batch before the resets (its ended rows are the final states), what the step
+            gave, and the frames of the first.
+        """
+        stepped, outcome = self._step(batch, action)
+        root = self._reset_where(stepped, outcome.done)
+        return root, stepped, outcome, self._render(root)
+
+    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
+        """Step and draw, without any reset."""
+        stepped, outcome = self._step(batch, action)
+        return stepped, outcome, self._render(stepped)
+
+    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
+        """Begin anew where ``mask`` is true, and draw all."""
+        root = self._reset_where(batch, mask)
+        return root, self._render(root)
+
+
+class BatchedGame(Steps, Generic[State]):
     """Compiled functions over a batch of one game; each is compiled once per batch size.
 
     Args:
@@ -144,27 +182,6 @@ class BatchedGame(Generic[State]):
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""
         return jax.vmap(self.game.render)(batch.state, batch.partial)
-
-    def _step_auto(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
-        """Step, begin anew where an episode ended, then draw once.
-
-        Returns:
-            The batch to go on with, the batch before the resets (its ended rows are the final states), what the step
-            gave, and the frames of the first.
-        """
-        stepped, outcome = self._step(batch, action)
-        root = self._reset_where(stepped, outcome.done)
-        return root, stepped, outcome, self._render(root)
-
-    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
-        """Step and draw, without any reset."""
-        stepped, outcome = self._step(batch, action)
-        return stepped, outcome, self._render(stepped)
-
-    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
-        """Begin anew where ``mask`` is true, and draw all."""
-        root = self._reset_where(batch, mask)
-        return root, self._render(root)
 
     def _render_rows(self, batch: Batch, index: Array) -> Array:
         """Draw the envs in ``index`` (int32 [K]) alone: uint8 [K, S, S, 3]."""

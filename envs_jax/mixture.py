@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome
+from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Array, Game
 
 
@@ -67,7 +67,7 @@ class Mixture:
         return f"mixture({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
 
 
-class MixedGames:
+class MixedGames(Steps):
     """Compiled functions over a batch in which every env plays one of several games.
 
     Has the methods of ``BatchedGame`` with the same meaning, so that the bridge takes either. In the ``Batch`` only
@@ -162,22 +162,6 @@ class MixedGames:
         """Draw every env: uint8 [N, S, S, 3]."""
         parts = self._split(batch, batch.partial)
         return jnp.concatenate([_drawn_apart(group, part) for group, (part, _) in zip(self.groups, parts, strict=True)])
-
-    def _step_auto(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
-        """Step, begin anew where an episode ended, then draw once; see ``BatchedGame``."""
-        stepped, outcome = self._step(batch, action)
-        root = self._reset_where(stepped, outcome.done)
-        return root, stepped, outcome, self._render(root)
-
-    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
-        """Step and draw, without any reset."""
-        stepped, outcome = self._step(batch, action)
-        return stepped, outcome, self._render(stepped)
-
-    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
-        """Begin anew where ``mask`` is true, and draw all."""
-        root = self._reset_where(batch, mask)
-        return root, self._render(root)
 
     def _render_rows(self, batch: Batch, index: Array) -> Array:
         """The frames of the envs in ``index`` (int32 [K]): uint8 [K, S, S, 3]; all are drawn, unlike in one game."""

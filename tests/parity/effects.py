@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
+from arcade_torch.gym_ids import DIFFICULTIES, GAMES
 from arcade_torch.tools.files import write_text
 from arcade_torch.tools.versions import versions
 from tests.parity.faults import FAULTS, Fault, take_all
-from tests.parity.translations import GAMES, LEVELS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/differences.md"
 BEGIN, END = "<!-- effects: begin -->\n", "<!-- effects: end -->\n"
@@ -92,7 +92,7 @@ def measure(games: Iterable[str]) -> tuple[list[str], list[str]]:
     for game in games:
         own = [fault for fault in FAULTS if fault.game == game]
         changes: dict[str, list[dict[str, Returns]]] = {fault.ids: [] for fault in own}
-        for level in LEVELS:
+        for level in DIFFICULTIES:
             task, start = game + level, time.perf_counter()
             reference = make(task, rules="reference")
             before = returns(reference, reference)

@@ -2,22 +2,10 @@
 
 from importlib import import_module
 
+from arcade_torch.gym_ids import DIFFICULTIES, GAMES
 from tests.parity.translation import Translation
 
-GAMES = (
-    "AutoEncode",
-    "BattleShip",
-    "Breakout",
-    "CartPole",
-    "CountRecall",
-    "MineSweeper",
-    "Navigator",
-    "NoisyCartPole",
-    "Skittles",
-    "Tetris",
-)
-LEVELS = ("Easy", "Medium", "Hard")
-TASKS = tuple(game + level for game in GAMES for level in LEVELS)
+TASKS = tuple(game + level for game in GAMES for level in DIFFICULTIES)
 
 
 def translation_of(task: str) -> Translation:
