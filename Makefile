@@ -14,18 +14,19 @@ PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow lint bench parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-triton lint bench parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make install    build $(VENV) with the versions of constraints.txt"
 	@echo "make demo       a small study of memory, ending in an HTML report"
 	@echo "make test       the tests (make test-slow: the long ones)"
+	@echo "                (make test-triton: the Triton kernels on the CPU; installs triton, 1 GB, into $(VENV))"
 	@echo "make lint       ruff and mypy"
-	@echo "make bench      frames per second of the environments"
+	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
 	@echo "                (make bench-parity: the ratio of speed to it, game by game)"
-	@echo "make docs       these pages and the API reference in build/docs"
+	@echo "make docs       the documentation as a site in build/docs, API reference included"
 	@echo "make clean      remove build output and caches (make distclean: and $(VENV))"
 
 install: $(VENV)/.installed
@@ -44,6 +45,10 @@ $(VENV)/.docs: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[docs]'
 	@touch $@
 
+$(VENV)/.triton: $(VENV)/.installed
+	$(PIP) --no-build-isolation -e '.[triton]'
+	@touch $@
+
 $(VENV)/.parity: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[parity]'
 	@touch $@
@@ -52,10 +57,13 @@ demo: install
 	$(VENV)/bin/arcade-torch demo $(ARGS)
 
 test: install
-	$(ONE_THREAD) $(RUN) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(ONE_THREAD) $(RUN) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart=1 $(ARGS)
 
 test-slow: install
-	$(ONE_THREAD) $(RUN) -m pytest -m slow $(ARGS)
+	$(ONE_THREAD) $(RUN) -m pytest -m slow --timeout=3600 $(ARGS)
+
+test-triton: $(VENV)/.triton
+	TRITON_INTERPRET=1 $(ONE_THREAD) $(RUN) -m pytest -m triton --timeout=3600 tests/models/test_scan_triton.py $(ARGS)
 
 lint: install
 	$(RUN) -m ruff check .
@@ -63,16 +71,17 @@ lint: install
 	$(RUN) -m mypy
 
 bench: install
-	$(VENV)/bin/arcade-torch bench envs $(ARGS)
+	$(VENV)/bin/arcade-torch bench all $(ARGS)
 
 parity: $(VENV)/.parity
-	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity tests/parity $(ARGS)
+	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity --timeout=3600 tests/parity $(ARGS)
 
 bench-parity: $(VENV)/.parity
 	$(RUN) -m tests.parity.bench $(ARGS)
 
 docs: $(VENV)/.docs
-	$(RUN) docs/build.py build/docs
+	NO_MKDOCS_2_WARNING=1 $(ONE_THREAD) $(RUN) -m mkdocs build --strict --site-dir build/docs
+	@echo "documentation: $(CURDIR)/build/docs/index.html (to search it: $(PYTHON) -m http.server -d build/docs --bind 127.0.0.1)"
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -4,23 +4,45 @@ import doctest
 import importlib
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
+from arcade_torch.models import registry
+from arcade_torch.tools import cli, extensions
+
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "results").glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 LINKED = ("envs_jax", "models", "agents", "tools")
-FENCE = re.compile(r"^```(?P<language>\w+)\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
+SLOW = "<!-- slow -->"
+FENCE = re.compile(
+    rf"(?P<slow>^{SLOW}\n)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^(?P=indent)```$", re.MULTILINE | re.DOTALL
+)
+INLINE = re.compile(r"(?<!`)`arcade-torch ([^`]+)`(?!`)")
+PLACEHOLDER = re.compile(r"[A-Z][A-Z_]+$")  # a word such as NAME or COMMAND stands for something else
+
+
+class Block(NamedTuple):
+    line: int
+    code: str
+    slow: bool
+
+
+def fenced(text: str, language: str) -> list[Block]:
+    """The fenced blocks of a page in one language; what stands below `SLOW` takes long."""
+    found = [match for match in FENCE.finditer(text) if match["language"] == language]
+    return [Block(text[: m.start("code")].count("\n") + 1, m["code"], bool(m["slow"])) for m in found]
 
 
 def blocks(path: Path, language: str) -> list[tuple[int, str]]:
     """The fenced blocks of a page in one language, each with the line it begins at."""
-    text = path.read_text(encoding="utf-8")
-    found = FENCE.finditer(text)
-    return [(text[: m.start()].count("\n") + 2, m["code"]) for m in found if m["language"] == language]
+    return [block[:2] for block in fenced(path.read_text(encoding="utf-8"), language)]
+
+
+def without_code(text: str) -> str:
+    """A page without its fenced blocks: what stands there is no heading and no link."""
+    return FENCE.sub("", text)
 
 
 def name(path: Path) -> str:
@@ -50,13 +72,32 @@ def documented_modules() -> list[str]:
     return sorted(module.removesuffix(".__init__") for module in found)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
+def python_pages() -> list[object]:
+    """Pages with Python on them; those with a block that takes long are left to `make test-slow`."""
+    found = {page: fenced(page.read_text(encoding="utf-8"), "python") for page in PAGES}
+    return [
+        pytest.param(page, id=name(page), marks=[pytest.mark.slow] * any(block.slow for block in found[page]))
+        for page in PAGES
+        if found[page]
+    ]
+
+
+@pytest.mark.parametrize("page", python_pages())
 def test_the_python_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))  # a page may register a model of its own
     namespace: dict[str, object] = {"__name__": "__example__"}
     for line, code in blocks(page, "python"):
         # Blank lines in front: a traceback names the line of the page.
         exec(compile("\n" * (line - 1) + code, str(page), "exec"), namespace)
+
+
+def test_a_block_below_the_mark_is_slow_and_every_block_is_found() -> None:
+    text = "a\n```python\n1\n```\n<!-- slow -->\n```python\n2\n```\n- item\n\n  ```python\n  3\n  ```\n"
+    assert [(block.line, block.slow) for block in fenced(text, "python")] == [(3, False), (7, True), (12, False)]
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert len(re.findall(r"^ *```\w", text, re.MULTILINE)) == len(FENCE.findall(text)), name(page)
 
 
 def test_the_readme_has_examples_of_environment_collector_and_memory() -> None:
@@ -83,46 +124,62 @@ def test_every_make_target_that_is_named_exists() -> None:
             assert target in targets, f"{name(page)} names `make {target}`, the Makefile has {sorted(targets)}"
 
 
-def commands() -> list[tuple[str, ...]]:
-    """Every `arcade-torch` command on any page, with its options."""
-    lines = {line for page in PAGES for _, code in blocks(page, "bash") for line in code.splitlines()}
-    split = (tuple(shlex.split(line, comments=True)) for line in lines)
-    return sorted(words[1:] for words in split if words and words[0] == "arcade-torch")
+def command_lines() -> list[tuple[str, ...]]:
+    """Every `arcade-torch` command in a shell block of any page, with its options."""
+    code = [code for page in PAGES for _, code in blocks(page, "bash")]
+    lines = {line for text in code for line in text.replace("\\\n", " ").splitlines()}
+    split = (shlex.split(line, comments=True) for line in lines)
+    return sorted({tuple(words[words.index("arcade-torch") + 1 :]) for words in split if "arcade-torch" in words})
 
 
-@pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_every_command_that_is_named_exists_with_its_options(words: tuple[str, ...]) -> None:
-    options = [word.split("=")[0] for word in words if word.startswith("--") and word != "--help"]
-    command = []
-    for word in words:
-        if not re.fullmatch(r"[a-z][a-z-]*", word):
-            break
-        command.append(word)
-    result = subprocess.run(
-        [sys.executable, "-m", "arcade_torch.tools", *command, "--help"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    assert " ".join(command) in result.stdout
-    for option in options:
-        assert option in result.stdout
+@pytest.mark.parametrize("words", command_lines(), ids=" ".join)
+def test_every_command_is_one_that_the_parser_takes(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    imports, rest = extensions.take_imports(list(words))
+    assert all(Path(path).is_file() for path in imports)
+    command, options = cli.split_command(rest)
+    module = importlib.import_module(f"arcade_torch.tools.commands.{cli.COMMANDS[command].module}")
+    try:
+        if hasattr(module, "parse"):
+            module.parse(options, f"arcade-torch {command}")
+        else:
+            cli.parse(module.COMMAND, options, f"arcade-torch {command}")
+    except SystemExit as stop:
+        assert "--help" in options and not stop.code
+
+
+def test_the_parser_refuses_what_does_not_exist() -> None:
+    module = importlib.import_module("arcade_torch.tools.commands.sheet")
+    with pytest.raises(ValueError, match="--stepps"):
+        cli.parse(module.COMMAND, ["--stepps", "3"], "arcade-torch sheet")
+
+
+def test_every_command_in_a_sentence_exists() -> None:
+    groups = {command.split()[0] for command in cli.COMMANDS if " " in command}
+    for page in PAGES:
+        for text in INLINE.findall(without_code(page.read_text(encoding="utf-8"))):
+            words = text.split()
+            if not (
+                PLACEHOLDER.match(words[0]) or words[0].startswith("-") or (words[:1] == words and words[0] in groups)
+            ):
+                cli.split_command(words)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as they are made on the site and by hosts of repositories."""
+    headings = re.findall(r"^#+ (.*)$", without_code(page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+    for target in re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8"))):
         if "://" in target:
             continue
         path, _, anchor = target.partition("#")
-        linked = (page.parent / path) if path else page
-        assert linked.exists(), f"{name(page)} links to {target}"
-        if anchor:
-            headings = re.findall(r"^#+ (.*)$", linked.read_text(encoding="utf-8"), re.MULTILINE)
-            anchors = {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
-            assert anchor in anchors, f"{name(page)} links to {target}"
+        linked = (page.parent / path).resolve() if path else page
+        assert linked.exists() and linked.is_relative_to(ROOT), f"{name(page)} links to {target}"
+        assert not anchor or anchor in anchors(linked), f"{name(page)} links to {target}"
 
 
 def test_the_table_of_environments_is_true() -> None:

@@ -1,6 +1,8 @@
-"""One picture of all games: both twins at both sizes, side by side and pixel by pixel."""
+"""Pictures of games pixel by pixel: all of them at both sizes, or some moments of one, always both twins."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from arcade_torch.tools.files import write_bytes
 from arcade_torch.tools.optional import need
 
 Picture = npt.NDArray[np.uint8]
+Moment = Callable[[], tuple[Picture, Picture]]
 GAP = 8
 PAPER = 255
 
@@ -27,6 +30,38 @@ def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> tuple[Pictu
     Returns:
         The frames of the MDP and of the POMDP twin: uint8 [S, S, 3] each.
     """
+    from arcade_torch.envs_jax import make
+
+    *_, last = _walk(id, obs_size, seed, min(steps, make(id, obs_size=obs_size).max_steps // 4))
+    return last()
+
+
+def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Picture:
+    """Some moments of one episode side by side, the MDP twin above the POMDP twin.
+
+    Args:
+        id: the game.
+        steps: how many steps were taken at each moment, rising from 0 or more.
+        obs_size: 128 or 256.
+        seed: of the episode.
+
+    Returns:
+        uint8 [height, width, 3].
+
+    Raises:
+        ValueError: steps do not rise, or the scripted player's episode ends before one of them.
+    """
+    if not steps or steps[0] < 0 or any(a >= b for a, b in pairwise(steps)):
+        raise ValueError(f"steps must be whole numbers that rise from 0 or more, got {list(steps)}")
+    moments = list(_walk(id, obs_size, seed, steps[-1]))
+    if len(moments) <= steps[-1]:
+        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay below")
+    columns = [np.concatenate(_spaced(moments[step](), 0)) for step in steps]
+    return np.concatenate(_spaced(columns, 1), 1)
+
+
+def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
+    """What draws both twins of each state of an episode, from the first to that after `steps` or before the end."""
     import jax
 
     from arcade_torch.envs_jax import BatchedGame, env_keys, make
@@ -34,15 +69,28 @@ def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> tuple[Pictu
 
     game = make(id, obs_size=obs_size)
     batched, player = BatchedGame(game), make_oracle(game)
+
+    def draw(batch: Any) -> tuple[Picture, Picture]:
+        twins = (batched.render(batch._replace(partial=np.array([hides]))) for hides in (False, True))
+        full, hidden = (np.asarray(frames)[0] for frames in twins)
+        return full, hidden
+
     batch = batched.init(env_keys(seed, 1), np.zeros(1, bool))
-    for step in range(min(steps, game.max_steps // 4)):
+    yield partial(draw, batch)
+    for step in range(steps):
         action = player.act(jax.tree.map(np.asarray, batch.state), np.array([step == 0]))
-        after, outcome = batched.step(batch, action.astype(np.int32))
+        batch, outcome = batched.step(batch, action.astype(np.int32))
         if outcome.done[0]:
-            break
-        batch = after
-    full, partial = (np.asarray(batched.render(batch._replace(partial=np.array([twin]))))[0] for twin in (False, True))
-    return full, partial
+            return
+        yield partial(draw, batch)
+
+
+def _spaced(pictures: Sequence[Picture], axis: int) -> list[Picture]:
+    """The pictures with a gap between each two along an axis."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, PAPER, np.uint8)
+    return [part for picture in pictures for part in (gap, picture)][1:]
 
 
 def sheet(ids: Sequence[str], columns: int = 2) -> Picture:

@@ -59,4 +59,4 @@ for name, result in found.items():
 #   know. That is contamination.
 #
 # Noise takes frames out of what training has seen. `shuffled_beginning` permutes early frames instead, each of them a
-# frame of the game. For whole studies: `arcade-torch contamination RUNS ...`, with `--shuffle`.
+# frame of the game. For whole studies: `arcade-torch analyze contamination RUNS ...`, with `--shuffle`.

@@ -70,4 +70,4 @@ for name, share in shares.items():
 
 # %% [markdown]
 # One episode is an example, not a result: `recall_density.ipynb` averages over many. From the command line, on any
-# run: `arcade-torch saliency RUN`.
+# run: `arcade-torch analyze saliency RUN`.

@@ -24,7 +24,7 @@ class Examples:
 
     Attributes:
         frames: uint8 [R, F, S, S, 3], some frames of each version; row 0 is undisturbed.
-        names: [R][F], what each frame is.
+        names: R rows of F, what each frame is.
         values: float64 [R, A] at the last step: relative Q-values (minus their mean), or probabilities.
         labels: [R], what was done.
         target: which outputs.
