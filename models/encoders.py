@@ -5,6 +5,8 @@ An encoder also says what of a frame is worth storing (``compress``) and learns 
 and gradients reach them.
 """
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -88,6 +90,20 @@ _PAPER_LAYERS: dict[int, list[tuple[tuple[int, int], tuple[int, int] | None]]] =
 _PAPER_CHANNELS = (3, 64, 128, 256, 512)
 
 
+def _in_phases(x: Tensor, conv: nn.Conv2d) -> Tensor:
+    """A convolution of stride 2 as one of stride 1 over the four phases of the picture, [N, C, H, W] with even H, W.
+
+    The same sums in another order. Its gradient with respect to the picture is two to three times as fast on a CPU:
+    three channels fill a fifth of a vector register, twelve most of one. Forward it is slower, so it is
+    for frames whose gradient is wanted.
+    """
+    out, channels, kernel, _ = conv.weight.shape
+    half = (kernel + 1) // 2
+    weight = F.pad(conv.weight, (0, kernel % 2, 0, kernel % 2)).reshape(out, channels, half, 2, half, 2)
+    weight = weight.permute(0, 1, 3, 5, 2, 4).reshape(out, 4 * channels, half, half)
+    return F.conv2d(F.pixel_unshuffle(x, 2), weight, conv.bias)
+
+
 class PaperEncoder(Encoder):
     """The paper's CNN: four convolutions (64, 128, 256, 512 channels), LeakyReLU, three max pools, 512 features.
 
@@ -119,8 +135,10 @@ class PaperEncoder(Encoder):
 
     def features(self, frames: Tensor) -> Tensor:
         """[N, S, S, 3] -> [N, 512]."""
-        x = frames.permute(0, 3, 1, 2).to(self.layers[0].weight.dtype) / 255  # type: ignore[arg-type]
-        return self.layers(x).flatten(1)  # type: ignore[no-any-return]
+        first, rest = cast(nn.Conv2d, self.layers[0]), self.layers[1:]
+        x = frames.permute(0, 3, 1, 2).to(first.weight.dtype) / 255
+        convolved = _in_phases(x, first) if x.requires_grad else first(x)
+        return rest(convolved).flatten(1)  # type: ignore[no-any-return]
 
 
 class SmallEncoder(Encoder):

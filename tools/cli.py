@@ -66,9 +66,14 @@ COMMANDS: dict[str, Command] = {
     "figure": Command("figure", "draw one of the paper's figures from run folders"),
     "play": Command("play", "play a game by hand, in a window or in the terminal"),
     "record": Command("record", "a GIF or MP4 of a random, scripted or trained player"),
+    "bench all": Command("bench_all", "every benchmark into one file, and a page of its tables"),
+    "bench compare": Command("bench_compare", "what became better or worse between two such files"),
     "bench envs": Command("bench_envs", "frames per second of the games, every frame consumed"),
     "bench train": Command("bench_train", "frames per second of training, and where the time goes"),
     "bench memory": Command("bench_memory", "time and memory of the memory models and of the scans behind them"),
+    "bench saliency": Command(
+        "bench_saliency", "saliency maps in two stages against the whole network action by action"
+    ),
     "bench recall": Command("bench_recall", "delayed recall: which model remembers one symbol for how long"),
 }
 

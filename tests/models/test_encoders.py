@@ -32,6 +32,19 @@ def test_the_papers_encoder_equals_the_textbook_order_activation_then_pool():
     torch.testing.assert_close(encoder(pixels), x.flatten(1))
 
 
+@pytest.mark.parametrize("size", [128, 256])
+def test_the_gradient_of_the_papers_encoder_with_respect_to_frames_is_that_of_its_layers(size):
+    encoder = PaperEncoder(size).double()
+    pixels = frames(2, size=size).double().requires_grad_()
+    plain = encoder.layers(pixels.permute(0, 3, 1, 2) / 255).flatten(1)
+    features = encoder(pixels)
+    torch.testing.assert_close(features, plain, rtol=0, atol=1e-12)
+    cotangent = torch.randn_like(plain)
+    wanted = torch.autograd.grad(plain, [pixels, *encoder.parameters()], cotangent)
+    found = torch.autograd.grad(features, [pixels, *encoder.parameters()], cotangent)
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
+
+
 @given(
     block=st.sampled_from([1, 2, 4, 8]),
     lead=st.lists(st.integers(0, 3), max_size=2),

@@ -60,7 +60,7 @@ def saliency(
     reduce: Reduce = "per_action",
     norm: Norm = "l2sq",
     target: Target = "auto",
-    chunk: int = 16,
+    chunk: int = 8,
     dtype: torch.dtype = torch.float32,
 ) -> Saliency:
     """Gradient of the outputs at step n with respect to every frame up to n.

@@ -92,7 +92,7 @@ def recall_density(
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
-    chunk: int = 16,
+    chunk: int = 8,
     progress: Progress | None = None,
 ) -> RecallDensity:
     """Recall density of an agent over whole greedy episodes.
@@ -134,7 +134,7 @@ def density_of_windows(
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
-    chunk: int = 16,
+    chunk: int = 8,
     progress: Callable[[int], None] | None = None,
 ) -> RecallDensity:
     """Recall density over windows of experience of your own; the last frame of each is explained.
