@@ -67,8 +67,10 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import ``MemoryModule``, and TorchRL with it, on first use."""
-    if name != "MemoryModule":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
-    return import_module("arcade_torch.models.module").MemoryModule
+if not TYPE_CHECKING:  # a checker is to find misspelt names
+
+    def __getattr__(name: str) -> Any:
+        """Import ``MemoryModule``, and TorchRL with it, on first use."""
+        if name != "MemoryModule":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+        return import_module("arcade_torch.models.module").MemoryModule

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.base import Memory, replay_by_steps
-from arcade_torch.models.rotary import angles, rotate
+from arcade_torch.models.rotary import angles, rotate, rotate_pairs
 
 __all__ = ["Attention", "window_attention", "window_attention_loop"]
 
@@ -65,9 +65,11 @@ class Attention(Memory):
         if not self.carry_cache and x.shape[1] > 1:
             valid = torch.zeros_like(valid)
         episode = torch.cat([torch.where(valid, 0, -1), is_init.cumsum(1)], dim=1)
-        hidden = (episode < 0).unsqueeze(-1)
-        keys = torch.cat([state["key"][:, 1:], self.key(x)], dim=1).masked_fill_(hidden, 0)
-        values = torch.cat([state["value"][:, 1:], self.value(x)], dim=1).masked_fill_(hidden, 0)
+        keys = torch.cat([state["key"][:, 1:], self.key(x)], dim=1)
+        values = torch.cat([state["value"][:, 1:], self.value(x)], dim=1)
+        if x.shape[1] > 1 or not _known_to_be_none(is_init):  # else what is hidden holds zeros already
+            hidden = (episode < 0).unsqueeze(-1)
+            keys, values = keys.masked_fill_(hidden, 0), values.masked_fill_(hidden, 0)
         y = window_attention(self.query(x), keys, values, episode, self.window)
         valid = episode[:, -self.window :] == episode[:, -1:]
         if x.shape[1] > 1:  # else nothing else is hidden
@@ -84,6 +86,16 @@ class Attention(Memory):
     def extra_repr(self) -> str:
         """Sizes and options, for printing."""
         return f"{super().extra_repr()}, window={self.window}, carry_cache={self.carry_cache}"
+
+
+def _known_to_be_none(flags: Tensor) -> bool:
+    """Whether no flag is set; False where finding out costs something (a card, a graph) or cannot be done (vmap)."""
+    if torch.compiler.is_compiling() or flags.device.type != "cpu":
+        return False
+    try:
+        return not bool(flags.any())
+    except RuntimeError:  # vmap: every row has flags of its own
+        return False
 
 
 def window_attention(
@@ -120,13 +132,13 @@ def window_attention(
     bad = ~value.sum(-1).isfinite() if length > 1 else None  # acting: what is not seen has been zeroed
     if bad is not None:
         value = value.masked_fill(bad.unsqueeze(-1), 0)  # a weight of zero would not stop it
-    queries = rotate(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
+    queries = rotate_pairs(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
     keys, values = (x.unfold(1, stretch, size).mT for x in (key, value))
     episodes = episode.unfold(1, stretch, size)
     distance = index[past:, None] - index
     seen = (distance >= 0) & (distance < window) & (episodes[..., past:, None] == episodes[..., None, :])
     # Spelled out: on a CPU as fast as scaled_dot_product_attention with a mask, which vmap runs row by row.
-    score = queries / math.sqrt(query.shape[-1]) @ rotate(keys, cosine, sine).mT
+    score = queries / math.sqrt(query.shape[-1]) @ rotate_pairs(keys, cosine, sine).mT
     if bad is not None:
         score = score + torch.where(bad, torch.nan, 0.0).to(score.dtype).unfold(1, stretch, size).unsqueeze(-2)
     y = torch.where(seen, score, -torch.inf).softmax(-1) @ values

@@ -1,19 +1,26 @@
 """The operators behind ``linear_scan``: forward and backward, registered with torch (autograd, vmap, compile).
 
-Back ends by device: a serial loop, in place over time and vectorised over batch and features; on CUDA the doubling
-form, ``log2(T)`` passes over the whole tensor. The backward pass is the same recurrence run the other way on conj(a)
-shifted by one; its own derivative is again a scan, so gradients of any order exist.
+Back ends by device: a serial loop, in place over time and vectorised over batch and features; on CUDA the kernels of
+``scan_triton``, or, without Triton or for other dtypes, the doubling form, ``log2(T)`` passes over the whole tensor.
+The backward pass is the same recurrence run the other way on conj(a) shifted by one; its own derivative is again a
+scan, so gradients of any order exist.
 
 Inside the operators conj() is spelled conj_physical(): compiled code (torch 2.13, aot and inductor) calls them in a way
 in which the lazy conj() is silently lost.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["scan", "scan_backward"]
+from arcade_torch.models.scan_triton import runs_triton, scan_backward_triton, scan_triton
+
+__all__ = ["back_end", "scan", "scan_backward"]
+
+_forced: str | None = None
 
 
 @torch.library.custom_op("arcade_torch::linear_scan", mutates_args=())
@@ -29,6 +36,11 @@ def scan(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
     Returns:
         [B, T, ...].
     """
+    return BACK_ENDS[_back_end_of(b)][0](a, b, start, h0)
+
+
+def scan_serial(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
+    """A loop over time, in place."""
     starts = _start_masks(start, b.ndim)
     out = b.clone(memory_format=torch.contiguous_format)
     h = h0
@@ -54,6 +66,11 @@ def scan_backward(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: 
         (grad_a, grad_b): grad_b_t = grad_t + conj(a_{t+1}) grad_b_{t+1}, where nothing crosses a start, and
         grad_a_t = grad_b_t conj(h_{t-1}), zero at a start.
     """
+    return BACK_ENDS[_back_end_of(grad)][1](a, start, h0, h, grad)
+
+
+def scan_backward_serial(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+    """The backward pass as a loop."""
     starts = _start_masks(start, a.ndim)
     grad_b = grad.clone(memory_format=torch.contiguous_format)
     factors, rows = torch.conj_physical(a).unbind(1), grad_b.unbind(1)
@@ -76,7 +93,6 @@ def _start_masks(start: Tensor | None, ndim: int) -> dict[int, Tensor]:
     return {t: masks[t] for t, begins in enumerate(start.any(0).tolist()) if begins}
 
 
-@scan.register_kernel("cuda")
 def scan_doubling(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
     """Parallel form (Hillis and Steele 1986): after the pass with shift s an entry covers the 2s steps up to it."""
     closed = _closed_at_starts(start, b)
@@ -92,7 +108,6 @@ def scan_doubling(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Ten
     return h
 
 
-@scan_backward.register_kernel("cuda")
 def scan_backward_doubling(
     a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -110,6 +125,47 @@ def _closed_at_starts(start: Tensor | None, like: Tensor) -> Tensor:
     if start is None:
         start = torch.zeros(like.shape[:2], dtype=torch.bool, device=like.device)
     return start.reshape(start.shape + (1,) * (like.ndim - 2))
+
+
+BACK_ENDS = {
+    "serial": (scan_serial, scan_backward_serial),
+    "doubling": (scan_doubling, scan_backward_doubling),
+    "triton": (scan_triton, scan_backward_triton),
+}
+"""Name -> what solves forward and backward."""
+
+
+def _back_end_of(x: Tensor) -> str:
+    if _forced is not None:
+        return _forced
+    if not x.is_cuda:
+        return "serial"
+    return "triton" if runs_triton(x) else "doubling"
+
+
+@contextmanager
+def back_end(name: str) -> Iterator[None]:
+    """Inside, every scan of this process runs by one back end, whatever the device: for tests and benchmarks.
+
+    Args:
+        name: key of `BACK_ENDS`. "triton" on a CPU needs ``TRITON_INTERPRET=1`` in the environment from the start.
+
+    Raises:
+        ValueError: there is no such back end.
+
+    Example:
+        >>> with back_end("doubling"):
+        ...     scan(torch.full((1, 3), 0.5), torch.ones(1, 3), None, torch.zeros(1)).tolist()
+        [[1.0, 1.5, 1.75]]
+    """
+    global _forced
+    if name not in BACK_ENDS:
+        raise ValueError(f"no back end {name!r}; there are {', '.join(BACK_ENDS)}")
+    before, _forced = _forced, name
+    try:
+        yield
+    finally:
+        _forced = before
 
 
 # Shapes, derivatives and vmap rules.

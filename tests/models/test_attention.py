@@ -4,10 +4,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
 from arcade_torch.models import MemoryLawError, check_memory, make_memory
 from arcade_torch.models.attention import window_attention, window_attention_loop
-from arcade_torch.models.rotary import angles, rotate
+from arcade_torch.models.rotary import angles, rotate, rotate_pairs
 
 F64 = torch.float64
 
@@ -90,6 +91,38 @@ def test_only_the_distance_of_two_steps_matters():
         products.append(rotate(q, cosine[0], sine[0]) @ rotate(k, cosine[1], sine[1]))
     torch.testing.assert_close(torch.stack(products), products[0].expand(4), rtol=0, atol=1e-9)
     assert (rotate(q, *(a[0] for a in angles(torch.tensor([3]), 7, F64))) @ k - q @ k).abs() > 1e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64, torch.bfloat16])
+@pytest.mark.parametrize("width", [1, 2, 7, 8])
+def test_pairs_are_turned_in_place_whatever_their_memory_looks_like(width, dtype):
+    cosine, sine = angles(torch.arange(5), width, dtype)
+    wide = torch.randn(3, 5, 2 * width + 2, dtype=dtype)
+    views = [torch.randn(3, 5, width, dtype=dtype), wide[..., 1 : width + 1], wide[..., 2 : width + 2], wide[..., ::2]]
+    for x in (view[..., :width].requires_grad_() for view in views):
+        turned, apart = rotate_pairs(x, cosine, sine), rotate(x, cosine, sine)
+        even = width // 2 * 2
+        order = [*range(0, even, 2), *range(1, even, 2), *range(even, width)]
+        torch.testing.assert_close(turned[..., order], apart)
+        weight = torch.randn_like(turned)
+        ours = torch.autograd.grad(turned, x, weight)[0]
+        torch.testing.assert_close(ours, torch.autograd.grad(apart, x, weight[..., order])[0])
+
+
+def test_acting_under_vmap_with_flags_that_differ_equals_one_batch():
+    memory = make_memory("attention", 3, 4, window=5)
+    _, state = memory(torch.randn(6, 9, 3), memory.initial_state(6), flags(6, 9))
+    x, is_init = torch.randn(6, 1, 3), torch.arange(6).reshape(6, 1) % 2 == 0
+
+    def act(x, is_init, *leaves):
+        rows = TensorDict({n: leaf.unsqueeze(0) for n, leaf in zip(state.keys(), leaves, strict=True)}, batch_size=[1])
+        y, after = memory(x.unsqueeze(0), rows, is_init.unsqueeze(0))
+        return y[0], after["key"][0]
+
+    y, after = memory(x, state, is_init)
+    mapped = torch.vmap(act)(x, is_init, *state.values())
+    for ours, together in zip(mapped, (y, after["key"]), strict=True):
+        torch.testing.assert_close(ours, together)
 
 
 def test_the_state_is_the_window_newest_last_and_empty_slots_hold_zeros():

@@ -1,12 +1,15 @@
 """The linear scan: every form equals the plain loop, and its derivatives equal finite differences."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from arcade_torch.models import scan_ops, scan_triton
 from arcade_torch.models.scan import linear_scan, linear_scan_loop
-from arcade_torch.models.scan_ops import scan, scan_backward, scan_backward_doubling, scan_doubling
+from arcade_torch.models.scan_ops import back_end, scan, scan_backward, scan_backward_doubling, scan_doubling
 
 DTYPES = [torch.float64, torch.complex128]
 
@@ -202,3 +205,27 @@ def test_wrong_shapes_get_one_clear_line(change, message):
     arguments = {"a": torch.zeros(2, 5, 3), "b": torch.zeros(2, 5, 3)} | change
     with pytest.raises(ValueError, match=message):
         linear_scan(**arguments)
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_a_card_runs_triton_where_it_can_and_the_doubling_form_elsewhere(installed, monkeypatch):
+    monkeypatch.setattr(scan_triton, "_kernels", lambda: object() if installed else None)
+    for dtype in (torch.float32, torch.float64, torch.complex64, torch.complex128, torch.bfloat16):
+        on_card = "triton" if installed and dtype != torch.bfloat16 else "doubling"
+        assert scan_ops._back_end_of(SimpleNamespace(is_cuda=True, dtype=dtype)) == on_card
+        assert scan_ops._back_end_of(SimpleNamespace(is_cuda=False, dtype=dtype)) == "serial"
+
+
+def test_a_back_end_can_be_chosen_for_a_while_and_a_wrong_one_is_refused():
+    a, b, start, h0 = problem(grad=True)
+    with pytest.raises(ValueError, match="serial, doubling, triton"), back_end("parallel"):
+        pass
+    expected = linear_scan(a, b, start, h0)
+    grads = torch.autograd.grad(expected.sum(), (a, b, h0))
+    with pytest.raises(KeyError), back_end("doubling"):
+        found = linear_scan(a, b, start, h0)
+        torch.testing.assert_close(found, expected)
+        for ours, theirs in zip(torch.autograd.grad(found.sum(), (a, b, h0)), grads, strict=True):
+            torch.testing.assert_close(ours, theirs)
+        raise KeyError
+    assert scan_ops._back_end_of(b) == "serial"

@@ -7,8 +7,10 @@ import torch
 
 from arcade_torch.models import linear_scan, lru
 from arcade_torch.tools import cli
+from arcade_torch.tools.bench.back_ends import bench_back_ends
 from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, forms, looped, peak_bytes
 from arcade_torch.tools.bench.scans import FORMS, unbind_loop
+from arcade_torch.tools.commands.bench_memory import show_back_ends
 from arcade_torch.tools.files import read_csv
 
 
@@ -49,6 +51,17 @@ def test_peak_memory_is_what_was_held_at_a_time_and_not_what_was_allocated() -> 
         return None
 
     assert 8000 <= peak_bytes(work) < 8200
+
+
+def test_back_ends_are_timed_beside_a_copy_and_compared_with_the_loop(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("doubling", "serial")
+    rows = list(bench_back_ends(torch.device("cpu"), (5, 9), 2, 3, names=names, repeats=2))
+    keys = [(row.steps, row.numbers, row.back_end) for row in rows]
+    assert keys == [(t, numbers, name) for t in (5, 9) for numbers in ("real", "complex") for name in names]
+    for row in rows:
+        assert row.error < 1e-5 and min(row.forward_ms, row.backward_ms, row.forward_share, row.backward_share) > 0
+    show_back_ends(rows, "a processor")
+    assert "linear scan on a processor" in capsys.readouterr().out
 
 
 def test_the_command_prints_both_tables_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

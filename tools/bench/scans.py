@@ -51,7 +51,7 @@ def chunked(a: Tensor, b: Tensor) -> Tensor:
 
 
 def doubling(a: Tensor, b: Tensor) -> Tensor:
-    """log2(T) passes over the whole tensor (Hillis and Steele 1986): the back end of CUDA."""
+    """log2(T) passes over the whole tensor (Hillis and Steele 1986): the back end of CUDA without Triton."""
     h: Tensor = scan_doubling(a, b, None, torch.zeros_like(b[:, 0]))
     return h
 

@@ -17,7 +17,8 @@ class BenchMemory:
     """Time and memory of the memory models, each scan beside its own loop and torch.nn.GRU; then of the scans alone.
 
     Measures take turns; the best turn counts. Peak memory is what torch's allocator had handed out (its profiler's
-    events), the same on every machine.
+    events), the same on every machine. Where there is a CUDA device, a third table has the back ends of the scan there,
+    each as a share of the speed of a plain copy of the same bytes in the same run.
 
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory
     """
@@ -39,13 +40,16 @@ class BenchMemory:
     repeats: int = 3
     """Turns."""
     out: Path | None = None
-    """Beginning of the names of two files, OUT_models.csv and OUT_scans.csv; overwritten."""
+    """Beginning of the names of the files: OUT_models.csv, OUT_scans.csv, with CUDA OUT_back_ends.csv; overwritten."""
 
     def run(self) -> int:
         """Measure, print, save."""
         if min((1, *self.steps, *self.layers, self.size, self.batch, self.threads)) < 1:
             raise ValueError("steps, layers, size, batch and threads must be at least 1")
+        import torch
+
         from arcade_torch.models import memory_names
+        from arcade_torch.tools.bench.back_ends import BackEndRow, bench_back_ends
         from arcade_torch.tools.bench.memory import Row, bench_memory
         from arcade_torch.tools.bench.scans import ScanRow, bench_scans
         from arcade_torch.tools.versions import versions
@@ -56,9 +60,15 @@ class BenchMemory:
         rows = self._collect(
             "models", Row, bench_memory(names, self.steps, self.layers, self.size, self.batch, tell=_tell, **how)
         )
+        on_card: list[Any] = []
+        if torch.cuda.is_available():
+            found = bench_back_ends(torch.device("cuda"), self.steps, self.batch, self.size, tell=_tell)
+            on_card = self._collect("back_ends", BackEndRow, found)
         shape = f"B = {self.batch}, H = {self.size}, float32, torch threads: {self.threads}"
         _show_models(rows, shape)
         _show_scans(scans, shape)
+        if on_card:
+            show_back_ends(on_card, f"{torch.cuda.get_device_name()}, B = {self.batch}, H = {self.size}")
         print(", ".join(f"{name} {value}" for name, value in versions().items() if value))
         return 0
 
@@ -123,3 +133,27 @@ def _show_scans(rows: Sequence[Any], shape: str) -> None:
         ]
         columns = ("form", "forward ms", "both ms", "to ours", "error")
         show_table(f"linear scan, T = {steps}, {numbers}, {shape}", columns, cells)
+
+
+def show_back_ends(rows: Sequence[Any], where: str) -> None:
+    """Print what the back ends of the scan do on a device.
+
+    Args:
+        rows: ``BackEndRow``.
+        where: the device and the sizes, for the title.
+    """
+    cells = [
+        (
+            row.back_end,
+            row.numbers,
+            str(row.steps),
+            f"{1e3 * row.forward_ms:.0f}",
+            f"{100 * row.forward_share:.0f} %",
+            f"{1e3 * row.backward_ms:.0f}",
+            f"{100 * row.backward_share:.0f} %",
+            f"{row.error:.1g}",
+        )
+        for row in rows
+    ]
+    columns = ("back end", "numbers", "T", "forward us", "of copy", "backward us", "of copy", "error")
+    show_table(f"linear scan on {where}", columns, cells, left=2)
