@@ -52,7 +52,9 @@ def afmhot(values: NDArray[np.floating]) -> Floats:
 
 
 def scaled(maps: NDArray[np.floating], sigma_px: float) -> tuple[Floats, float]:
-    """Smoothed maps on one scale for the whole row.
+    """Smoothed maps on one scale for the whole row: the square root of the share of the brightest value.
+
+    The root makes a frame visible that has a hundredth of the brightest; norms that are squares become lengths.
 
     Args:
         maps: float [T, H, W], not negative.
@@ -63,7 +65,7 @@ def scaled(maps: NDArray[np.floating], sigma_px: float) -> tuple[Floats, float]:
     """
     soft = smooth(maps, sigma_px)
     peak = float(soft.max(initial=0.0))
-    return (soft / peak if peak > 0 else soft), peak
+    return (np.sqrt(soft / peak) if peak > 0 else soft), peak
 
 
 def overlay(frames: Image, heat: NDArray[np.floating], alpha: float = 0.5) -> Image:

@@ -37,6 +37,8 @@ MEASURES = {
     "change": "change of A / spread of A",
     "kl": "KL(pi || pi') in nats",
 }
+LEAST_SCALE = 0.1
+"""Axes reach at least so far, so that nothing looks like much."""
 STARTS_AN_EPISODE = 2
 """The figure takes twice as many start points as it is asked for episodes."""
 
@@ -128,12 +130,14 @@ def lines(plt: Any, agents: Mapping[str, Pooled], first: Contamination, title: s
     figure, axes = plt.subplots(
         len(shown), columns, figsize=size, squeeze=False, sharex=True, sharey="row", layout="constrained"
     )
-    places = np.arange(len(first.delays))
+    reached = [np.isfinite(mean).any(0) for value in agents.values() for mean, _, _ in value.values.values()]
+    count = int(np.flatnonzero(np.any(reached, axis=0))[-1]) + 1  # episodes may be shorter than the longest delay
+    places = np.arange(count)
     for row, name in enumerate(shown):
         for column, sigma in enumerate(first.sigmas):
             axis = axes[row, column]
             for place, (agent, value) in enumerate(agents.items()):
-                mean, low, high = (part[column] for part in value.values[name])
+                mean, low, high = (part[column, :count] for part in value.values[name])
                 colour = agent_colour(agent, place)
                 x = places + 0.1 * (place - (len(agents) - 1) / 2)
                 axis.plot(x, mean, color=colour, marker=MARKERS[place % len(MARKERS)], label=agent)
@@ -142,10 +146,12 @@ def lines(plt: Any, agents: Mapping[str, Pooled], first: Contamination, title: s
                     errors = whiskers(low[known], mean[known], high[known])
                     axis.errorbar(x[known], mean[known], errors, fmt="none", ecolor=colour, capsize=2, lw=1)
             axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
-            axis.set_xticks(places, [str(delay) for delay in first.delays])
+            axis.set_xticks(places, [str(delay) for delay in first.delays[:count]])
             if row == 0 and np.isfinite(sigma):
                 axis.set_title(f"noise sigma = {sigma:g}")
         axes[row, 0].set_ylabel(MEASURES[name])
+        top = max(axes[row, 0].get_ylim()[1], LEAST_SCALE)
+        axes[row, 0].set_ylim(-0.05 * top, top)
     what = "steps from the noisy frame to the decision" if first.kind == "noise" else "steps from the shuffled frames"
     for axis in axes[-1]:
         axis.set_xlabel(what)

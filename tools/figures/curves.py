@@ -8,7 +8,17 @@ import numpy as np
 from arcade_torch.tools.analysis.curves import Curve, curves_of_runs
 from arcade_torch.tools.figures.registry import Made, Request
 from arcade_torch.tools.figures.runs import find_runs
-from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colour, drawing, footnote, inches, save, seeds_note
+from arcade_torch.tools.figures.style import (
+    DASHES,
+    MARKERS,
+    TWIN_NAMES,
+    agent_colour,
+    drawing,
+    footnote,
+    inches,
+    save,
+    seeds_note,
+)
 
 KINDS = {"eval_final": "eval", "train_max_ewm": "train"}
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
@@ -31,7 +41,9 @@ def make(request: Request) -> Made:
         figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
         for axis in axes.flat[len(tasks) :]:
             axis.set_axis_off()
+        of_game: dict[str, Any] = {}
         for axis, (game, twin) in zip(axes.flat, tasks, strict=False):
+            axis.sharey(of_game.setdefault(game, axis))  # twins are there to be compared
             here = [curve for curve in curves if (curve.game, curve.observability) == (game, twin)]
             _panel(axis, here, agents)
             axis.set_title(f"{game}, {TWIN_NAMES.get(twin, twin)}")
@@ -47,12 +59,13 @@ def _panel(axis: Any, curves: list[Curve], agents: list[str]) -> None:
     longest = max(float(curve.frames[-1]) for curve in curves)
     unit, name = (1e6, "million frames") if longest >= 2e6 else (1e3, "thousand frames")
     for curve in curves:
-        colour = agent_colour(curve.agent, agents.index(curve.agent))
+        place = agents.index(curve.agent)
+        colour = agent_colour(curve.agent, place)
         x = curve.frames / unit
         if np.isfinite(curve.low).any():
             axis.fill_between(x, curve.low, curve.high, color=colour, alpha=0.18, lw=0)
-        marker = "o" if x.size <= 12 else None
-        axis.plot(x, curve.mean, color=colour, label=curve.agent, marker=marker)
+        marker = MARKERS[place % len(MARKERS)] if x.size <= 12 else None
+        axis.plot(x, curve.mean, color=colour, label=curve.agent, marker=marker, ls=DASHES[place % len(DASHES)])
     axis.set_xlabel(name)
 
 

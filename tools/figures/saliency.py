@@ -37,6 +37,7 @@ def make(request: Request) -> Made:
         figure = saliency_figure(rows, show=SHOW)
         footnote(
             figure,
-            f"n = 1 episode a row, decision at n; sum over actions of |gradient|^2, {result.target}; no interval",
+            f"n = 1 episode a row, decision at n; sum over actions of |gradient|^2, {result.target}, brightness is its "
+            "square root; no interval",
         )
         return Made(save(figure, request.out / "saliency", numbers, arrays), found.notes)

@@ -31,6 +31,8 @@ AGENT_COLOURS = {
 
 SPARE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#5e3c10", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)))
+"""Lines that lie on one another are seen both."""
 
 MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")
 POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
