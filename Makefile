@@ -9,12 +9,15 @@ WORKERS ?= 2
 ARGS    ?=
 
 VENV := .venv
+OLDEST := .venv-oldest
+OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
+  models/test_memory_models.py agents/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
 RUN  := $(VENV)/bin/python
 PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow test-triton lint bench parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-oldest test-triton lint bench parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -22,6 +25,7 @@ help:
 	@echo "make demo       a small study of memory, ending in an HTML report"
 	@echo "make test       the tests (make test-slow: the long ones)"
 	@echo "                (make test-triton: the Triton kernels on the CPU; installs triton, 1 GB, into $(VENV))"
+	@echo "make test-oldest  a part of the tests with the oldest supported versions, in $(OLDEST)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
@@ -65,6 +69,15 @@ test-slow: install
 test-triton: $(VENV)/.triton
 	TRITON_INTERPRET=1 $(ONE_THREAD) $(RUN) -m pytest -m triton --timeout=3600 tests/models/test_scan_triton.py $(ARGS)
 
+$(OLDEST)/.installed: setup.cfg pyproject.toml constraints-oldest.txt
+	@$(OLDEST)/bin/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet -c constraints-oldest.txt torch==2.13.0 setuptools wheel
+	$(OLDEST)/bin/python -m pip install --quiet -c constraints-oldest.txt --no-build-isolation -e '.[tools]' hypothesis pytest pytest-timeout
+	@touch $@
+
+test-oldest: $(OLDEST)/.installed
+	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(OLDEST)/jax-cache $(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(ARGS)
+
 lint: install
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check --quiet .
@@ -88,4 +101,4 @@ clean:
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(OLDEST)

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -102,8 +103,37 @@ def list_checkpoints(folder: Path) -> list[Path]:
     """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames) first."""
     found = sorted((p for p in folder.glob("frames-*") if p.is_dir()), reverse=True)
     pointer = folder / _LATEST
-    latest = pointer.read_text().strip() if pointer.is_file() else ""
+    latest = pointer.read_text(encoding="utf-8", errors="replace").strip() if pointer.is_file() else ""
     return sorted(found, key=lambda p: p.name != latest)
+
+
+def checkpoint_frames(path: Path) -> int:
+    """Training frames that a checkpoint was saved at, by the name of its folder; -1 for another name.
+
+    Example:
+        >>> checkpoint_frames(Path("run/checkpoints/frames-000000204800"))
+        204800
+    """
+    digits = path.name.removeprefix("frames-")
+    return int(digits) if digits.isdecimal() else -1
+
+
+def discard_later(folder: Path, frames: int) -> None:
+    """Remove the checkpoints after ``frames``, of a run that goes on from there; that one becomes the latest.
+
+    Args:
+        folder: ``checkpoints/`` of a run.
+        frames: of the checkpoint gone on from; 0 for a run that starts over.
+    """
+    later = [path for path in list_checkpoints(folder) if checkpoint_frames(path) > frames]
+    if not later:
+        return
+    if frames:
+        write_atomic(folder / _LATEST, f"frames-{frames:012d}\n")
+    else:
+        (folder / _LATEST).unlink(missing_ok=True)
+    for path in later:
+        shutil.rmtree(path)
 
 
 def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only: bool = False) -> Checkpoint:
@@ -134,7 +164,10 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
             raise CheckpointError(f"checkpoint {path} is damaged: {part} is missing")
         if _checksum(path / part) != sums.get(part):
             raise CheckpointError(f"checkpoint {path} is damaged: {part} does not have the checksum in {_META}")
-    weights = load_file(path / _WEIGHTS)
+    try:
+        weights = load_file(path / _WEIGHTS)
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise CheckpointError(f"checkpoint {path} is damaged: {_WEIGHTS} holds no tensors ({error})") from error
     trainer = None if weights_only else _load_trainer(path)
     return Checkpoint(config, frames, weights, trainer, path)
 
@@ -186,8 +219,11 @@ def load_latest(
 def _load_trainer(path: Path) -> dict[str, Any]:
     try:
         state: dict[str, Any] = from_plain(torch.load(path / _TRAINER, map_location="cpu", weights_only=True))
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+    except pickle.UnpicklingError as error:
         raise CheckpointError(f"{_TRAINER} in {path} holds more than tensors, numbers and text; not loaded") from error
+    except Exception as error:  # torch and zipfile name damage in many ways
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise CheckpointError(f"{_TRAINER} in {path} is damaged; not loaded ({reason})") from error
     return state
 
 
@@ -196,8 +232,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
     if not file.is_file():
         raise CheckpointError(f"{path} is not a checkpoint: {_META} is missing")
     try:
-        meta: Any = json.loads(file.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        meta: Any = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} is not JSON ({error})") from error
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         found = meta.get("format") if isinstance(meta, dict) else None

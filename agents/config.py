@@ -81,7 +81,7 @@ class TrainConfig:
         twins = ("full", "partial", "mixed")
         require(self.observability in twins, "observability", self.observability, "'full', 'partial' or 'mixed'")
         require(self.rules in ("default", "reference"), "rules", self.rules, "'default' or 'reference'")
-        require(self.algorithm in GROUPS, "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
+        require(self.algorithm in tuple(GROUPS), "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
         loggers = ("none", "tensorboard", "wandb")
         require(self.logger in loggers, "logger", self.logger, "'none', 'tensorboard' or 'wandb'")
         require(self.obs_size >= 1, "obs_size", self.obs_size, "a number of pixels >= 1")
@@ -126,6 +126,7 @@ class TrainConfig:
         Raises:
             ValueError: a field is unknown, has the wrong type, or holds a value that is not allowed.
         """
+        require(isinstance(plain, Mapping), "a config", plain, "a table of fields")
         values, groups = dict(plain), {}
         for name, kind in GROUPS.items():
             numbers = values.pop(name, {})
@@ -151,7 +152,7 @@ def _checked(cls: type, values: Mapping[str, Any], prefix: str) -> dict[str, Any
     known = {f.name for f in dataclasses.fields(cls)}
     unknown = sorted(set(values) - known)
     if unknown:
-        raise ValueError(f"unknown field {prefix}{unknown[0]}; fields: {', '.join(sorted(known))}")
+        raise ValueError(f"unknown field {prefix + unknown[0]!r}; fields: {', '.join(sorted(known))}")
     return {name: coerce(prefix + name, value, hints[name]) for name, value in values.items()}
 
 
@@ -166,7 +167,8 @@ def coerce(name: str, value: Any, kind: Any) -> Any:
         require(whole and not isinstance(value, bool), name, value, "a whole number")
         return int(value)
     if kind is float:
-        require(isinstance(value, (int, float)) and not isinstance(value, bool), name, value, "a number")
+        is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**1000)
+        require(is_number and not isinstance(value, bool), name, value, "a number")
         return float(value)
     if kind is str:
         require(isinstance(value, str), name, value, "a string")

@@ -38,9 +38,37 @@ def read_json(path: Path) -> Any:
         ValueError: it does not hold JSON.
     """
     try:
-        return json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # no text, no JSON, a number of thousands of digits, nested too deeply
         raise ValueError(f"{path} does not hold JSON: {error}") from error
+
+
+def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
+    """Whether something is the content of the ``eval.json`` of a finished run, with numbers where numbers belong.
+
+    Args:
+        values: what the file holds.
+        needed: keys that have to be there.
+    """
+    if not isinstance(values, dict) or values.get("status", "finished") != "finished" or not set(needed) <= set(values):
+        return False
+    returns, lengths = values.get("returns", []), values.get("lengths", [])
+    if not all(isinstance(part, list) and all(map(_is_number, part)) for part in (returns, lengths)):
+        return False
+    if not all(isinstance(length, int) for length in lengths) or ("mean" not in values and not returns):
+        return False
+    if "mean" in values and not _is_number(values["mean"]):
+        return False
+    rest = ("std", "ci", "n", "frames", "seconds", "train_max_ewm")
+    return all(values.get(name) is None or _is_number(values[name]) for name in rest)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that can be squared; NaN is one."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) > 1e15
 
 
 class CsvLog:
@@ -73,14 +101,28 @@ class CsvLog:
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a table, without an unfinished or damaged last one."""
-    text = path.read_text()
-    whole = text[: text.rfind("\n") + 1]
-    rows = list(csv.reader(whole.splitlines()))
+    """Rows of a table whose first column is ``frames``, without an unfinished or damaged last one.
+
+    Raises:
+        ValueError: it is no such table.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        rows = list(csv.reader(whole.splitlines()))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is damaged, it is no table: {error}") from error
     if not rows:
         return []
     header = rows[0]
-    return [dict(zip(header, row, strict=True)) for row in rows[1:] if len(row) == len(header) and row[0].isdigit()]
+    if header.count("frames") != 1 or header[0] != "frames":
+        raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
+    return [dict(zip(header, row, strict=True)) for row in rows[1:] if len(row) == len(header) and _counts(row[0])]
+
+
+def _counts(cell: str) -> bool:
+    """Whether a cell is a number of frames; 15 digits are more than anybody trains."""
+    return cell.isascii() and cell.isdigit() and len(cell) <= 15
 
 
 def _cell(value: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import arcade_torch
 from arcade_torch.agents.config import TrainConfig, differing_fields
-from arcade_torch.agents.files import CsvLog, read_json, write_json
+from arcade_torch.agents.files import CsvLog, is_final, read_json, write_json
 from arcade_torch.agents.lease import LOCK, Lease
 
 METRIC_COLUMNS = (
@@ -137,7 +137,8 @@ class RunFolder:
             result = read_json(file)
         except ValueError:
             return None
-        return result if isinstance(result, dict) and result.get("status") == "finished" else None
+        needed = ("status", "frames", "seconds", "returns", "lengths", "train_max_ewm")
+        return result if is_final(result, needed) and result["frames"] is not None else None
 
     def open_logs(self, frames: int) -> tuple[CsvLog, CsvLog]:
         """``metrics.csv`` and ``eval.csv``, cut back to ``frames``."""

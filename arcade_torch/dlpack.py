@@ -32,6 +32,8 @@ share_gpu()
 
 import jax  # noqa: E402  (after share_gpu)
 
+from arcade_torch.envs_jax.shown import shown  # noqa: E402
+
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
 _CPU_ALIGNMENT_BYTES = 64
 
@@ -154,8 +156,8 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
         device = "cuda" if on_gpu else "cpu"
     try:
         wanted = torch.device(device)
-    except (RuntimeError, TypeError) as error:
-        raise ValueError(f"device is {device!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"device is {shown(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
     if wanted.type == "cpu":
         return torch.device("cpu"), jax.devices("cpu")[0]
     if wanted.type != "cuda":

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from arcade_torch import specs
+from arcade_torch import border, specs
 from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
 from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
 from arcade_torch.endings import FinalStates
@@ -29,22 +29,6 @@ class RawStep(NamedTuple):
     pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
     step: Step  # everything else
     any_done: bool  # whether some episode ended
-
-
-def check_num_envs(num_envs: int) -> None:
-    """Refuse anything but a positive int.
-
-    Args:
-        num_envs: What arrived.
-
-    Raises:
-        TypeError: Not an int.
-        ValueError: Not positive.
-    """
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int):
-        raise TypeError(f"num_envs is {num_envs!r}, expected an int of 1 or more")
-    if num_envs < 1:
-        raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
 
 
 class ArcadeEnv(EnvBase):
@@ -93,7 +77,9 @@ class ArcadeEnv(EnvBase):
         task_in_td: bool | None = None,
         debug: bool = False,
     ) -> None:
-        check_num_envs(num_envs)
+        border.check_num_envs(num_envs)
+        flags_given = (categorical_actions, state_in_td, task_in_td, debug)
+        border.check_flags("categorical_actions state_in_td task_in_td debug", flags_given)
         flags = partial_flags(observability, num_envs)
         torch_device, jax_device = pick_devices(device)
         super().__init__(device=torch_device, batch_size=[num_envs])
@@ -242,6 +228,7 @@ class ArcadeEnv(EnvBase):
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
+        border.check_tensor(action, "action")
         num_actions, shape = self.game.num_actions, (self.num_envs,)
         if self.one_hot:
             if action.shape != (*shape, num_actions):
@@ -260,22 +247,28 @@ class ArcadeEnv(EnvBase):
 
     # -- TorchRL's methods ------------------------------------------------------------------------------------------
 
+    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
+        border.check_tensordict(tensordict, self.num_envs)
+
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
     ) -> TensorDictBase:
         if set_state and tensordict is not None and "state" in tensordict:
             return self.set_state(tensordict["state"])
-        mask = tensordict.get("_reset", None) if tensordict is not None else None
         # A mask that is true everywhere is no special case: other random numbers would be drawn than on the fused path.
-        rows = np.ones(self.num_envs, np.bool_) if mask is None else mask.reshape(self.num_envs).cpu().numpy()
+        rows = np.ones(self.num_envs, np.bool_)
+        if tensordict is not None and "_reset" in tensordict:
+            rows = border.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         batch, pixels = self._batched.reset_render(self._live.batch, rows)
-        frames = to_torch(pixels, self.device)
+        root = self._root(batch, to_torch(pixels, self.device))
+        if tensordict is not None and not rows.all():
+            border.check_merge(tensordict, root)
         self._live.replace(batch)
-        return self._root(batch, frames)
+        return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._load_state_of(tensordict)
-        action = self._check_action(tensordict["action"])
+        action = self._check_action(border.tensor(tensordict, "action"))
         argument = int32_argument(action)
         stepped, outcome, pixels = self._batched.step_render(self._live.batch, argument)
         frames = to_torch(pixels, self.device)
@@ -288,11 +281,11 @@ class ArcadeEnv(EnvBase):
         return following
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        self._assert_tensordict_shape(tensordict)
         if self._state_in_td or "_step" in tensordict or self._post_step_mdp_hooks is not None:
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
             return stock
-        self._assert_tensordict_shape(tensordict)
-        action = tensordict["action"]
+        action = border.tensor(tensordict, "action")
         raw = self.step_raw(action)
         self._live.generation += 1
         last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
@@ -327,7 +320,7 @@ class ArcadeEnv(EnvBase):
     def _load_state_of(self, tensordict: TensorDictBase) -> None:
         """With ``state_in_td``, go on from the state the caller handed over."""
         if self._state_in_td:
-            self._live.replace(self._snapshots.load(tensordict["state"]))
+            self._live.replace(self._snapshots.load(tensordict.get("state", None)))
 
     def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""

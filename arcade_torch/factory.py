@@ -5,8 +5,9 @@ from typing import Any
 
 import torch
 
+from arcade_torch.border import check_num_envs
 from arcade_torch.compiled import compiled_game
-from arcade_torch.env import ArcadeEnv, check_num_envs
+from arcade_torch.env import ArcadeEnv
 from arcade_torch.observability import Observability, resolve_observability
 
 

@@ -4,6 +4,8 @@ from typing import Literal
 
 import torch
 
+from arcade_torch.envs_jax.shown import shown
+
 Observability = Literal["full", "partial"] | torch.Tensor
 
 _ALLOWED = "allowed: 'full', 'partial', or a bool tensor with one flag an env (True = partial)"
@@ -29,7 +31,7 @@ def partial_flags(observability: Observability, num_envs: int) -> torch.Tensor:
     """
     if isinstance(observability, str):
         if observability not in ("full", "partial"):
-            raise ValueError(f"observability is {observability!r}, {_ALLOWED}")
+            raise ValueError(f"observability is {shown(observability)}, {_ALLOWED}")
         return torch.full((num_envs,), observability == "partial")
     if not isinstance(observability, torch.Tensor):
         raise TypeError(f"observability is a {type(observability).__name__}, {_ALLOWED}")
@@ -60,5 +62,7 @@ def resolve_observability(observability: Observability | None, partial_obs: bool
     if observability is not None:
         raise ValueError("both observability and partial_obs are given: keep observability, partial_obs is its alias")
     if not isinstance(partial_obs, bool):
-        raise TypeError(f"partial_obs is {partial_obs!r}, allowed: True, False; for a mixed batch use observability")
+        raise TypeError(
+            f"partial_obs is {shown(partial_obs)}, allowed: True, False; for a mixed batch use observability"
+        )
     return partial_flags("partial" if partial_obs else "full", num_envs)

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
+from arcade_torch.border import check_tensor
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
@@ -29,6 +30,22 @@ def fingerprint(game_id: str) -> int:
 def _names(path: tuple[Any, ...]) -> tuple[str, ...]:
     """Key path of a pytree leaf as names."""
     return tuple(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path)
+
+
+def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
+    return torch.from_numpy(np.empty(0, dtype)).dtype
+
+
+def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
+    """A leaf of a state, or one line about what stands in its place."""
+    value: Any = td
+    for depth, name in enumerate(path):
+        value = value.get(name, None) if isinstance(value, TensorDictBase) else None
+        if value is None:
+            raise ValueError(f"the state has no entry {'.'.join(path[: depth + 1])!r}: pass what get_state() gave")
+    check_tensor(value, f"state entry {'.'.join(path)!r}")
+    leaf: torch.Tensor = value
+    return leaf
 
 
 class Snapshots:
@@ -83,30 +100,34 @@ class Snapshots:
 
         Raises:
             ValueError: Another game, another number of envs, or leaves that are missing, or of another shape or type.
+            TypeError: Not a TensorDict, or a leaf that is no tensor.
         """
         self._check_game(td)
         arrays = []
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
-            name, tensor = ".".join(key), td.get(key, None)
-            if tensor is None:
-                raise ValueError(f"the state has no entry {name!r}: pass what get_state() gave")
-            value = tensor.detach().to("cpu", copy=True).numpy()
-            value = value.view(dtype) if dtype in _SIGNED and value.dtype.itemsize == dtype.itemsize else value
-            if value.dtype != dtype or value.shape != shape:
+            name, tensor = ".".join(key), _entry(td, key)
+            same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
+            if tensor.dtype not in same_bits or tensor.shape != shape:
+                found = str(tensor.dtype).removeprefix("torch.")
                 raise ValueError(
-                    f"state entry {name!r} is {value.dtype} {value.shape}, {self._game_id} with {self._num_envs} envs "
-                    f"expects {dtype} {tuple(shape)}"
+                    f"state entry {name!r} is {found} {tuple(tensor.shape)}, {self._game_id} with {self._num_envs} "
+                    f"envs expects {dtype} {tuple(shape)}"
                 )
+            value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
             arrays.append(jax.device_put(value, self._jax_device))
         return self._batched.narrow(jax.tree_util.tree_unflatten(self._tree, arrays))
 
     def _check_game(self, td: TensorDictBase) -> None:
         """Refuse the state of another game or of another number of envs."""
+        if not isinstance(td, TensorDictBase):
+            raise TypeError(f"the state is a {type(td).__name__}: pass what get_state() gave")
         if td.batch_size != (self._num_envs,):
             raise ValueError(f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} envs")
-        game = td.get("game", None)
-        if game is None:
-            raise ValueError("the state has no entry 'game': pass what get_state() gave")
+        game = _entry(td, ("game",))
+        if game.dtype is not torch.int64 or game.shape != (self._num_envs,):
+            raise ValueError(
+                f"state entry 'game' is {game.dtype} {tuple(game.shape)}, expected torch.int64 ({self._num_envs},)"
+            )
         differs = (game.cpu() != self._games).nonzero()
         if len(differs):
             env = int(differs[0])
@@ -120,7 +141,7 @@ class Snapshots:
         spec = Composite(shape=(num_envs,), device=device)
         spec["game"] = Unbounded(shape=(num_envs,), dtype=torch.int64, device=device)
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
-            torch_dtype = _SIGNED.get(dtype) or torch.from_numpy(np.empty(0, dtype)).dtype
+            torch_dtype = _SIGNED.get(dtype) or _torch_dtype(dtype)
             inner = spec
             for name in key[:-1]:
                 if name not in inner:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import Array, Game
+from arcade_torch.envs_jax.shown import shown
 
 State = TypeVar("State")
 
@@ -51,12 +52,15 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         uint32 [num_envs, 2].
 
     Raises:
+        TypeError: The seed is no whole number.
         ValueError: The seed is out of range.
 
     Example:
         >>> bool((env_keys(3, 8)[5:] == env_keys(3, 3, first=5)).all())
         True
     """
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
+        raise TypeError(f"seed is {shown(seed)}, expected a whole number from 0 to 4294967295")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)

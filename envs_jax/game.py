@@ -5,6 +5,8 @@ from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import jax
 
+from arcade_torch.envs_jax.shown import shown
+
 Array = jax.Array
 Rules = Literal["default", "reference"]
 State = TypeVar("State")
@@ -91,5 +93,6 @@ def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     Raises:
         ValueError: ``value`` is not one of ``allowed``.
     """
-    if isinstance(value, bool) or value not in allowed:
-        raise ValueError(f"{what} is {value!r}, allowed: {', '.join(map(repr, allowed))}")
+    kinds = tuple({type(one) for one in allowed})
+    if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
+        raise ValueError(f"{what} is {shown(value)}, allowed: {', '.join(map(repr, allowed))}")

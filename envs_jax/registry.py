@@ -8,6 +8,7 @@ from typing import Any
 
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import OBS_SIZES, RULES, Game, check_choice
+from arcade_torch.envs_jax.shown import shown
 
 Factory = Callable[..., Game[Any]]
 
@@ -85,7 +86,7 @@ def resolve_id(id: str) -> str:
         'NoisyCartPoleEasy-v0'
     """
     if not isinstance(id, str):
-        raise TypeError(f"the env id is {id!r}, expected a string such as 'CartPoleEasy'")
+        raise TypeError(f"the env id is {shown(id)}, expected a string such as 'CartPoleEasy'")
     match = _VERSIONED.match(id)
     name = match["name"] if match else id
     name = _ALIASES.get(name, name)
@@ -93,13 +94,13 @@ def resolve_id(id: str) -> str:
     if wanted in _FACTORIES:
         return wanted
     if match and name in _NEWEST:
-        raise ValueError(f"unknown version in env id {id!r}: the newest is {_NEWEST[name]!r}")
+        raise ValueError(f"unknown version in env id {shown(id)}: the newest is {_NEWEST[name]!r}")
     known = {known.lower(): known for known in (*_NEWEST, *_ALIASES)}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
     raise ValueError(
-        f"unknown env id {id!r}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a game of your "
-        "own has to be registered first, on the command line with --import"
+        f"unknown env id {shown(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a game of "
+        "your own has to be registered first, on the command line with --import"
     )
 
 

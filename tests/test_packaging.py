@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LINKED = ("envs_jax", "models", "agents", "tools")
 # What the build reads. Nothing else is copied, so that old build output cannot slip into the wheel.
 SOURCES = (*LINKED, "arcade_torch", "setup.cfg", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
-METADATA = ("CHANGELOG.md", "CONTRIBUTING.md", "constraints.txt")
+METADATA = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "constraints.txt", "constraints-oldest.txt")
 
 STEP_AN_ENV = """
 import importlib.util, pathlib, sys

@@ -38,7 +38,7 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
             rest.append(word)
             continue
         name = value if equals else next(pending, "")
-        if not name:
+        if not name or "\0" in name:
             raise ValueError(f"{FLAG} needs a file (games.py) or a module (package.games) that registers something")
         found.append(str(Path(name).resolve()) if _is_file(name) else name)
     return found, rest

@@ -52,7 +52,10 @@ def write_between(page: Path, begin: str, end: str, text: str) -> Path:
     Raises:
         ValueError: the page has no such marks.
     """
-    old = page.read_text(encoding="utf-8")
+    try:
+        old = page.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{page} is not text in UTF-8: {error}") from error
     if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
         raise ValueError(f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes between them")
     before, after = old.partition(begin)[0], old.partition(end)[2]
@@ -75,7 +78,10 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} does not exist") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # no text, no JSON, a number of thousands of digits, nested too deeply
         raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it from a copy") from error
 
 
@@ -100,7 +106,7 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it has no header, or a line with more cells than the header.
+        ValueError: it is no text, has no header, a name twice in it, or a line of another length.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -109,8 +115,14 @@ def read_csv(path: Path) -> list[dict[str, str]]:
             header = reader.fieldnames
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} does not exist") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is not CSV in UTF-8: {error}") from error
     if not header:
         raise ValueError(f"{path} is empty: expected CSV with a header line")
     if any(None in row for row in rows):
         raise ValueError(f"{path} has a line with more cells than its header names")
+    if any(None in row.values() for row in rows):
+        raise ValueError(f"{path} has a line with fewer cells than its header names")
+    if len(set(header)) != len(header) or any(name.splitlines() not in ([name], []) for name in header):
+        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
     return rows

@@ -22,5 +22,5 @@ def name_and_value(text: str) -> tuple[str, Any]:
         raise ValueError(f"an option is written NAME=VALUE, got {text!r}")
     try:
         return name, json.loads(value.lower() if value in ("True", "False") else value)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):  # no JSON, or numbers and nesting that Python does not read
         return name, value

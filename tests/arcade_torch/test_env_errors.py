@@ -78,7 +78,7 @@ def test_a_tensordict_of_another_batch_size_is_refused() -> None:
     env.reset()
     td = TensorDict({"action": torch.zeros(2, dtype=torch.int64)}, [2])
     for step in (env.step, env.step_and_maybe_reset):
-        with pytest.raises(RuntimeError, match="batch_size"):
+        with pytest.raises(ValueError, match="batch_size"):
             step(td.clone())
 
 

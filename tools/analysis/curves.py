@@ -85,8 +85,11 @@ def curves_of_runs(
 def _history(run: RunFolder, kind: str) -> tuple[Array, Array]:
     name, column = ("eval.csv", "mean") if kind == "eval" else ("metrics.csv", "train_return_ewm")
     rows = [row for row in run.table(name) if row.get(column)]
-    frames = np.array([float(row["frames"]) for row in rows])
-    return frames, np.array([float(row[column]) for row in rows])
+    try:
+        frames = np.array([float(row["frames"]) for row in rows])
+        return frames, np.array([float(row[column]) for row in rows])
+    except ValueError as error:
+        raise ValueError(f"{run.path / name} is damaged: {error}") from None
 
 
 def _curve(

@@ -63,6 +63,9 @@ def read_scores(runs: Runs, metric: str = "eval_final") -> list[Score]:
     scores = _one_name_a_game(scores)
     seen: set[tuple[str, str, str, int]] = set()
     for score in scores:
+        for name in (score.agent, score.game):
+            if name.splitlines() != [name]:
+                raise ValueError(f"names of agents and games are one line, not {name!r}")
         key = (score.agent, score.game, score.observability, score.seed)
         if key in seen:
             raise ValueError(f"two scores for {score.agent} on {score.game} ({score.observability}), seed {score.seed}")
@@ -96,16 +99,24 @@ def _read_run(path: Path, metric: str) -> list[Score]:
     final, config = folder.final(), folder.config()
     if final is None:
         return []
-    value = final["mean"] if metric == "eval_final" else final["train_max_ewm"]
+    value = final.get("mean" if metric == "eval_final" else "train_max_ewm")
+    seed = config.get("seed", 0)
+    if value is None or type(seed) is not int or not {"memory", "env"} <= set(config):
+        raise ValueError(f"{path} does not say what was trained, with which seed, or how it scored ({metric})")
     twin = str(config.get("observability", "full"))
-    return [Score(str(config["memory"]), str(config["env"]), twin, int(config.get("seed", 0)), float(value))]
+    return [Score(str(config["memory"]), str(config["env"]), twin, seed, float(value))]
 
 
 def _read_table(path: Path, metric: str) -> list[Score]:
     rows = read_csv(path)
     header = set(rows[0]) if rows else set()
     if {"mdp_mean", "pomdp_mean"} <= header:
-        return [score for row in rows for score in _wide(row)]
+        if missing := sorted({"env", "model"} - header):
+            raise ValueError(f"{path} has no column for {', '.join(missing)}; it has {', '.join(sorted(header))}")
+        try:
+            return [score for row in rows for score in _wide(row)]
+        except ValueError as error:
+            raise ValueError(f"{path}: a mean is not a number ({error})") from None
     names = {role: next((name for name in choice if name in header), None) for role, choice in _roles(metric).items()}
     missing = [role for role, name in names.items() if name is None]
     if missing:

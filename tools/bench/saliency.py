@@ -95,7 +95,7 @@ def _ways(name: str, memory: str, steps: int, chunk: int) -> dict[str, Callable[
     def forward(x: Tensor) -> Tensor:
         features = network.encode(x)
         q, _ = network.remember(features[None], last_action[None], is_init[None], network.initial_state(1))
-        return q[0, -1]  # type: ignore[no-any-return]
+        return q[0, -1]
 
     def end_to_end(passes: int) -> Tensor:
         maps = torch.zeros(frames.shape[:-1])

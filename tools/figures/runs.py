@@ -117,6 +117,8 @@ def find_runs(paths: Sequence[Path]) -> Found:
         final, config = run.final(), run.config()
         if not {"env", "memory"} <= set(config):
             raise ValueError(f"{folder / 'config.json'} does not describe a run: it has no env or no memory")
+        if type(config.get("seed", 0)) is not int or not isinstance(config.get("network_options") or {}, dict):
+            raise ValueError(f"{folder / 'config.json'} is damaged: its seed or its network_options are of no use")
         if final is None:
             unfinished.append(folder.name)
         else:
@@ -159,5 +161,6 @@ def _comparable(runs: Sequence[Run]) -> list[str]:
         if cell in seen:
             raise ValueError(f"{seen[cell]} and {run.folder.path} are the same cell: give one of them")
         seen[cell] = run.folder.path
-    versions = sorted({str(run.folder.record().get("versions", {}).get("arcade_torch", "")) for run in runs} - {""})
+    made_with = [run.folder.record().get("versions") for run in runs]
+    versions = sorted({str(made.get("arcade_torch", "")) for made in made_with if isinstance(made, dict)} - {""})
     return [f"the runs were made with several versions of arcade_torch: {', '.join(versions)}"] * (len(versions) > 1)

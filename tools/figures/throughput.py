@@ -90,6 +90,13 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         raise ValueError(
             f"{path} has no column {missing[0]}: give the file that `arcade-torch bench envs --out FILE.csv` wrote"
         )
+    for row in rows:
+        for name, kind in (("obs_size", int), ("num_envs", int), ("frames_per_s_with_check", float)):
+            try:
+                if not 0 < kind(row[name]) < 10**12:
+                    raise ValueError
+            except ValueError:
+                raise ValueError(f"{path}: {name} is {row[name]!r}, expected a number above 0") from None
     if not any(row["measure"] == "step+draw" for row in rows):
         raise ValueError(f"{path} has no row with the measure step+draw: nothing to draw")
     return rows

@@ -75,6 +75,11 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
     rows = read_csv(path)
     if rows and tuple(rows[0]) != COLUMNS:
         raise ValueError(f"{path} is no table of human scores: its columns are {', '.join(rows[0])}")
+    if not rows and path.read_text(encoding="utf-8").strip() != ",".join(COLUMNS):
+        raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
+    for row in rows:
+        if not re.fullmatch(r"[0-9]{1,10}", row["seed"]):
+            raise ValueError(f"{path}: the seed {row['seed']!r} is no whole number")
     return rows
 
 
@@ -99,14 +104,31 @@ def replay(row: Mapping[str, Any]) -> Attempt:
         The episode, from the game's own rules.
 
     Raises:
-        ValueError: the actions go on after the end.
+        ValueError: the actions go on after the end, or the line is damaged.
     """
     found: list[Attempt] = []
-    game = compiled_game(row["game"], int(row["obs_size"]), row["rules"], json.loads(row["options"]))
-    session = Session(game, seed=int(row["seed"]), partial=row["observability"] == "partial", on_attempt=found.append)
+    seed, obs_size, options = _numbers(row)
+    game = compiled_game(row["game"], obs_size, row["rules"], options)
+    session = Session(game, seed=seed, partial=row["observability"] == "partial", on_attempt=found.append)
     for number, action in enumerate(row["actions"]):
         if session.end is not None:
             raise ValueError(f"{len(row['actions'])} actions, but the episode ends after {number}")
         session.press(ACTION_NAMES[int(action)])
     session.press("quit")
     return found[0]
+
+
+def _numbers(row: Mapping[str, Any]) -> tuple[int, int, dict[str, Any]]:
+    """Seed, size and options of a line; its actions are looked at too."""
+    if not re.fullmatch(r"[0-4]+", row["actions"]):
+        raise ValueError(f"actions are digits from 0 to 4, one a step, got {row['actions']!r}")
+    for name in ("seed", "obs_size"):
+        if not re.fullmatch(r"[0-9]{1,10}", str(row[name])):
+            raise ValueError(f"{name} is {row[name]!r}, expected a whole number")
+    try:
+        options = json.loads(row["options"])
+    except (ValueError, RecursionError):
+        options = None
+    if not isinstance(options, dict):
+        raise ValueError(f"options are {row['options']!r}, expected a JSON object")
+    return int(row["seed"]), int(row["obs_size"]), options

@@ -19,8 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.files import is_final
+from arcade_torch.agents.files import read_csv as read_log
 from arcade_torch.agents.lease import LOCK, Lease
-from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
+from arcade_torch.tools.files import read_json, write_csv, write_json
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.versions import versions
 
@@ -68,14 +70,14 @@ class RunFolder:
             values = read_json(self.path / "eval.json")
         except (OSError, ValueError):
             return None
-        return values if isinstance(values, dict) and values.get("status", "finished") == "finished" else None
+        return values if is_final(values) else None
 
     def progress(self) -> Progress | None:
         """What ``progress.json`` says, or None; a file just being replaced counts as none."""
         try:
             values = read_json(self.path / "progress.json")
             return Progress(int(values["frames"]), int(values["total_frames"]), str(values.get("status", "running")))
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
             return None
 
     def config(self) -> dict[str, Any]:
@@ -85,13 +87,17 @@ class RunFolder:
         return dict(inner) if isinstance(inner, dict) else {}
 
     def record(self) -> dict[str, Any]:
-        """All of ``config.json``: settings, versions, command."""
-        return dict(read_json(self.path / "config.json"))
+        """All of ``config.json``: settings, versions, command.
+
+        Raises:
+            ValueError: it is damaged.
+        """
+        return _mapping(self.path / "config.json")
 
     def table(self, name: str) -> list[dict[str, str]]:
         """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
         file = self.path / name
-        return read_csv(file) if file.exists() else []
+        return read_log(file) if file.exists() else []
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,7 @@ class StudyFolder:
 
     def record(self) -> dict[str, Any]:
         """All of ``study.json``."""
-        return dict(read_json(self.root / "study.json"))
+        return _mapping(self.root / "study.json")
 
     def claim(self, study: Study, command: str = "") -> None:
         """Write ``study.json``, or go on where the same study stands already.
@@ -178,7 +184,7 @@ class StudyFolder:
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
         commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
         # What the first runs were made with stays on record.
-        first, also = old.get("versions", versions()), list(old.get("also", []))
+        first, also = old.get("versions", versions()), _list(old.get("also"))
         also += [] if versions() in (first, *also) else [versions()]
         made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
         if made != old:
@@ -187,7 +193,7 @@ class StudyFolder:
     def _old(self, file: Path) -> dict[str, Any]:
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError:
+        except (ValueError, RecursionError):
             return {}
         return values if isinstance(values, dict) else {}
 
@@ -246,6 +252,17 @@ class StudyFolder:
                 "train_max_ewm": final.get("train_max_ewm"),
             }
         return row
+
+
+def _mapping(file: Path) -> dict[str, Any]:
+    values = read_json(file)
+    if not isinstance(values, dict):
+        raise ValueError(f"{file} is damaged: it holds no table of names and values")
+    return values
+
+
+def _list(values: Any) -> list[Any]:
+    return list(values) if isinstance(values, list) else []
 
 
 def _ours(entry: os.PathLike[str]) -> bool:

@@ -11,6 +11,9 @@ from typing import Any
 from arcade_torch.tools.extensions import command_line
 
 OBSERVABILITIES = ("full", "partial")
+MOST_SEEDS = 10_000
+"""``seeds = N`` beyond this is a slip."""
+_NAME = re.compile(r"[\w.\-]{1,80}")
 _AXES = ("games", "observability", "memories", "algorithms", "seeds")
 
 
@@ -85,10 +88,14 @@ class Study:
             ValueError: an axis is empty or repeats itself, or a value is out of range.
             TypeError: an axis holds something of the wrong type.
         """
-        if not isinstance(self.name, str) or not re.fullmatch(r"[\w.\-]+", self.name):
+        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name) or set(self.name) == {"."}:
             raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
         for axis in _AXES:
             _check_axis(axis, getattr(self, axis), int if axis == "seeds" else str)
+        for word in ("preset", "baseline", "question"):
+            if not isinstance(getattr(self, word), str):
+                raise TypeError(f"{word} must be text, got {getattr(self, word)!r}")
+        _check_settings(self.settings)
         for size in self.sizes:
             if not isinstance(size, str) or not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
                 raise ValueError(f"sizes are layers x width, such as '2x512', got {size!r}")
@@ -97,7 +104,7 @@ class Study:
         unknown = [value for value in self.observability if value not in OBSERVABILITIES]
         if unknown:
             raise ValueError(f"observability must be among {', '.join(OBSERVABILITIES)}, got {unknown[0]!r}")
-        if self.total_frames is not None and (type(self.total_frames) is not int or self.total_frames < 1):
+        if self.total_frames is not None and not (type(self.total_frames) is int and 1 <= self.total_frames <= 10**15):
             raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
         clash = sorted(set(flatten(self.settings)) & {"env", "observability", "memory", "algorithm", "seed", "out"})
         if clash:
@@ -112,6 +119,8 @@ class Study:
         Raises:
             ValueError: a key is unknown or missing, or a value is out of range.
         """
+        if not isinstance(values, Mapping):
+            raise ValueError(f"a study is a table of names and values, got {values!r}")
         known = [item.name for item in fields(cls)]
         for key in values:
             if key not in known:
@@ -152,7 +161,10 @@ class Study:
         Raises:
             ValueError: it is not TOML or not a study.
         """
-        values = tomllib.loads(text)
+        try:
+            values = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raise ValueError(f"it is not TOML: {error}") from error
         values.setdefault("name", name)
         return cls.from_dict(values)
 
@@ -227,8 +239,8 @@ def _flag(key: str, value: Any) -> list[str]:
 
 def _as_tuple(axis: str, value: Any) -> tuple[Any, ...]:
     if axis == "seeds" and type(value) is int:
-        if value < 1:
-            raise ValueError(f"seeds = {value}: give the number of seeds (at least 1) or a list")
+        if not 1 <= value <= MOST_SEEDS:
+            raise ValueError(f"seeds = {value}: give the number of seeds (1 to {MOST_SEEDS}) or a list")
         return tuple(range(value))
     if isinstance(value, str):
         return (value,)
@@ -245,5 +257,23 @@ def _check_axis(axis: str, values: tuple[Any, ...], kind: type) -> None:
             raise TypeError(f"{axis} must hold {'whole numbers' if kind is int else 'names'}, got {value!r}")
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
-    if kind is int and min(values) < 0:
-        raise ValueError(f"seeds must be 0 or more, got {min(values)}")
+    if kind is int and not (min(values) >= 0 and max(values) < 2**32):
+        raise ValueError(f"seeds must be 0 or more and below 2**32, got {min(values)} to {max(values)}")
+    if kind is str and (odd := [value for value in values if not _NAME.fullmatch(value)]):
+        raise ValueError(f"{axis} become names of folders: letters, digits, dots and dashes only, got {odd[0]!r}")
+
+
+def _check_settings(settings: Any) -> None:
+    """Refuse anything but options, and tables of options of one learner, game or network."""
+    if not isinstance(settings, Mapping):
+        raise TypeError(f"settings must be a table of options, got {settings!r}")
+    for key, value in settings.items():
+        for name, inner in value.items() if isinstance(value, Mapping) else [(key, value)]:
+            items = inner if isinstance(inner, list | tuple) else [inner]
+            if not all(isinstance(item, bool | int | float | str) for item in items):
+                raise TypeError(
+                    f"settings: {name!r} must be a number, text, true, false or a list of such, got {inner!r}"
+                )
+        names = [key, *value] if isinstance(value, Mapping) else [key]
+        if odd := [name for name in names if not isinstance(name, str) or not _NAME.fullmatch(name)]:
+            raise ValueError(f"settings: {odd[0]!r} is no name of an option")

@@ -1,0 +1,146 @@
+"""What ``ArcadeEnv`` refuses at its border: tensordicts and entries that it could not use, in one clear line each."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from arcade_torch.envs_jax.shown import shown
+
+MOST_ENVS = 2**20
+"""The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed allocation."""
+
+
+def check_num_envs(num_envs: int) -> None:
+    """Refuse anything but a positive int that memory can hold.
+
+    Args:
+        num_envs: What arrived.
+
+    Raises:
+        TypeError: Not an int.
+        ValueError: Not positive, or above `MOST_ENVS`.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int):
+        raise TypeError(f"num_envs is {shown(num_envs)}, expected an int of 1 or more")
+    if num_envs < 1:
+        raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
+    if num_envs > MOST_ENVS:
+        raise ValueError(f"num_envs is above {MOST_ENVS}, the most that a batch may hold")
+
+
+def check_flags(names: str, values: Sequence[bool | None]) -> None:
+    """Refuse options that are neither true nor false; None passes for ``task_in_td``, where it means "as is usual".
+
+    Args:
+        names: Of the options, separated by spaces.
+        values: What arrived, in the same order.
+
+    Raises:
+        TypeError: Something else.
+    """
+    for name, value in zip(names.split(), values, strict=True):
+        if not isinstance(value, bool) and not (value is None and name == "task_in_td"):
+            raise TypeError(f"{name} is {shown(value)}, allowed: True, False")
+
+
+def check_tensordict(td: Any, num_envs: int) -> None:
+    """Refuse what ``step`` and ``reset`` cannot use.
+
+    Args:
+        td: What arrived.
+        num_envs: Number of envs.
+
+    Raises:
+        TypeError: Not a TensorDict, or its ``next`` or ``_step`` is of the wrong kind.
+        ValueError: Another batch size, or a ``_step`` of another shape or with nothing to do.
+    """
+    if not isinstance(td, TensorDictBase):
+        raise TypeError(f"got a {type(td).__name__}, expected a TensorDict of batch size [{num_envs}]")
+    if td.batch_size != (num_envs,):
+        raise ValueError(f"the tensordict has batch_size {list(td.batch_size)}, expected [{num_envs}], one row an env")
+    following = td.get("next", None)
+    if following is not None and not isinstance(following, TensorDictBase):
+        raise TypeError(f"entry 'next' is a {type(following).__name__}, expected a TensorDict: leave it out")
+    if "_step" in td:
+        steps = mask(td, "_step", num_envs)
+        if following is None and not bool(steps.any()):
+            raise ValueError("entry '_step' is false in all envs: there is nothing to step")
+
+
+def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
+    """An entry that has to be a plain tensor.
+
+    Args:
+        td: Where it stands.
+        key: Its name.
+
+    Raises:
+        ValueError: There is no such entry.
+        TypeError: It is no tensor, or a sparse one.
+    """
+    value = td.get(key, None)
+    if value is None:
+        raise ValueError(f"the tensordict has no entry {key!r}; it has {', '.join(map(str, td.keys())) or 'none'}")
+    check_tensor(value, f"entry {key!r}")
+    found: torch.Tensor = value
+    return found
+
+
+def check_tensor(value: Any, what: str) -> None:
+    """Refuse anything but a dense tensor.
+
+    Args:
+        value: What arrived.
+        what: Its name, for the message.
+
+    Raises:
+        TypeError: It is no tensor, or a sparse one.
+    """
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
+    if value.layout is not torch.strided:
+        raise TypeError(f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()")
+
+
+def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
+    """Refuse entries that cannot stay where they are while other envs are reset.
+
+    Args:
+        td: What arrived, with the envs that are not reset.
+        root: What ``reset`` gives.
+
+    Raises:
+        ValueError: An entry is of another kind or shape than that of ``reset``.
+    """
+    for key, fresh in root.items():
+        kept = td.get(key, None)
+        if kept is not None and (
+            isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor) or kept.shape != fresh.shape
+        ):
+            found = f"{type(kept).__name__} {list(kept.shape)}"
+            raise ValueError(f"entry {key!r} is a {found}, expected one of shape {list(fresh.shape)} as reset gives it")
+
+
+def mask(td: TensorDictBase, key: str, num_envs: int) -> torch.Tensor:
+    """An entry that marks envs.
+
+    Args:
+        td: Where it stands.
+        key: Its name, ``"_reset"`` or ``"_step"``.
+        num_envs: Number of envs.
+
+    Returns:
+        bool [num_envs].
+
+    Raises:
+        ValueError: There is none, or it has another shape.
+        TypeError: It is no bool tensor.
+    """
+    value = tensor(td, key)
+    if value.dtype is not torch.bool:
+        raise TypeError(f"entry {key!r} has dtype {value.dtype}, expected torch.bool")
+    if value.shape not in ((num_envs,), (num_envs, 1)):
+        raise ValueError(f"entry {key!r} has shape {tuple(value.shape)}, expected ({num_envs}, 1), one flag an env")
+    return value.reshape(num_envs)

@@ -1,0 +1,184 @@
+"""Studies: files with every field mutated, folders, locks and the queue."""
+
+import json
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+
+from arcade_torch.agents.lease import Lease
+from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.grid import RunSpec, Study
+from arcade_torch.tools.studies.queue import RunQueue
+from tests.fuzz.contract import attempt, content, fuzz
+from tests.fuzz.hostile import NAMES, NUMBERS, json_bytes, mutated, mutated_value, seeds
+from tests.fuzz.test_runs import _repair, _rewrite_json
+from tests.tools.fabricated import small_study, write_study
+
+pytestmark = pytest.mark.slow
+
+TOML = b"""# what memory is worth
+question = "Who remembers?"
+games = ["MineSweeperEasy", "CartPoleEasy"]
+memories = ["lru", "mlp"]
+observability = ["full", "partial"]
+algorithms = ["pqn"]
+seeds = 3
+preset = "small"
+total_frames = 4096
+sizes = ["1x64", "2x128"]
+baseline = "mlp"
+
+[settings]
+eval_episodes = 16
+device = "cpu"
+
+[settings.pqn]
+gamma = 0.9
+lam = 0.5
+
+[settings.env_options]
+noise = 0.1
+"""
+VALUES: dict[str, Any] = {
+    "name": "toy",
+    "games": ["MineSweeperEasy"],
+    "memories": ["lru", "mlp"],
+    "seeds": [0, 1],
+    "observability": ["full", "partial"],
+    "algorithms": ["pqn"],
+    "preset": "small",
+    "total_frames": 4096,
+    "settings": {"threads": 1, "pqn": {"gamma": 0.9}, "env_options": {"noise": 0.5}},
+    "baseline": "mlp",
+    "sizes": ["1x64"],
+    "question": "why?",
+}
+
+
+def _use(study: Study) -> None:
+    """What a dry run does with a study."""
+    assert Study.from_dict(json.loads(json.dumps(study.to_dict()))).fixed().keys() == study.fixed().keys()
+    for run in study.runs()[:4]:
+        assert os.sep not in run.name and run.name not in ("", ".", "..")
+        study.command(run, Path("runs") / run.name)
+
+
+@fuzz(9_000)
+@given(seeds)
+def test_a_study_file_is_read_or_refused(seed: int) -> None:
+    data = mutated(TOML, seed)
+
+    def read() -> None:
+        _use(Study.parse(data.decode("utf-8", "replace"), "toy"))
+
+    attempt("study file", read)
+
+
+@fuzz(9_000)
+@given(seeds)
+def test_a_study_of_any_fields_is_made_or_refused(seed: int) -> None:
+    rng = random.Random(seed)
+    values = mutated_value(VALUES, seed)
+    if isinstance(values, dict) and rng.random() < 0.4:
+        values[rng.choice(tuple(VALUES))] = rng.choice((rng.choice(NAMES), rng.choice(NUMBERS), [rng.choice(NAMES)]))
+    attempt("Study.from_dict", lambda: _use(Study.from_dict(values)))
+
+
+@fuzz(1_500)
+@given(seed=seeds)
+def test_a_study_file_of_any_bytes_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    file = tmp_path_factory.getbasetemp() / "study.toml"
+    data = mutated(TOML, seed)
+    file.write_bytes(data)
+    attempt("Study.load", lambda: Study.load(file))
+    assert file.read_bytes() == data
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> StudyFolder:
+    return write_study(tmp_path_factory.mktemp("study"), small_study())
+
+
+@fuzz(300)
+@given(seed=seeds)
+def test_a_damaged_studys_folder_gives_results_or_refuses(study: StudyFolder, seed: int) -> None:
+    rng = random.Random(seed)
+    before = content(study.root)
+    try:
+        for _ in range(rng.choice((1, 1, 2))):
+            file = rng.choice(sorted(path for path in study.root.rglob("*") if path.is_file()))
+            if file.suffix == ".json" and rng.random() < 0.6:
+                _rewrite_json(file, rng)
+            elif rng.random() < 0.1:
+                file.unlink()
+            else:
+                file.write_bytes(mutated(file.read_bytes(), rng.randrange(2**32)))
+        attempt("study folder", lambda: study.write_results(study.load()))
+        attempt("study folder, claimed again", lambda: study.claim(small_study()))
+    finally:
+        _repair(study.root, before)
+
+
+@fuzz(3_000)
+@given(seed=seeds)
+def test_a_damaged_lock_is_free_held_or_waited_for(study: StudyFolder, seed: int) -> None:
+    rng = random.Random(seed)
+    lock = study.root / "locks" / "fuzz"
+    lock.mkdir(parents=True, exist_ok=True)
+    record = {"name": "here", "pid": os.getpid(), "host": "elsewhere", "started": "1", "token": "x"}
+    for _ in range(rng.choice((1, 1, 2))):
+        name = rng.choice(("owner-000001.json", "owner-000002.json", "owner-999999.json", "owner-x.json", "other"))
+        data = json_bytes(mutated_value(record, rng.randrange(2**32)))
+        (lock / name).write_bytes(data if rng.random() < 0.6 else mutated(data, rng.randrange(2**32)))
+    lease = Lease(lock, timeout_s=0.0 if rng.random() < 0.5 else 60.0)
+
+    def look() -> None:
+        lease.held(), lease.owner()
+        if lease.try_take():
+            lease.confirm()
+            lease.release()
+
+    try:
+        attempt("lock", look)
+    finally:
+        for file in lock.iterdir() if lock.exists() else ():
+            file.unlink()
+
+
+@fuzz(300)
+@given(seed=seeds)
+def test_the_queue_goes_through_a_damaged_study(study: StudyFolder, seed: int) -> None:
+    rng = random.Random(seed)
+    what = small_study()
+    before = content(study.root)
+    try:
+        for run in what.runs():
+            for file in (study.run(run).path / "eval.json", study.run(run).path / "progress.json"):
+                if rng.random() < 0.5:
+                    _rewrite_json(file, rng)
+            if rng.random() < 0.3:
+                failure = study.root / "failures" / f"{run.name}.json"
+                failure.parent.mkdir(exist_ok=True)
+                failure.write_bytes(mutated(b'{"error": "disk full"}', rng.randrange(2**32)))
+
+        def drain() -> None:
+            queue = RunQueue(what, study, lambda name, error: None)
+            for _ in range(6):
+                job = next(queue, None)
+                if job is not None:
+                    queue.done(job.name)
+            queue.close()
+
+        attempt("queue", drain)
+    finally:
+        _repair(study.root, before)
+
+
+def test_the_names_of_runs_cannot_leave_the_folder() -> None:
+    for name in NAMES:
+        for spec in (RunSpec(name, "full", "lru", "pqn", 0), RunSpec("G", "full", name, "pqn", 0)):
+            assert StudyFolder(Path("s")).run(spec).path.parent == Path("s/runs") or "/" in spec.name

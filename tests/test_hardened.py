@@ -1,0 +1,326 @@
+"""What fuzzing (tests/fuzz) found, a test a defect: hostile input is refused in one line of ours, nothing is lost."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from tensordict import TensorDict
+
+import arcade_torch
+from arcade_torch.agents import TrainConfig, preset
+from arcade_torch.agents.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
+from arcade_torch.agents.files import CsvLog, checksum, is_final
+from arcade_torch.agents.files import read_json as read_run_json
+from arcade_torch.agents.lease import Lease
+from arcade_torch.agents.run_folder import RunFolder
+from arcade_torch.tools.analysis.scores import read_scores
+from arcade_torch.tools.figures.runs import find_runs
+from arcade_torch.tools.figures.throughput import read_rows
+from arcade_torch.tools.files import read_csv, read_json, write_between
+from arcade_torch.tools.name_value import name_and_value
+from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
+from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.grid import Study
+from tests.tools.fabricated import small_study, write_study
+
+CONFIG = preset("smoke")
+
+
+@pytest.fixture(scope="module")
+def env() -> arcade_torch.ArcadeEnv:
+    return arcade_torch.make("CartPoleEasy", num_envs=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"num_envs": 10**12}, ValueError, "num_envs is above 1048576"),
+        ({"seed": "7"}, TypeError, "seed is '7', expected a whole number"),
+        ({"seed": 0.5}, TypeError, "seed is 0.5, expected a whole number"),
+        ({"debug": torch.zeros(0)}, TypeError, "debug is .*, allowed: True, False"),
+        ({"categorical_actions": "no"}, TypeError, "categorical_actions is 'no', allowed: True, False"),
+        ({"obs_size": torch.zeros(2, 2)}, ValueError, r"obs_size is tensor\(\[\[0\., 0\.\], \[0\., 0\.\]\]\), allowed"),
+        ({"device": 10**30}, ValueError, "device is 1000.*, allowed: 'cpu', 'cuda'"),
+    ],
+)
+def test_make_refuses_values_that_broke_inside(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message) as found:
+        arcade_torch.make(**{"id": "CartPoleEasy", "num_envs": 2, **options})
+    assert "\n" not in str(found.value)
+
+
+def test_an_endless_name_is_cut_in_the_message() -> None:
+    with pytest.raises(ValueError, match=r"xxx\.\.\. \(5002 characters\)"):
+        arcade_torch.make("x" * 5000)
+
+
+@pytest.mark.parametrize(
+    ("entries", "error", "message"),
+    [
+        ({}, ValueError, "no entry 'action'; it has none"),
+        ({"action": TensorDict({}, [2])}, TypeError, "'action' is a TensorDict, expected a tensor"),
+        ({"action": torch.zeros(2).to_sparse()}, TypeError, "expected a dense one"),
+        (
+            {"action": torch.zeros(2).long(), "next": torch.zeros(2)},
+            TypeError,
+            "'next' is a Tensor, expected a TensorDict",
+        ),
+        ({"action": torch.zeros(2).long(), "_step": torch.zeros(2).bool()}, ValueError, "'_step' is false in all envs"),
+        ({"action": torch.zeros(2).long(), "_step": torch.zeros(2)}, TypeError, "'_step' has dtype torch.float32"),
+    ],
+)
+@pytest.mark.parametrize("way", ["step", "step_and_maybe_reset"])
+def test_a_step_refuses_a_tensordict_it_cannot_use(
+    env: arcade_torch.ArcadeEnv, way: str, entries: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        getattr(env, way)(TensorDict(entries, [2]))
+
+
+def test_what_is_no_tensordict_is_no_step(env: arcade_torch.ArcadeEnv) -> None:
+    for one in ({"action": torch.zeros(2)}, None, torch.zeros(2)):
+        with pytest.raises(TypeError, match="expected a TensorDict of batch size"):
+            env.step(one)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("mask", "error", "message"),
+    [
+        (torch.zeros(2), TypeError, "'_reset' has dtype torch.float32"),
+        (torch.tensor([-6, 0]), TypeError, "'_reset' has dtype torch.int64"),
+        (torch.zeros(2, 0).bool(), ValueError, r"'_reset' has shape \(2, 0\)"),
+        (TensorDict({}, [2]), TypeError, "'_reset' is a TensorDict"),
+    ],
+)
+def test_reset_refuses_a_mask_that_is_none(
+    env: arcade_torch.ArcadeEnv, mask: Any, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        env.reset(TensorDict({"_reset": mask}, [2]))
+
+
+def test_a_partial_reset_refuses_entries_that_cannot_stay(env: arcade_torch.ArcadeEnv) -> None:
+    mask = torch.tensor([True, False])
+    for wrong in (torch.zeros(2, 5), TensorDict({"x": torch.zeros(2)}, [2])):
+        with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected one of shape"):
+            env.reset(TensorDict({"_reset": mask, "pixels": wrong}, [2]))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "error", "message"),
+    [
+        ("step_count", torch.zeros(2, dtype=torch.bfloat16), ValueError, r"'step_count' is bfloat16 \(2,\)"),
+        ("step_count", torch.zeros(2).to_sparse(), TypeError, "expected a dense one"),
+        ("step_count", TensorDict({}, [2]), TypeError, "'step_count' is a TensorDict"),
+        ("state", torch.zeros(2), ValueError, r"no entry 'state\."),
+        ("game", torch.zeros(2, 5), ValueError, r"'game' is torch.float32 \(2, 5\)"),
+    ],
+)
+def test_a_state_with_something_else_in_it_is_refused_whole(
+    env: arcade_torch.ArcadeEnv, key: str, value: Any, error: type[Exception], message: str
+) -> None:
+    before = env.get_state()
+    with pytest.raises(error, match=message):
+        env.set_state(env.get_state().exclude(key).set(key, value))
+    with pytest.raises(TypeError, match="the state is a Tensor: pass what"):
+        env.set_state(torch.zeros(2))  # type: ignore[arg-type]
+    after = env.get_state()
+    assert all(torch.equal(before.get(name), after.get(name)) for name in before.keys(True, True))
+
+
+def checkpoint(folder: Path) -> Path:
+    return save_checkpoint(folder, CONFIG, 64, {"w": torch.ones(4)}, {"frames": 64})
+
+
+def forge(path: Path, part: str, data: bytes) -> None:
+    """Replace a part and its checksum, as somebody would who knows about it."""
+    (path / part).write_bytes(data)
+    meta = json.loads((path / "meta.json").read_text())
+    meta["sha256"][part] = checksum(path / part)
+    (path / "meta.json").write_text(json.dumps(meta))
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00" * 40, b"\xff" * 9, b"PK\x03\x04junk"])
+@pytest.mark.parametrize("part", ["weights.safetensors", "trainer.pt"])
+def test_forged_parts_of_a_checkpoint_are_damage(tmp_path: Path, part: str, data: bytes) -> None:
+    path = checkpoint(tmp_path)
+    forge(path, part, data)
+    with pytest.raises(CheckpointError, match=part) as found:
+        load_checkpoint(path)
+    assert "\n" not in str(found.value)
+
+
+def test_json_of_endless_depth_or_digits_is_damage(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path)
+    for text in ("[" * 100_000, "9" * 5000):
+        (path / "meta.json").write_text(text)
+        with pytest.raises(CheckpointError, match="is not JSON"):
+            load_checkpoint(path)
+        for read, words in ((read_json, "is not valid JSON"), (read_run_json, "does not hold JSON")):
+            with pytest.raises(ValueError, match=words):
+                read(path / "meta.json")
+        lock = tmp_path / "lock"
+        lock.mkdir(exist_ok=True)
+        (lock / "owner-000001.json").write_text(text)
+        assert Lease(lock).owner() == ""
+
+
+def test_the_name_of_the_latest_checkpoint_need_not_be_text(tmp_path: Path) -> None:
+    checkpoint(tmp_path)
+    (tmp_path / "latest").write_bytes(b"\x9c\xff")
+    assert load_latest(tmp_path).frames == 64
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (3.5, "a config must be a table of fields; got 3.5"),
+        ({"algorithm": ["pqn"]}, "algorithm must be"),
+        ({"a\nb": 1}, r"unknown field 'a\\nb'"),
+        ({"pqn": {"gamma": 10**400}}, r"pqn\.gamma must be a number"),
+    ],
+)
+def test_a_config_of_any_json_is_refused_in_one_line(values: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as found:
+        TrainConfig.from_dict(values)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe\n", b"framez,loss\n1,2\n", b"frames,frames\n1,\n", b'frames,"a\n'])
+def test_a_log_that_is_none_is_refused_and_kept(tmp_path: Path, data: bytes) -> None:
+    file = tmp_path / "metrics.csv"
+    file.write_bytes(data)
+    if data.startswith(b'frames,"'):
+        return CsvLog(file, ("frames", "loss"), keep_frames=9).close()
+    with pytest.raises(ValueError, match="is damaged"):
+        CsvLog(file, ("frames", "loss"), keep_frames=9)
+    assert file.read_bytes() == data
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"returns": 5}, {"returns": [[1]]}, {"returns": [10**400]}, {"mean": {}}, {"lengths": [0.5]}, {"frames": "x"}],
+)
+def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(
+    tmp_path: Path, changes: dict[str, Any]
+) -> None:
+    good = {"status": "finished", "frames": 64, "seconds": 1.0, "mean": 0.5, "train_max_ewm": 0.5}
+    good |= {"returns": [0.5], "lengths": [3]}
+    assert is_final(good) and not is_final(good | changes)
+    (tmp_path / "eval.json").write_text(json.dumps(good | changes))
+    assert RunFolder(tmp_path).finished() is None
+    study = write_study(tmp_path / "s", small_study())
+    (study.run(small_study().runs()[0]).path / "eval.json").write_text(json.dumps(good | changes))
+    assert study.write_results(small_study())[0]["status"] == "unfinished"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": 10**12}, "1 to 10000"),  # would have made the list of them
+        ({"seeds": [10**400]}, r"below 2\*\*32"),
+        ({"games": ["../../x"]}, r"names of folders.*got '\.\./\.\./x'"),
+        ({"memories": ["a/b"]}, "names of folders"),
+        ({"name": ".."}, "a study's name"),
+        ({"settings": 5}, "settings must be a table of options"),
+        ({"settings": {"pqn": {"gamma": {"x": 1}}}}, "'gamma' must be a number, text, true, false or a list"),
+        ({"settings": {"--out": "x y"}, "preset": None}, "preset must be text"),
+        ({"question": 5}, "question must be text"),
+    ],
+)
+def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        small_study(**changes)
+
+
+def test_a_study_that_is_no_table_is_refused() -> None:
+    with pytest.raises(ValueError, match="a study is a table"):
+        Study.from_dict([1])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="it is not TOML"):
+        Study.parse("a = [", "x")
+
+
+def test_records_of_runs_that_hold_no_table_are_damage(tmp_path: Path) -> None:
+    study = write_study(tmp_path, small_study())
+    config = study.run(small_study().runs()[0]).path / "config.json"
+    values = json.loads(config.read_text())
+    for damage in ("[1]", json.dumps({"config": values["config"] | {"seed": {}}})):
+        config.write_text(damage)
+        with pytest.raises(ValueError, match=r"config\.json"):
+            find_runs([study.root])
+    config.write_text(json.dumps(values | {"versions": 3.5}))
+    assert len(find_runs([study.root]).runs) == 8
+    record = json.loads((study.root / "study.json").read_text())
+    (study.root / "study.json").write_text(json.dumps(record | {"also": 5}))
+    StudyFolder(study.root).claim(small_study())
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"\xff\xfe", "is not CSV in UTF-8"),
+        (b"a,b\n1\n", "fewer cells"),
+        (b"a,a\n1,2\n", "names a column twice"),
+        (b'a,"b\nc"\n1,2\n', "over several lines"),
+    ],
+)
+def test_a_table_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes, message: str) -> None:
+    file = tmp_path / "x.csv"
+    file.write_bytes(data)
+    for read in (read_csv, read_scores, read_rows):
+        with pytest.raises(ValueError, match=message):
+            read(file)
+
+
+def test_a_published_table_without_names_or_numbers_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "x.csv"
+    for text, message in (
+        ("model,mdp_mean,pomdp_mean\nm,1,2\n", "no column for env"),
+        ("model,env,mdp_mean,pomdp_mean\nm,E,x,2\n", "a mean is not a number"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_scores(file)
+
+
+def test_a_file_of_somebody_else_is_not_overwritten_by_a_score(tmp_path: Path) -> None:
+    file = tmp_path / "thesis.txt"
+    file.write_text("one precious line\n")
+    with pytest.raises(ValueError, match="would lose what it holds"):
+        append_score(file, dict.fromkeys(COLUMNS, ""))
+    assert file.read_text() == "one precious line\n"
+
+
+@pytest.mark.parametrize(
+    ("cell", "value", "message"),
+    [
+        ("actions", "0a", "actions are digits from 0 to 4"),
+        ("actions", "07", "actions are digits from 0 to 4"),
+        ("seed", "٣", "seed is '٣', expected a whole number"),
+        ("options", "[]", "expected a JSON object"),
+        ("options", "{", "expected a JSON object"),
+    ],
+)
+def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, message: str) -> None:
+    row = dict.fromkeys(COLUMNS, "") | {"game": "CartPoleEasy-v0", "obs_size": "128", "rules": "default"}
+    row |= {"options": "{}", "seed": "0", "actions": "012", "observability": "full"}
+    with pytest.raises(ValueError, match=message):
+        replay(row | {cell: value})
+
+
+def test_small_things_that_are_no_text_or_no_json(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_bytes(b"\xff")
+    with pytest.raises(ValueError, match="is not text in UTF-8"):
+        write_between(page, "a", "b", "c")
+    assert name_and_value("x=" + "9" * 5000) == ("x", "9" * 5000)
+
+
+def test_weights_that_are_fine_still_load(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path)
+    save_file({"w": torch.zeros(4)}, path / "weights.safetensors")
+    forge(path, "weights.safetensors", (path / "weights.safetensors").read_bytes())
+    assert torch.equal(load_checkpoint(path).weights["w"], torch.zeros(4))
