@@ -12,6 +12,7 @@ An owner is gone
 An owner that slept through its own end finds out by `Lease.confirm` before it writes again.
 """
 
+import contextlib
 import errno
 import functools
 import json
@@ -91,23 +92,24 @@ class Lease:
         number = int(_NAME.fullmatch(files[-1].name)[1]) if files else 0  # type: ignore[index]
         token = uuid.uuid4().hex
         mine = self.folder / f"owner-{number + 1:06d}.json"
+        taken = False
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             _tokens.add(token)
             _create(mine, token)
+            others = [file for file in self._files() if file != mine]
+            taken = not any(self._alive(file) for file in others)
+            if not taken:  # somebody asked at the same moment
+                mine.unlink(missing_ok=True)
+                return False
         except (FileExistsError, FileNotFoundError):  # another was faster, or has just released and swept
-            _tokens.discard(token)
             return False
-        except BaseException:
-            _tokens.discard(token)
-            raise
-        others = [file for file in self._files() if file != mine]
-        if any(self._alive(file) for file in others):
-            _tokens.discard(token)
-            mine.unlink(missing_ok=True)
-            return False
+        finally:
+            if not taken:  # whatever happened, nobody may see a living owner in what is left
+                _tokens.discard(token)
         for file in others:
-            file.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # the dead stay dead
+                file.unlink()
         self._file, self._token, self._lost, self._beat_s = mine, token, False, _awake_s()
         _heart.add(self)
         return True
@@ -285,7 +287,7 @@ def _read(file: Path) -> dict[str, Any] | None:
     """The record of an owner; None if there is none or only a part of one."""
     try:
         record: Any = json.loads(file.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return record if isinstance(record, dict) and isinstance(record.get("pid"), int) else None
 

@@ -19,6 +19,7 @@ from arcade_torch.envs_jax.oracles import make_oracle
 from arcade_torch.envs_jax.oracles import play as oracle_play
 from arcade_torch.tools import cli
 from arcade_torch.tools.play.session import Attempt, Session
+from arcade_torch.tools.record import evaluations
 from arcade_torch.tools.record.episodes import recorded_frames
 from arcade_torch.tools.record.files import write_gif, write_mp4
 from arcade_torch.tools.record.players import SCRIPTED, Trained, load_agent, scripted
@@ -219,3 +220,28 @@ def test_missing_writers_are_named_with_their_extras(
     for suffix, extra in ((".mp4", "video"), (".gif", "tools")):
         assert cli.main(["record", GAME, "--out", str(tmp_path / f"x{suffix}")]) == cli.EXIT_BAD_INPUT
         assert f"pip install 'arcade-torch[{extra}]'" in capsys.readouterr().err
+
+
+def test_every_evaluation_of_a_training_is_filmed_and_changes_nothing(tmp_path: Path) -> None:
+    words = ["train", "--preset", "smoke", "--env", GAME, "--total-frames", "256", "--eval-every", "128"]
+    assert cli.main([*words, "--out", str(tmp_path / "filmed"), "--videos", "gif"]) == 0
+    assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
+    films = sorted(path.name for path in (tmp_path / "filmed" / "videos").iterdir())
+    assert films == ["frames-000000128.gif", "frames-000000256.gif"]
+    agent, found = load_agent(str(tmp_path / "filmed")), []
+    game = compiled_game(GAME, 128, "default", {})
+    player = Session(game, seed=evaluations.SEED, partial=False, episodes=1, on_attempt=found.append)
+    played = list(recorded_frames(player, Trained(agent, False), max_steps=500, hold=evaluations.FPS, scale=2))
+    np.testing.assert_array_equal(pictures(tmp_path / "filmed" / "videos" / films[-1])[0], np.stack(played))
+    assert (tmp_path / "filmed/eval.csv").read_bytes() == (tmp_path / "plain/eval.csv").read_bytes()
+    weights = [sorted((tmp_path / run).rglob("*.safetensors"))[-1].read_bytes() for run in ("filmed", "plain")]
+    assert weights[0] == weights[1]
+
+
+def test_a_film_that_fails_is_the_last_and_stops_nothing(tmp_path: Path) -> None:
+    film = evaluations.EvaluationVideos(tmp_path / "videos")
+    with pytest.warns(UserWarning, match="no more films, frames-000000007.gif: AttributeError"):
+        film(type("Broken", (), {"frames": 7})())
+    film(None)
+    with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4"):
+        evaluations.EvaluationVideos(tmp_path, ".avi")

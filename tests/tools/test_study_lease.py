@@ -64,11 +64,12 @@ def test_counting_under_the_lock_loses_no_count(tmp_path: Path) -> None:
             count.write_text(str(int(count.read_text()) + 1))
             lease.release()
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(60)
+    assert not any(thread.is_alive() for thread in threads), "a thread waits for a lease that nobody holds"
     assert count.read_text() == "100"
 
 
