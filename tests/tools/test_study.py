@@ -93,7 +93,7 @@ def test_a_study_is_read_from_toml_and_its_settings_become_options(tmp_path: Pat
     ("changes", "message"),
     [
         ({"games": []}, "games is empty"),
-        ({"seeds": 0}, "at least 1"),
+        ({"seeds": 0}, "1 to 10000"),
         ({"seeds": [1, 1]}, "names something twice"),
         ({"seeds": [-1]}, "0 or more"),
         ({"observability": ["some"]}, "full, partial"),
