@@ -37,6 +37,7 @@ _PUBLIC = {
     "preset_names": "presets",
     "q_lambda_return": "targets",
     "train": "loop",
+    "train_seeds": "seeds",
 }
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
     from arcade_torch.agents.presets import preset, preset_names
     from arcade_torch.agents.replay import SequenceReplay
     from arcade_torch.agents.run_folder import RunFolderError
+    from arcade_torch.agents.seeds import train_seeds
     from arcade_torch.agents.targets import gae, q_lambda_return
 
 __all__ = [
@@ -83,16 +85,19 @@ __all__ = [
     "preset_names",
     "q_lambda_return",
     "train",
+    "train_seeds",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for (PEP 562)."""
-    if name not in _PUBLIC:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
-    value = getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # a checker is to find misspelt names
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name when it is first asked for (PEP 562)."""
+        if name not in _PUBLIC:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+        value = getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

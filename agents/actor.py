@@ -1,5 +1,7 @@
 """Acting: epsilon-greedy with a recurrent Q-network, or by sampling a recurrent policy."""
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -64,11 +66,25 @@ class EpsilonGreedyActor:
         return action, {"q_value": q} if self.record_q else {}, state
 
     def _explore(self, action: Tensor, num_actions: int) -> Tensor:
-        """Replace each action by a uniform one with probability epsilon; always two draws, whatever epsilon is."""
-        shape, device = action.shape, action.device
-        coin = torch.rand(shape, generator=self.generator, device=device)
-        other = torch.randint(num_actions, shape, generator=self.generator, device=device)
-        return torch.where(coin < (1.0 if self.uniform else self.epsilon), other, action)
+        return _perturbed(action, num_actions, 1.0 if self.uniform else self.epsilon, self.generator)
+
+
+class GroupedEpsilonGreedyActor(EpsilonGreedyActor):
+    """:class:`EpsilonGreedyActor` for groups of rows, each of which draws from a generator of its own.
+
+    Args:
+        network: reads the rows of all groups, such as ``StackedNetworks``.
+        generators: one a group; the rows are split evenly among them.
+    """
+
+    def __init__(self, network: QNetwork, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(network, generator=generators[0])
+        self.generators = tuple(generators)
+
+    def _explore(self, action: Tensor, num_actions: int) -> Tensor:
+        epsilon, groups = 1.0 if self.uniform else self.epsilon, action.chunk(len(self.generators))
+        drawn = zip(groups, self.generators, strict=True)
+        return torch.cat([_perturbed(group, num_actions, epsilon, generator) for group, generator in drawn])
 
 
 class CategoricalActor:
@@ -119,6 +135,14 @@ class CategoricalActor:
         action = (torch.zeros_like(log_prob) if self.uniform else log_prob).sub(noise).argmax(-1)
         taken = log_prob.gather(-1, action.unsqueeze(-1)).squeeze(-1)
         return action, {"action_log_prob": taken, "state_value": value}, state
+
+
+def _perturbed(action: Tensor, num_actions: int, epsilon: float, generator: torch.Generator | None) -> Tensor:
+    """Replace each action by a uniform one with probability epsilon; always two draws, whatever epsilon is."""
+    shape, device = action.shape, action.device
+    coin = torch.rand(shape, generator=generator, device=device)
+    other = torch.randint(num_actions, shape, generator=generator, device=device)
+    return torch.where(coin < epsilon, other, action)
 
 
 def _one_step(network: QNetwork, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, TensorDictBase]:

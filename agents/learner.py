@@ -85,7 +85,7 @@ class Learner(ABC):
             return {"lr": rate}
         self.grad_steps += len(records)
         table = torch.stack(records).cpu()
-        self._guard(table)
+        guard(table, self.network)
         return dict(zip(names, table.mean(0).tolist(), strict=True)) | {"lr": rate}
 
     def state_dict(self) -> dict[str, Any]:
@@ -99,20 +99,34 @@ class Learner(ABC):
 
     def row_numbers(self, num_rows: int) -> list[list[int]]:
         """Row numbers of every minibatch of every epoch, in the order they are used."""
-        size = num_rows // self.numbers.minibatches
-        batches: list[list[int]] = []
-        for _ in range(self.numbers.epochs):
-            order = torch.randperm(num_rows, generator=self.generator).tolist()
-            batches += [order[i : i + size] for i in range(0, num_rows, size)]
-        return batches
+        return minibatch_rows(self.numbers, num_rows, self.generator)
 
-    def _guard(self, table: Tensor) -> None:
-        """Look once an update, so that no gradient step waits for the device."""
-        for step, (loss, norm, *_) in enumerate(table.tolist()):
-            for name, value in (("loss", loss), ("gradient norm", norm)):
-                if not math.isfinite(value):
-                    raise NonFiniteError(f"the {name} is {value} at gradient step {step + 1} of {len(table)}")
-        sums = torch.stack([p.detach().sum() for p in self.parameters])
-        if not bool(sums.isfinite().all()):
-            bad = [n for n, p in self.network.named_parameters() if not bool(p.detach().isfinite().all())]
-            raise NonFiniteError(f"the weights {', '.join(bad[:3])} are not finite")
+
+def minibatch_rows(numbers: LearnerConfig, num_rows: int, generator: torch.Generator) -> list[list[int]]:
+    """Row numbers of every minibatch of every epoch, in the order they are used; one draw an epoch."""
+    size = num_rows // numbers.minibatches
+    batches: list[list[int]] = []
+    for _ in range(numbers.epochs):
+        order = torch.randperm(num_rows, generator=generator).tolist()
+        batches += [order[i : i + size] for i in range(0, num_rows, size)]
+    return batches
+
+
+def guard(table: Tensor, network: nn.Module) -> None:
+    """Look for numbers that are none, once an update, so that no gradient step waits for the device.
+
+    Args:
+        table: float [gradient steps, 2 or more], losses and gradient norms first.
+        network: what was trained.
+
+    Raises:
+        NonFiniteError: one of them, or a weight, is NaN or infinite.
+    """
+    for step, (loss, norm, *_) in enumerate(table.tolist()):
+        for name, value in (("loss", loss), ("gradient norm", norm)):
+            if not math.isfinite(value):
+                raise NonFiniteError(f"the {name} is {value} at gradient step {step + 1} of {len(table)}")
+    sums = torch.stack([p.detach().sum() for p in network.parameters() if p.requires_grad])
+    if not bool(sums.isfinite().all()):
+        bad = [n for n, p in network.named_parameters() if not bool(p.detach().isfinite().all())]
+        raise NonFiniteError(f"the weights {', '.join(bad[:3])} are not finite")

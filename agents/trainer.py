@@ -1,6 +1,7 @@
 """One run in memory: environments, actor, learner, and the state that makes it resumable."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ from torch import Tensor
 import arcade_torch
 from arcade_torch.agents.actor import EpsilonGreedyActor
 from arcade_torch.agents.agent import build_network
-from arcade_torch.agents.algorithms import ALGORITHMS
+from arcade_torch.agents.algorithms import ALGORITHMS, Network, PlayingActor
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.evaluation import twins
 from arcade_torch.agents.learner import NonFiniteError
+from arcade_torch.agents.learner_config import LearnerConfig
 from arcade_torch.agents.metrics import EpisodeStats
+from arcade_torch.groups import seed_groups
 
 _CALIBRATION_FRAMES = 3200
 
@@ -30,33 +33,16 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
         self.config = config
-        numbers, algorithm = config.learner, ALGORITHMS[config.algorithm]
+        algorithm = ALGORITHMS[config.algorithm]
         self.network = build_network(config)
-        self.total_frames = config.num_updates * numbers.frames_per_update
+        self.total_frames = config.num_updates * config.learner.frames_per_update
         self.explore = torch.Generator(config.device).manual_seed(config.seed)
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
         self.actor = algorithm.make_actor(self.network, self.explore)
         self.learner = algorithm.make_learner(self.network, config, self.total_frames, self.shuffle, replay_folder)
-        self.env = arcade_torch.make(
-            config.env,
-            num_envs=numbers.num_envs,
-            observability=twins(config.observability, numbers.num_envs),
-            obs_size=config.obs_size,
-            seed=config.seed,
-            device=config.device,
-            rules=config.rules,
-            **dict(config.env_options),
-        )
-        self.collector = arcade_torch.ArcadeCollector(
-            self.env,
-            self.actor,
-            frames_per_batch=numbers.frames_per_update,
-            total_frames=-1,
-            context=numbers.prefix,
-            compress=self.network.compress,
-            final_frames="truncated" if numbers.time_limit == "bootstrap" else "none",
-        )
-        self.stats = EpisodeStats.start(numbers.num_envs)
+        self.collector = make_collector([config], self.actor, self.network)
+        self.env = self.collector.env
+        self.stats = EpisodeStats.start(config.learner.num_envs)
         self.frames = self.updates = 0
         self.seconds = 0.0
 
@@ -71,18 +57,7 @@ class Trainer:
 
     def warm_up(self) -> None:
         """Random play before training: fills the context and calibrates the input scaling; not counted as frames."""
-        numbers = self.config.learner
-        steps = max(0, numbers.warmup_steps - numbers.prefix)  # the first window fills the context too
-        windows = -(-steps // numbers.num_steps)
-        seen: list[Tensor] = []
-        self.actor.uniform = True
-        for _ in range(windows):
-            frames = self._new_steps(self.collector.collect().get("pixels")).flatten(0, 1)
-            stride = max(1, frames.shape[0] * windows // _CALIBRATION_FRAMES)
-            seen.append(frames[::stride].clone())
-        self.actor.uniform = False
-        if seen:
-            self.network.calibrate(torch.cat(seen))
+        play_at_random(self.collector, self.actor, self.config.learner, [self.network])
 
     def update(self) -> dict[str, Any]:
         """Collect one window and learn from it.
@@ -98,7 +73,7 @@ class Trainer:
         if isinstance(self.actor, EpsilonGreedyActor) and epsilon is not None:
             self.actor.epsilon = epsilon
         batch = self.collector.collect()
-        last = self._follow_episodes(batch)
+        last = follow_episodes(self.stats, batch, self.config.learner.num_steps)
         try:
             metrics = self.learner.learn(batch, self.frames)
         except NonFiniteError as error:
@@ -107,7 +82,6 @@ class Trainer:
         self.updates += 1
         took = time.perf_counter() - began
         self.seconds += took
-        finished = self.stats.finished
         return {
             "frames": self.frames,
             "updates": self.updates,
@@ -116,10 +90,7 @@ class Trainer:
             "fps": self.config.learner.frames_per_update / took,
             **metrics,
             "epsilon": epsilon,
-            "train_return": sum(finished) / len(finished) if finished else None,
-            "train_return_ewm": self.stats.smooth,
-            "train_return_last": last,
-            "episodes": self.stats.episodes,
+            **episode_columns(self.stats, last),
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -157,10 +128,79 @@ class Trainer:
         """Let go of the environments."""
         self.collector.shutdown()
 
-    def _follow_episodes(self, batch: TensorDictBase) -> float:
-        reward, done = batch.get(("next", "reward")), batch.get(("next", "done"))
-        return self.stats.update(self._new_steps(reward).squeeze(-1), self._new_steps(done).squeeze(-1))
 
-    def _new_steps(self, entry: Tensor) -> Tensor:
-        """Without the context that the previous window already had."""
-        return entry[:, entry.shape[1] - self.config.learner.num_steps :]
+def make_collector(configs: Sequence[TrainConfig], actor: Any, network: Network) -> arcade_torch.ArcadeCollector:
+    """The collector of a run, or of several that differ in their seed alone: a group of environments for each.
+
+    Args:
+        configs: of the runs.
+        actor: plays all environments.
+        network: says what of a frame is stored.
+
+    Returns:
+        A collector of ``len(configs) * num_envs`` environments.
+    """
+    config, numbers, size = configs[0], configs[0].learner, len(configs)
+    shown = twins(config.observability, numbers.num_envs)
+    env = arcade_torch.make(
+        config.env,
+        num_envs=size * numbers.num_envs,
+        observability=shown.repeat(size) if isinstance(shown, Tensor) else shown,
+        obs_size=config.obs_size,
+        seed=config.seed,
+        device=config.device,
+        rules=config.rules,
+        **dict(config.env_options),
+    )
+    if size > 1:
+        seed_groups(env, [each.seed for each in configs])
+    return arcade_torch.ArcadeCollector(
+        env,
+        actor,
+        frames_per_batch=size * numbers.frames_per_update,
+        total_frames=-1,
+        context=numbers.prefix,
+        compress=network.compress,
+        final_frames="truncated" if numbers.time_limit == "bootstrap" else "none",
+    )
+
+
+def play_at_random(
+    collector: arcade_torch.ArcadeCollector, actor: PlayingActor, numbers: LearnerConfig, networks: Sequence[Network]
+) -> None:
+    """Fill the context with random play, and calibrate each network with the frames of its group of environments."""
+    steps = max(0, numbers.warmup_steps - numbers.prefix)  # the first window fills the context too
+    windows = -(-steps // numbers.num_steps)
+    stride = max(1, numbers.frames_per_update * windows // _CALIBRATION_FRAMES)
+    seen: list[list[Tensor]] = [[] for _ in networks]
+    actor.uniform = True
+    for _ in range(windows):
+        pixels = _new_steps(collector.collect().get("pixels"), numbers.num_steps)
+        for frames, group in zip(seen, pixels.chunk(len(networks)), strict=True):
+            frames.append(group.flatten(0, 1)[::stride].clone())
+    actor.uniform = False
+    for network, frames in zip(networks, seen, strict=True):
+        if frames:
+            network.calibrate(torch.cat(frames))
+
+
+def follow_episodes(stats: EpisodeStats, batch: TensorDictBase, num_steps: int) -> float:
+    """Count the returns of a window's new steps, see ``EpisodeStats.update``."""
+    reward, done = (_new_steps(batch.get(("next", key)), num_steps).squeeze(-1) for key in ("reward", "done"))
+    return stats.update(reward, done)
+
+
+def episode_columns(stats: EpisodeStats, last: float) -> dict[str, Any]:
+    """What ``metrics.csv`` shows of the episodes; ``last`` is what :func:`follow_episodes` returned."""
+    finished = stats.finished
+    return {
+        "train_return": sum(finished) / len(finished) if finished else None,
+        "train_return_ewm": stats.smooth,
+        "train_return_last": last,
+        "episodes": stats.episodes,
+    }
+
+
+def _new_steps(entry: Tensor, num_steps: int) -> Tensor:
+    """Without the context that the previous window already had."""
+    return entry[:, entry.shape[1] - num_steps :]

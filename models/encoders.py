@@ -97,11 +97,14 @@ def _in_phases(x: Tensor, conv: nn.Conv2d) -> Tensor:
     three channels fill a fifth of a vector register, twelve most of one. Forward it is slower, so it is
     for frames whose gradient is wanted.
     """
-    out, channels, kernel, _ = conv.weight.shape
+    (out, channels, kernel, _), (batch, _, height, width) = conv.weight.shape, x.shape
     half = (kernel + 1) // 2
     weight = F.pad(conv.weight, (0, kernel % 2, 0, kernel % 2)).reshape(out, channels, half, 2, half, 2)
-    weight = weight.permute(0, 1, 3, 5, 2, 4).reshape(out, 4 * channels, half, half)
-    return F.conv2d(F.pixel_unshuffle(x, 2), weight, conv.bias)
+    weight = weight.permute(0, 3, 5, 1, 2, 4).reshape(out, 4 * channels, half, half)
+    # Channels last, as frames arrive: rows of two pixels stay together in memory, there and back.
+    phases = x.permute(0, 2, 3, 1).reshape(batch, height // 2, 2, width // 2, 2 * channels).transpose(2, 3)
+    phases = phases.reshape(batch, height // 2, width // 2, 4 * channels).permute(0, 3, 1, 2)
+    return F.conv2d(phases, weight.contiguous(memory_format=torch.channels_last), conv.bias)
 
 
 class PaperEncoder(Encoder):

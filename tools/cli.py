@@ -70,6 +70,7 @@ COMMANDS: dict[str, Command] = {
     "bench compare": Command("bench_compare", "what became better or worse between two such files"),
     "bench envs": Command("bench_envs", "frames per second of the games, every frame consumed"),
     "bench train": Command("bench_train", "frames per second of training, and where the time goes"),
+    "bench seeds": Command("bench_seeds", "several seeds in one process against one after the other"),
     "bench memory": Command("bench_memory", "time and memory of the memory models and of the scans behind them"),
     "bench saliency": Command(
         "bench_saliency", "saliency maps in two stages against the whole network action by action"

@@ -108,11 +108,22 @@ def _ways(name: str, memory: str, steps: int, chunk: int) -> dict[str, Callable[
             maps += gradient.square().sum(-1)
         return maps
 
+    def as_usually_written() -> Tensor:
+        maps = torch.zeros(frames.shape[:-1])
+        for action in range(5):
+            x = frames.float().requires_grad_()
+            forward(x)[action].backward()
+            assert x.grad is not None
+            maps += x.grad.square().sum(-1)
+        network.zero_grad()
+        return maps
+
     def two_stages() -> Tensor:
         return torch.from_numpy(saliency(network, frames, last_action, is_init, chunk=chunk).maps)
 
     return {
         f"two stages, {chunk} frames at once": two_stages,
+        "end to end, q[a].backward() for each action, weights too": as_usually_written,
         "end to end, forward and backward for each action": lambda: end_to_end(5),
         "end to end, one forward, backward for each action": lambda: end_to_end(1),
     }

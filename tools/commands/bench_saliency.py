@@ -37,7 +37,10 @@ class BenchSaliency:
         if not self.networks or min(self.steps, self.chunk, self.repeats, self.threads) < 1:
             raise ValueError("name a network; steps, chunk, repeats and threads must be at least 1")
         from arcade_torch.tools.bench.saliency import bench_saliency
+        from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.versions import versions
+
+        keep_freed_memory()
 
         found = bench_saliency(
             self.networks, self.memory, self.steps, self.chunk, self.repeats, self.threads, tell=_tell

@@ -44,8 +44,10 @@ class Figure:
         """Draw and save."""
         from arcade_torch.tools.count_bar import CountBar
         from arcade_torch.tools.figures.registry import Request, make_figure
+        from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.optional import need
 
+        keep_freed_memory()
         need("matplotlib")
         if not 0 < self.confidence < 1:
             raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")

@@ -47,8 +47,10 @@ class RecallDensityCommand:
         from arcade_torch.tools.count_bar import CountBar
         from arcade_torch.tools.figures.recall_density import draw, measure
         from arcade_torch.tools.figures.registry import Request
+        from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.optional import need
 
+        keep_freed_memory()
         if not self.runs:
             raise ValueError("name at least one run folder")
         if not self.bins or min(self.bins) < 1:

@@ -36,8 +36,10 @@ class SaliencyCommand:
         from arcade_torch.agents import load
         from arcade_torch.tools.analysis.episode_saliency import episode_window, explain
         from arcade_torch.tools.analysis.saliency_figure import save_saliency
+        from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.optional import need
 
+        keep_freed_memory()
         if not self.run_folders:
             raise ValueError("name at least one run folder")
         if self.show < 1:

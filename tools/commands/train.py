@@ -2,10 +2,10 @@
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -40,30 +40,55 @@ class Train:
     """Run folder; runs/ENV-OBSERVABILITY-MEMORY-ALGORITHM-SEED by default."""
     resume: bool = False
     """Go on with the run in that folder."""
+    seeds: tuple[int, ...] = ()
+    """Train these seeds of PQN together in one process, each in a run folder of its own: OUT/seed0 and so on, or the
+    default folders. With --resume those that are not finished go on from the last checkpoint that all of them have."""
+    videos: Literal["none", "gif", "mp4"] = "none"
+    """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
     words: tyro.conf.Suppress[tuple[str, ...]] = ()
 
-    def folder(self) -> Path:
-        """The run folder."""
+    def folder(self, seed: int | None = None) -> Path:
+        """The run folder; with ``seed``, that of one of several seeds."""
         config = self.config
-        name = f"{config.env}-{config.observability}-{config.memory}-{config.algorithm}-seed{config.seed}"
-        return self.out if self.out is not None else Path("runs") / name
+        if self.out is not None:
+            return self.out if seed is None else self.out / f"seed{seed}"
+        name = f"{config.env}-{config.observability}-{config.memory}-{config.algorithm}"
+        return Path("runs") / f"{name}-seed{config.seed if seed is None else seed}"
 
     def run(self) -> int:
         """Train."""
-        from arcade_torch.agents import train
+        from arcade_torch.agents import train, train_seeds
         from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.studies.engines import watch_parent
 
         watch_parent()
         keep_freed_memory()
-        with TrainBar(str(self.folder())) as bar:
-            result = train(self.config, self.folder(), resume=self.resume, progress=bar.update)
-        if result.status == "interrupted":
+        if self.seeds:
+            folders = [self.folder(seed) for seed in self.seeds]
+            with TrainBar(f"{len(folders)} seeds") as bar:
+                films = self._films(dict(zip(self.seeds, folders, strict=True)))
+                results = train_seeds(self.config, self.seeds, folders, self.resume, bar.update, films)
+        else:
+            folder = self.folder()
+            with TrainBar(str(folder)) as bar:
+                films = self._films({self.config.seed: folder})
+                results = [train(self.config, folder, self.resume, bar.update, films)]
+        if any(result.status == "interrupted" for result in results):
             raise KeyboardInterrupt
-        assert result.evaluation is not None
-        print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
-        print(f"finished: {self.folder()}")
+        for result in results:
+            assert result.evaluation is not None
+            print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
+            print(f"finished: {result.run_dir}")
         return 0
+
+    def _films(self, folders: Mapping[int, Path]) -> Callable[[Any], None] | None:
+        """What films the agents into the folders of their seeds."""
+        if self.videos == "none":
+            return None
+        from arcade_torch.tools.record.evaluations import EvaluationVideos
+
+        films = {seed: EvaluationVideos(folder / "videos", f".{self.videos}") for seed, folder in folders.items()}
+        return lambda agent: films[agent.config.seed](agent)
 
     def how_to_go_on(self) -> str:
         """What to type after an interruption."""
@@ -85,6 +110,8 @@ def parse(words: Sequence[str], prog: str) -> Train:
         ValueError: an option or the preset is unknown, or a value is not allowed.
     """
     words = [_plain_number(word) for word in words]
+    if _peek(words, "--seed") is not None and _peek(words, "--seeds") is not None:
+        raise ValueError("give --seed for one run or --seeds for several, not both")
     name = _peek(words, "--preset") or "paper"
     # The preset's numbers depend on these two, and the help shows them.
     decisive = {key: _peek(words, f"--{key}") for key in ("env", "algorithm")}
