@@ -39,6 +39,9 @@ _WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.
 class CheckpointError(RuntimeError):
     """A checkpoint is missing, damaged, of another format, or of another run."""
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))  # names of files may have line breaks
+
 
 @dataclass(frozen=True)
 class Checkpoint:

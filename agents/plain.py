@@ -27,7 +27,10 @@ def to_plain(value: Any) -> Any:
     if isinstance(value, torch.Tensor):
         return value.detach().clone()
     if isinstance(value, np.ndarray):
-        return torch.from_numpy(np.ascontiguousarray(value).copy())
+        try:
+            return torch.from_numpy(np.ascontiguousarray(value).copy())
+        except TypeError as error:
+            raise TypeError(f"cannot save an array of {value.dtype}; torch has numbers and bools only") from error
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, dict):

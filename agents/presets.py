@@ -1,6 +1,7 @@
 """Ready-made configs, by name."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from arcade_torch.agents.checks import require
@@ -54,6 +55,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
         if group not in changes:
             continue
         given = changes[group]
+        require(isinstance(given, kind | Mapping), group, given, f"a {kind.__name__} or a table of its fields")
         given = dataclasses.asdict(given) if isinstance(given, kind) else dict(given)
         used = group == base.algorithm or not given
         require(

@@ -4,17 +4,19 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 from tensordict import TensorDict
 
 import arcade_torch
-from arcade_torch.agents import TrainConfig, preset
+from arcade_torch.agents import TrainConfig, load, preset
 from arcade_torch.agents.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
 from arcade_torch.agents.files import CsvLog, checksum, is_final
 from arcade_torch.agents.files import read_json as read_run_json
 from arcade_torch.agents.lease import Lease
+from arcade_torch.agents.plain import to_plain
 from arcade_torch.agents.run_folder import RunFolder
 from arcade_torch.tools.analysis.scores import read_scores
 from arcade_torch.tools.figures.runs import find_runs
@@ -324,3 +326,19 @@ def test_weights_that_are_fine_still_load(tmp_path: Path) -> None:
     save_file({"w": torch.zeros(4)}, path / "weights.safetensors")
     forge(path, "weights.safetensors", (path / "weights.safetensors").read_bytes())
     assert torch.equal(load_checkpoint(path).weights["w"], torch.zeros(4))
+
+
+def test_a_preset_takes_no_object_for_the_numbers_of_a_learner() -> None:
+    with pytest.raises(ValueError, match=r"pqn must be a PQNConfig or a table of its fields; got"):
+        preset("smoke", pqn=object())
+
+
+def test_text_in_an_array_is_not_state() -> None:
+    with pytest.raises(TypeError, match=r"cannot save an array of <U1"):
+        to_plain({"names": np.array("x")})
+
+
+def test_a_folder_with_a_line_break_in_its_name_is_refused_in_one_line() -> None:
+    with pytest.raises(CheckpointError, match=r"no such  folder is not a folder") as refused:
+        load("no such \nfolder")
+    assert len(str(refused.value).splitlines()) == 1
