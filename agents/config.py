@@ -72,7 +72,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work, one line each; names of games and models are checked when they are made."""
-        for name in ("env", "memory", "network", "device"):
+        for name in ("env", "memory", "network", "device", "observability", "rules", "algorithm", "logger"):
             value = getattr(self, name)
             require(isinstance(value, str) and value != "", name, value, "a non-empty string")
         for name in ("env_options", "network_options"):
@@ -81,7 +81,7 @@ class TrainConfig:
         twins = ("full", "partial", "mixed")
         require(self.observability in twins, "observability", self.observability, "'full', 'partial' or 'mixed'")
         require(self.rules in ("default", "reference"), "rules", self.rules, "'default' or 'reference'")
-        require(self.algorithm in tuple(GROUPS), "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
+        require(self.algorithm in GROUPS, "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
         loggers = ("none", "tensorboard", "wandb")
         require(self.logger in loggers, "logger", self.logger, "'none', 'tensorboard' or 'wandb'")
         require(self.obs_size >= 1, "obs_size", self.obs_size, "a number of pixels >= 1")

@@ -37,7 +37,11 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
 
 
 def _find(path: Path) -> Checkpoint:
-    if not path.is_dir():
+    try:
+        there = path.is_dir()
+    except OSError as error:  # a name that is too long, or a folder nobody may enter
+        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
+    if not there:
         raise CheckpointError(f"{path} is not a folder; give a run folder or one of its checkpoints")
     if (path / "meta.json").is_file():
         return load_checkpoint(path, weights_only=True)

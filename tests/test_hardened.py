@@ -342,3 +342,19 @@ def test_a_folder_with_a_line_break_in_its_name_is_refused_in_one_line() -> None
     with pytest.raises(CheckpointError, match=r"no such  folder is not a folder") as refused:
         load("no such \nfolder")
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_folder_with_a_name_that_is_too_long_is_refused_in_one_line() -> None:
+    with pytest.raises(CheckpointError, match=r"cannot be looked at: File name too long"):
+        load("9" * 300)
+
+
+def test_what_cannot_be_compared_is_no_twin() -> None:
+    class Odd:
+        def __eq__(self, other: object) -> bool:
+            raise RuntimeError("no equality here")
+
+        __hash__ = None  # type: ignore[assignment]
+
+    with pytest.raises(ValueError, match=r"observability must be"):
+        preset("smoke", observability=Odd())
