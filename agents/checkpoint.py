@@ -232,7 +232,11 @@ def _load_trainer(path: Path) -> dict[str, Any]:
 
 def _read_meta(path: Path) -> dict[str, Any]:
     file = path / _META
-    if not file.is_file():
+    try:
+        there = file.is_file()
+    except OSError as error:  # a name that is too long, or a folder nobody may enter
+        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
+    if not there:
         raise CheckpointError(f"{path} is not a checkpoint: {_META} is missing")
     try:
         meta: Any = json.loads(file.read_text(encoding="utf-8"))

@@ -20,4 +20,5 @@ def require(condition: bool, name: str, value: object, allowed: str) -> None:
         ValueError: epochs must be a whole number >= 1; got 0
     """
     if not condition:
-        raise ValueError(f"{name} must be {allowed}; got {value!r}")
+        found = " ".join(line.strip() for line in repr(value).splitlines())
+        raise ValueError(f"{name} must be {allowed}; got {found}")

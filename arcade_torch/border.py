@@ -113,9 +113,12 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
 
     Raises:
         ValueError: An entry is of another kind or shape than that of ``reset``.
+        TypeError: A tensor is a sparse one.
     """
     for key, fresh in root.items():
         kept = td.get(key, None)
+        if isinstance(kept, torch.Tensor):
+            check_tensor(kept, f"entry {key!r}")
         if kept is not None and (
             isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor) or kept.shape != fresh.shape
         ):

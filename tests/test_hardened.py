@@ -358,3 +358,22 @@ def test_what_cannot_be_compared_is_no_twin() -> None:
 
     with pytest.raises(ValueError, match=r"observability must be"):
         preset("smoke", observability=Odd())
+
+
+def test_a_checkpoint_with_a_name_that_is_too_long_is_refused_in_one_line() -> None:
+    with pytest.raises(CheckpointError, match=r"cannot be looked at: File name too long"):
+        load_checkpoint(Path("9" * 300))
+
+
+def test_a_value_of_several_lines_is_refused_in_one() -> None:
+    with pytest.raises(ValueError, match=r"env must be a string; got tensor") as refused:
+        preset("smoke", env=torch.zeros(2, 2))
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_sparse_entry_cannot_stay_while_others_are_reset(env: arcade_torch.ArcadeEnv) -> None:
+    seen = env.reset()
+    seen["step_count"] = seen["step_count"].to_sparse()
+    seen["_reset"] = torch.tensor([[True], [False]])
+    with pytest.raises(TypeError, match=r"entry 'step_count' is a torch.sparse_coo tensor"):
+        env.reset(seen)

@@ -52,7 +52,7 @@ def _damage(folder: Path, rng: random.Random) -> None:
         elif kind == 6:
             file.unlink()
             file.mkdir()
-        elif kind == 7:
+        elif kind == 7 and not (folder / "checkpoints" / "latest").is_dir():
             (folder / "checkpoints" / "latest").write_bytes(rng.choice(NAMES).encode("utf-8", "replace"))
         elif file.suffix == ".json":
             _rewrite_json(file, rng)
