@@ -67,10 +67,10 @@ def measure(id: str, player: str, episodes: int, seconds: float, seed: int = 0) 
         game.id,
         player,
         returns.size,
-        float(returns.mean()),
-        1.96 * spread / math.sqrt(returns.size),
-        float(played.lengths.mean()),
-        time.monotonic() - started,
+        round(float(returns.mean()), 5),
+        round(1.96 * spread / math.sqrt(returns.size), 5),
+        round(float(played.lengths.mean()), 5),
+        round(time.monotonic() - started, 1),
     )
 
 
@@ -91,7 +91,9 @@ def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) ->
         for player in PLAYERS:
             if (id, player) not in known:
                 known[id, player] = measure(id, player, episodes, seconds)
-                write_csv(out, map(_plain, known.values()), [field.name for field in dataclasses.fields(Baseline)])
+                write_csv(
+                    out, map(dataclasses.asdict, known.values()), [field.name for field in dataclasses.fields(Baseline)]
+                )
             yield known[id, player]
 
 
@@ -139,8 +141,3 @@ def insert(page: Path, table: str) -> Path:
         ValueError: the page has no such marks.
     """
     return write_between(page, BEGIN, END, table)
-
-
-def _plain(row: Baseline) -> dict[str, object]:
-    rounded = {name: round(getattr(row, name), 5) for name in ("mean", "half_width", "steps")}
-    return dataclasses.asdict(row) | rounded | {"seconds": round(row.seconds, 1)}

@@ -45,14 +45,16 @@ def test_laps_give_every_moment_to_the_part_that_was_at_work() -> None:
 
     first, second, laps = nn.Linear(3, 4), Slow(4, 2), Laps()
     with laps.through(first, "first", "before", "between"), laps.through(second, "second", "between", "behind"):
+        outer = time.perf_counter()
         laps.start()
-        began = time.perf_counter()
+        inner = time.perf_counter()
         second(first(torch.randn(5, 3))).sum().backward()
+        at_least = time.perf_counter() - inner
         laps.press("after")
-        passed = time.perf_counter() - began
+        at_most = time.perf_counter() - outer
     assert list(laps.seconds) == ["before", "first", "between", "second", "behind", "after"]
     assert laps.seconds["second"] >= 0.05 and laps.seconds["behind"] >= 0.1
-    assert sum(laps.seconds.values()) == pytest.approx(passed, abs=1e-3)
+    assert at_least <= sum(laps.seconds.values()) + 1e-9 <= at_most + 2e-9  # nothing is lost, nothing counted twice
     before = dict(laps.seconds)
     second(first(torch.randn(5, 3))).sum().backward()
     assert laps.seconds == before  # the hooks are gone

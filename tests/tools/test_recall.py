@@ -82,6 +82,7 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     assert cli.main(words) == cli.EXIT_OK
     assert torch.get_num_threads() == threads and "training gdn, delay 2" in capsys.readouterr().err
     text = page.read_text()
+    assert recall.markdown(recall.read_recall(out)) in text
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
     assert "| `gdn` | " in text and "| delay 1 | delay 2 |" in text
     monkeypatch.setattr(recall, "train", None)
@@ -90,6 +91,15 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     assert cli.main(words) == cli.EXIT_BAD_INPUT
     assert "is no table of delayed recall" in capsys.readouterr().err
     assert cli.main(["bench", "recall", "--seconds", "0"]) == cli.EXIT_BAD_INPUT
+
+
+def test_a_row_reads_the_same_after_it_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """0.249 s is 0.2 s, and so it stays: not 0.25 s in the file and 0.3 s when it is read."""
+    out, passed = tmp_path / "r.csv", iter([0.0, 0.249])
+    monkeypatch.setattr(recall.time, "process_time", lambda: next(passed))
+    case, setting = (Entry("gdn"), 1), Setting(hidden_size=8, seconds=0.2, check_every=1, answers=200)
+    (row,) = recall.measure_all([case], setting, out)
+    assert recall.read_recall(out) == [row]
 
 
 def test_the_table_says_what_was_not_solved() -> None:

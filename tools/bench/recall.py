@@ -84,10 +84,10 @@ class Recall:
         delay: steps between the symbol and the question.
         hidden_size: width of the memory block.
         seed: of weights and data.
-        accuracy: share of right answers on fresh data at the end.
+        accuracy: share of right answers on fresh data at the end, to four places.
         answers: how many those were.
         steps: of training, until 99 % of the answers were right or the budget was spent.
-        seconds: processor time of these steps, tests left out.
+        seconds: processor time of these steps, tests left out, to two places.
         parameters: of the network.
         state_numbers: numbers in its recurrent state.
     """
@@ -229,10 +229,10 @@ def train(entry: Entry, delay: int, setting: Setting | None = None) -> Recall:
         delay,
         setting.hidden_size,
         setting.seed,
-        right,
+        round(right, 4),
         answers,
         steps,
-        spent,
+        round(spent, 2),
         sum(p.numel() for p in reader.parameters()),
         sum(leaf.numel() for leaf in state.values(True, True)),
     )
@@ -275,7 +275,7 @@ def measure_all(
             tell(f"{entry.label}, delay {delay}")
             known[key] = train(entry, delay, setting)
             if out is not None:
-                write_csv(out, map(_plain, known.values()), [field.name for field in fields(Recall)])
+                write_csv(out, map(asdict, known.values()), [field.name for field in fields(Recall)])
         yield known[key]
 
 
@@ -313,7 +313,3 @@ def _cell(row: Recall | None) -> str:
         return ""
     effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
     return f"{100 * row.accuracy:.1f} %" + (f" ({effort})" if row.solved else f" (not solved: {effort})")
-
-
-def _plain(row: Recall) -> dict[str, object]:
-    return asdict(row) | {"accuracy": round(row.accuracy, 4), "seconds": round(row.seconds, 2)}
