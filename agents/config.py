@@ -52,6 +52,9 @@ class TrainConfig:
     amp: bool = False
     """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the rest stays float32.
     Agents act as they were trained."""
+    compile: bool = False
+    """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and rounding of its own.
+    Meant for GPUs: two cores are no faster with it. What is saved is the same; a loaded agent is not compiled."""
     threads: int = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
     eval_every: int = 1_000_000

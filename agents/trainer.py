@@ -21,6 +21,8 @@ from arcade_torch.agents.metrics import EpisodeStats
 from arcade_torch.groups import seed_groups
 
 _CALIBRATION_FRAMES = 3200
+COMPILE_BACKEND = "inductor"
+"""Of ``torch.compile``; tests take one that needs no C++ compiler."""
 
 
 class Trainer:
@@ -35,6 +37,8 @@ class Trainer:
         self.config = config
         algorithm = ALGORITHMS[config.algorithm]
         self.network = build_network(config)
+        if config.compile:
+            compile_parts(self.network)
         self.total_frames = config.num_updates * config.learner.frames_per_update
         self.explore = torch.Generator(config.device).manual_seed(config.seed)
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
@@ -127,6 +131,19 @@ class Trainer:
     def close(self) -> None:
         """Let go of the environments."""
         self.collector.shutdown()
+
+
+def compile_parts(network: Network) -> None:
+    """Compile what acting and learning call of a network; its weights and their names stay as they are.
+
+    Sizes are symbols from the start, so windows of another length need no second compilation, and a run that goes on
+    after an interruption gets the same code whichever size it meets first.
+
+    Args:
+        network: changed in place.
+    """
+    for part in ("encode", "remember"):
+        setattr(network, part, torch.compile(getattr(network, part), dynamic=True, backend=COMPILE_BACKEND))
 
 
 def make_collector(configs: Sequence[TrainConfig], actor: Any, network: Network) -> arcade_torch.ArcadeCollector:

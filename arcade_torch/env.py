@@ -15,7 +15,7 @@ from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
 from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
 from arcade_torch.endings import FinalStates
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
-from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.envs_jax.batch import Batch, Outcome, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.snapshot import Snapshots
 
@@ -40,6 +40,9 @@ class ArcadeEnv(EnvBase):
     ``terminated``, ``truncated`` bool [N, 1]; ``"next"`` has ``reward`` float32 [N, 1] too. ``("next", "pixels")`` at
     an end is the true final frame; the following root is the first frame of the new episode. With several games also
     ``task`` int64 [N]: which of ``games`` an env plays, at every step and in every episode the same.
+
+    Envs that an entry ``_step`` (bool [N]) leaves out stay where they are, as TorchRL asks of them when a rollout waits
+    until all are done: their ``"next"`` repeats the root, with reward 0.
 
     ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
     give equal bits, whatever N, and whichever path is taken.
@@ -269,8 +272,8 @@ class ArcadeEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._load_state_of(tensordict)
         action = self._check_action(border.tensor(tensordict, "action"))
-        argument = int32_argument(action)
-        stepped, outcome, pixels = self._batched.step_render(self._live.batch, argument)
+        argument, before = int32_argument(action), self._live.batch
+        stepped, outcome, pixels = self._batched.step_render(before, argument)
         frames = to_torch(pixels, self.device)
         self._live.replace(stepped)
         step_count = to_torch(stepped.step_count, self.device).to(torch.int64)
@@ -278,7 +281,20 @@ class ArcadeEnv(EnvBase):
         following = self._next(frames, action, step_count, episode_reward, outcome)
         if self._state_in_td:
             following["state"] = self._snapshots.export(stepped)
+        if "_step" in tensordict:
+            return self._only_marked(tensordict, before, following)
         return following
+
+    def _only_marked(self, tensordict: TensorDictBase, before: Batch, following: TensorDict) -> TensorDictBase:
+        """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
+        marked = border.mask(tensordict, "_step", self.num_envs)
+        mask, both = jax.numpy.asarray(marked.cpu().numpy()), (self._live.batch, before)
+        self._live.replace(self._batched.narrow(choose_rows(mask, *map(self._batched.wide, both))))
+        left_alone = following.apply(torch.zeros_like)
+        kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
+        left_alone.update(tensordict.select(*kept, strict=False))
+        merged: TensorDictBase = following.where(marked, left_alone)
+        return merged
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         self._assert_tensordict_shape(tensordict)

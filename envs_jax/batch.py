@@ -67,8 +67,8 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.PRNGKey(jnp.uint32(seed)), index)
 
 
-def _where(mask: Array, yes: Any, no: Any) -> Any:
-    """Choose whole rows of two pytrees by a bool [N] mask."""
+def choose_rows(mask: Array, yes: Any, no: Any) -> Any:
+    """Choose whole rows of two pytrees, all leaves [N, ...], by a bool [N] mask."""
 
     def choose(a: Array, b: Array) -> Array:
         return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
@@ -181,7 +181,7 @@ class BatchedGame(Steps, Generic[State]):
         zeros = jnp.zeros_like(batch.step_count)
         state = jax.vmap(self.game.reset)(first)
         fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
-        return Batch(*_where(mask, fresh, batch))
+        return Batch(*choose_rows(mask, fresh, batch))
 
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""

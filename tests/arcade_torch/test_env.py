@@ -303,3 +303,21 @@ def test_real_games_pass_through(id: str) -> None:
     check_env_specs(env, seed=0)
     assert env.observability.all()
     assert make(id, num_envs=3)._compiled is env._compiled
+
+
+@pytest.mark.parametrize("options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=str)
+def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
+    """TorchRL hands ``_step`` to envs of a fixed batch size and trusts that they heed it."""
+    env, twin = stub_env(seed=3, **options), stub_env(seed=3, **options)
+    td, other = env.reset(), twin.reset()
+    marked = torch.arange(N) % 3 != 0
+    for _ in range(3):  # the envs left alone keep their state, their frames and their dice
+        whole = twin.step(scripted(other.clone()))["next"]
+        stepped = env.step(scripted(td.clone()).set("_step", marked))["next"]
+        assert_same(stepped[marked], whole[marked])
+        assert (stepped["reward"][~marked] == 0).all()
+        assert_same(stepped.exclude("reward")[~marked], td.select(*stepped.exclude("reward").keys(True, True))[~marked])
+        td, other = (env.step_mdp(TensorDict({"next": part}, [N])) for part in (stepped, whole))
+    fresh = stub_env(seed=3, **options)
+    first = fresh.step(scripted(fresh.reset()))["next"]
+    assert_same(env.step(scripted(td))["next"][~marked], first[~marked])

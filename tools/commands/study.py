@@ -21,7 +21,7 @@ class StudyCommand:
     sizes, question and a table [settings] with options of train. Several such processes, on any machines that see the
     folder, may work on one study together.
 
-    Example: arcade-torch study examples/study.toml --out runs/mine --workers 4
+    Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
 
     file: tyro.conf.Positional[Path | None] = None
