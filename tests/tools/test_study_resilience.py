@@ -22,6 +22,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     [
         pytest.param(lambda bench: resilience.engines(bench), id="every engine gives the same to the bit"),
         pytest.param(lambda bench: resilience.worker(bench), id="a killed worker costs nothing"),
+        pytest.param(
+            lambda bench: resilience.head(bench), id="a killed Ray cluster costs nothing", marks=pytest.mark.ray
+        ),
         pytest.param(lambda bench: resilience.kills(bench, 6), id="kills at random moments cost nothing"),
         pytest.param(lambda bench: resilience.disk(bench), id="a full disk costs nothing"),
         pytest.param(lambda bench: resilience.together(bench), id="three studies share a folder"),

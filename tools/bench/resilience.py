@@ -1,6 +1,6 @@
 """Prove that studies survive: engines agree to the bit, kills lose nothing, nor does a full disk, nor company.
 
-    python -m arcade_torch.tools.bench.resilience --work DIR [--rounds 20] [engines worker kills disk together]
+    python -m arcade_torch.tools.bench.resilience --work DIR [--rounds 20] [engines worker head kills disk together]
 
 Every part runs a study of 24 short trainings for real and prints one line with what it found; exit code 1 if something
 was lost, done twice or differs. Takes some minutes a part on two cores.
@@ -30,7 +30,7 @@ seeds = {seeds}
 preset = "smoke"
 """
 TIMES = ("seconds", "fps")
-PARTS = ("engines", "worker", "kills", "disk", "together")
+PARTS = ("engines", "worker", "head", "kills", "disk", "together")
 _CLOCK = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d|, \d+ s</span>|[\d.]+ minutes over all runs|--engine \w+")
 
 
@@ -122,6 +122,21 @@ def children(pid: int) -> list[int]:
     return found
 
 
+def descendants(pid: int) -> list[int]:
+    """Children of a process, theirs, and so on."""
+    return [one for child in children(pid) for one in (child, *descendants(child))]
+
+
+def ray_workers(pid: int) -> list[int]:
+    """Processes in which the Ray cluster of a study carries out runs."""
+    found = []
+    for each in descendants(pid):
+        with contextlib.suppress(OSError):
+            if b"ray::" in Path(f"/proc/{each}/cmdline").read_bytes():
+                found.append(each)
+    return found
+
+
 def kill(*pids: int) -> None:
     """SIGKILL."""
     for pid in pids:
@@ -160,6 +175,28 @@ def worker(bench: Bench) -> tuple[str, bool]:
     told = f"exit {code} with {len(before)} runs finished and {len(failed)} failed; again: exit {again}, finished runs "
     told += f"untouched: {kept}, same to the bit: {same}, same report: {pages}"
     return told, kept and same and pages and len(failed) == (code == 1)
+
+
+def head(bench: Bench) -> tuple[str, bool]:
+    """On Ray: kill a worker, later the study with its whole cluster, start again: the same as undisturbed."""
+    expected, root = bench.undisturbed(), bench.root("head")
+    study = bench.start(root, "ray")
+    while study.poll() is None and (len(finished(root)) < bench.runs // 4 or not ray_workers(study.pid)):
+        time.sleep(0.05)
+    workers = ray_workers(study.pid)
+    kill(*workers[:1])
+    while study.poll() is None and len(finished(root)) < bench.runs // 2:
+        time.sleep(0.05)
+    running = study.poll() is None
+    kill(study.pid, *descendants(study.pid))
+    study.wait()
+    before = finished(root)
+    again = bench.carry_out(root, "ray")
+    kept = all(finished(root)[name] == seen for name, seen in before.items())
+    same, pages = fingerprint(root) == expected, page(root) == page(bench.root("inline"))
+    told = f"one of {len(workers)} workers killed, then the study and its cluster with {len(before)} runs finished; "
+    told += f"again: exit {again}, finished runs untouched: {kept}, same to the bit: {same}, same report: {pages}"
+    return told, bool(workers) and running and again == 0 and kept and same and pages
 
 
 def kills(bench: Bench, rounds: int = 20) -> tuple[str, bool]:
@@ -275,6 +312,7 @@ def main() -> int:
     known: dict[str, Callable[[], tuple[str, bool]]] = {
         "engines": lambda: engines(bench),
         "worker": lambda: worker(bench),
+        "head": lambda: head(bench),
         "kills": lambda: kills(bench, options.rounds),
         "disk": lambda: disk(bench),
         "together": lambda: together(bench),
