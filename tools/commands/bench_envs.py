@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.files import write_csv, write_json
+from arcade_torch.tools.bench.table_file import check_table_file, save_table
 from arcade_torch.tools.tables import show_table
 
 
@@ -37,8 +37,7 @@ class BenchEnvs:
 
     def run(self) -> int:
         """Measure, print, save."""
-        if self.out is not None and self.out.suffix not in (".csv", ".json"):
-            raise ValueError(f"--out must end in .csv or .json, got {self.out}")
+        check_table_file(self.out)
         from arcade_torch.envs_jax import registered_ids
         from arcade_torch.tools.bench.envs import NAMES, as_dicts, bench_envs, machine
         from arcade_torch.tools.keep_memory import keep_freed_memory
@@ -59,9 +58,7 @@ class BenchEnvs:
         self._summary(rows, games)
         print("frames/s without the checksum's time, and with it; medians of", self.repeats, "turns")
         print(", ".join(f"{name} {value}" for name, value in about.items() if value))
-        if self.out is not None:
-            _save(self.out, as_dicts(rows), about)
-            print(self.out)
+        save_table(self.out, as_dicts(rows), about)
         return 0
 
     def _summary(self, rows: Sequence[Any], games: Sequence[str]) -> None:
@@ -102,10 +99,3 @@ def _cells(row: Any, names: dict[str, str]) -> Sequence[str]:
         f"{row.frames_per_s_with_check:,.0f}",
         *(drawn if row.measure != "step" else ("", "", "")),
     )
-
-
-def _save(path: Path, rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
-    if path.suffix == ".json":
-        write_json(path, {"machine": about, "rows": rows})
-    else:
-        write_csv(path, [{**row, **about} for row in rows], [*rows[0], *about])

@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from arcade_torch.tools.files import write_csv, write_json
+from arcade_torch.tools.bench.table_file import check_table_file, save_table
 from arcade_torch.tools.tables import show_table
 
 
@@ -40,8 +40,7 @@ class BenchSeeds:
 
     def run(self) -> int:
         """Measure, print, save."""
-        if self.out is not None and self.out.suffix not in (".csv", ".json"):
-            raise ValueError(f"--out must end in .csv or .json, got {self.out}")
+        check_table_file(self.out)
         if self.threads < 0:
             raise ValueError(f"--threads must be 0 or more, got {self.threads}")
         import torch
@@ -64,13 +63,7 @@ class BenchSeeds:
         titles = ("network", "memory", "seeds", "frames/s together", "frames/s one by one", "gain")
         show_table(f"Seeds together; medians of {self.repeats} turns", titles, cells)
         print(", ".join(f"{name} {value}" for name, value in about.items() if value))
-        if self.out is not None:
-            rows = as_rows(speeds)
-            if self.out.suffix == ".json":
-                write_json(self.out, {"machine": about, "rows": rows})
-            else:
-                write_csv(self.out, [{**row, **about} for row in rows], [*rows[0], *about])
-            print(self.out)
+        save_table(self.out, as_rows(speeds), about)
         return 0
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.files import write_csv, write_json
+from arcade_torch.tools.bench.table_file import check_table_file, save_table
 from arcade_torch.tools.tables import show_table
 
 
@@ -41,8 +41,7 @@ class BenchTrain:
 
     def run(self) -> int:
         """Measure, print, save."""
-        if self.out is not None and self.out.suffix not in (".csv", ".json"):
-            raise ValueError(f"--out must end in .csv or .json, got {self.out}")
+        check_table_file(self.out)
         if self.threads < 0:
             raise ValueError(f"--threads must be 0 or more, got {self.threads}")
         import torch
@@ -62,9 +61,7 @@ class BenchTrain:
         rows = [speed.flat() for speed in told]
         _show(rows, self.repeats)
         print(", ".join(f"{name} {value}" for name, value in about.items() if value))
-        if self.out is not None:
-            _save(self.out, rows, about)
-            print(self.out)
+        save_table(self.out, rows, about)
         return 0
 
 
@@ -106,10 +103,3 @@ def _digits(key: str) -> int:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
-
-
-def _save(path: Path, rows: list[dict[str, Any]], about: dict[str, Any]) -> None:
-    if path.suffix == ".json":
-        write_json(path, {"machine": about, "rows": rows})
-    else:
-        write_csv(path, [{**row, **about} for row in rows], [*rows[0], *about])
