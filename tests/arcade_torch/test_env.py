@@ -305,7 +305,7 @@ def test_real_games_pass_through(id: str) -> None:
     assert make(id, num_envs=3)._compiled is env._compiled
 
 
-@pytest.mark.parametrize("options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=["plain", "state", "mixed"])
 def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
     """TorchRL hands ``_step`` to envs of a fixed batch size and trusts that they heed it."""
     env, twin = stub_env(seed=3, **options), stub_env(seed=3, **options)
