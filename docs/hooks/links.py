@@ -10,6 +10,7 @@ PAGES = {
     "SECURITY.md": "security.md",
     "results/README.md": "results/measurements.md",
     "results/parity.md": "results/parity.md",
+    "results/small.md": "results/small.md",
     "examples/notebooks": "notebooks.md",
 }
 """Repository path to place on the site, for what does not lie in docs/."""
