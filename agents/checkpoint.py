@@ -26,7 +26,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig, coerce, differing_fields
 from arcade_torch.agents.files import checksum as _checksum
 from arcade_torch.agents.files import write_atomic
 from arcade_torch.agents.plain import from_plain, to_plain
@@ -156,7 +156,7 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
     meta = _read_meta(path)
     try:
         config = TrainConfig.from_dict(meta["config"])
-        frames = int(meta["frames"])
+        frames = coerce("frames", meta["frames"], int)
         sums = dict(meta["sha256"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error

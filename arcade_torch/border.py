@@ -105,25 +105,26 @@ def check_tensor(value: Any, what: str) -> None:
 
 
 def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
-    """Refuse entries that cannot stay where they are while other envs are reset.
+    """Refuse entries that cannot stay where they are while other envs are reset or stepped.
 
     Args:
-        td: What arrived, with the envs that are not reset.
-        root: What ``reset`` gives.
+        td: What arrived, with the envs that are left alone.
+        root: What ``reset`` or ``step`` gives.
 
     Raises:
-        ValueError: An entry is of another kind or shape than that of ``reset``.
+        ValueError: An entry is of another kind or shape than that of ``root``.
         TypeError: A tensor is a sparse one.
     """
-    for key, fresh in root.items():
-        kept = td.get(key, None)
+    for key, kept in td.items(True, True):  # TorchRL merges all of them, also those that reset does not know
         if isinstance(kept, torch.Tensor):
             check_tensor(kept, f"entry {key!r}")
+    for key, fresh in root.items():
+        kept = td.get(key, None)
         if kept is not None and (
             isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor) or kept.shape != fresh.shape
         ):
             found = f"{type(kept).__name__} {list(kept.shape)}"
-            raise ValueError(f"entry {key!r} is a {found}, expected one of shape {list(fresh.shape)} as reset gives it")
+            raise ValueError(f"entry {key!r} is a {found}, expected shape {list(fresh.shape)} as the env gives it")
 
 
 def mask(td: TensorDictBase, key: str, num_envs: int) -> torch.Tensor:

@@ -41,8 +41,7 @@ class ArcadeEnv(EnvBase):
     an end is the true final frame; the following root is the first frame of the new episode. With several games also
     ``task`` int64 [N]: which of ``games`` an env plays, at every step and in every episode the same.
 
-    Envs that an entry ``_step`` (bool [N]) leaves out stay where they are, as TorchRL asks of them when a rollout waits
-    until all are done: their ``"next"`` repeats the root, with reward 0.
+    Envs that an entry ``_step`` (bool [N]) leaves out stay where they are: their ``"next"`` repeats the root, reward 0.
 
     ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
     give equal bits, whatever N, and whichever path is taken.
@@ -287,9 +286,11 @@ class ArcadeEnv(EnvBase):
 
     def _only_marked(self, tensordict: TensorDictBase, before: Batch, following: TensorDict) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
-        marked = border.mask(tensordict, "_step", self.num_envs)
-        mask, both = jax.numpy.asarray(marked.cpu().numpy()), (self._live.batch, before)
-        self._live.replace(self._batched.narrow(choose_rows(mask, *map(self._batched.wide, both))))
+        marked, stepped = border.mask(tensordict, "_step", self.num_envs), self._live.batch
+        self._live.replace(before)  # where it stays if the next line refuses
+        border.check_merge(tensordict, following)
+        rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before)))
+        self._live.replace(self._batched.narrow(rows))
         left_alone = following.apply(torch.zeros_like)
         kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
         left_alone.update(tensordict.select(*kept, strict=False))

@@ -18,12 +18,14 @@ from arcade_torch.agents.files import read_json as read_run_json
 from arcade_torch.agents.lease import Lease
 from arcade_torch.agents.plain import to_plain
 from arcade_torch.agents.run_folder import RunFolder
+from arcade_torch.tools.analysis.curves import curves_of_runs
 from arcade_torch.tools.analysis.scores import read_scores
 from arcade_torch.tools.figures.runs import find_runs
 from arcade_torch.tools.figures.throughput import read_rows
 from arcade_torch.tools.files import read_csv, read_json, write_between
 from arcade_torch.tools.name_value import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
+from arcade_torch.tools.studies.folder import RunFolder as StudyRun
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import small_study, write_study
@@ -107,8 +109,12 @@ def test_reset_refuses_a_mask_that_is_none(
 def test_a_partial_reset_refuses_entries_that_cannot_stay(env: arcade_torch.ArcadeEnv) -> None:
     mask = torch.tensor([True, False])
     for wrong in (torch.zeros(2, 5), TensorDict({"x": torch.zeros(2)}, [2])):
-        with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected one of shape"):
+        with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected shape"):
             env.reset(TensorDict({"_reset": mask, "pixels": wrong}, [2]))
+        with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected shape"):
+            env.step(TensorDict({"_step": mask, "pixels": wrong, "action": torch.zeros(2).long()}, [2]))
+    with pytest.raises(TypeError, match=r"'x' is a torch\.sparse_coo tensor, expected a dense one"):
+        env.reset(TensorDict({"_reset": mask, "x": torch.zeros(2, 5).to_sparse()}, [2]))
 
 
 @pytest.mark.parametrize(
@@ -153,6 +159,15 @@ def test_forged_parts_of_a_checkpoint_are_damage(tmp_path: Path, part: str, data
     with pytest.raises(CheckpointError, match=part) as found:
         load_checkpoint(path)
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("frames", [float("inf"), float("nan"), 1.5, "64", None])
+def test_a_count_of_frames_that_is_none_is_damage(tmp_path: Path, frames: Any) -> None:
+    path = checkpoint(tmp_path)
+    meta = json.loads((path / "meta.json").read_text())
+    (path / "meta.json").write_text(json.dumps(meta | {"frames": frames}))
+    with pytest.raises(CheckpointError, match="frames must be a whole number"):
+        load_checkpoint(path)
 
 
 def test_json_of_endless_depth_or_digits_is_damage(tmp_path: Path) -> None:
@@ -311,6 +326,18 @@ def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, m
     row |= {"options": "{}", "seed": "0", "actions": "012", "observability": "full"}
     with pytest.raises(ValueError, match=message):
         replay(row | {cell: value})
+
+
+def test_seeds_that_never_met_make_no_curve(tmp_path: Path) -> None:
+    """Seed 0 was seen at 10 and 20 frames, seed 1 at 14 and 16: between 14 and 16 the longest log has nothing."""
+    runs = [StudyRun(tmp_path / name) for name in ("seed0", "seed1")]
+    for run, frames in zip(runs, ((10, 12, 20), (14, 16)), strict=True):
+        run.path.mkdir()
+        rows = "".join(f"{each},0.5,0,8\n" for each in frames)
+        (run.path / "eval.csv").write_text(f"frames,mean,std,n\n{rows}")
+    group = ("mlp", "MineSweeperEasy", "full")
+    assert curves_of_runs({group: runs}) == []
+    assert len(curves_of_runs({group: runs[:1]})) == 1
 
 
 def test_small_things_that_are_no_text_or_no_json(tmp_path: Path) -> None:

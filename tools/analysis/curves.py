@@ -72,13 +72,13 @@ def curves_of_runs(
         confidence: as for `learning_curves`.
 
     Returns:
-        One curve a group in which some run has logged something.
+        One curve a group whose runs have logged something at frames that all of them reached.
     """
     found = []
     for (agent, game, twin), runs in groups.items():
         histories = [history for run in runs if (history := _history(run, kind))[0].size]
-        if histories:
-            found.append(_curve(agent, game, twin, histories, kind, confidence))
+        if histories and (curve := _curve(agent, game, twin, histories, kind, confidence)).frames.size:
+            found.append(curve)
     return found
 
 

@@ -31,7 +31,10 @@ preset = "smoke"
 """
 TIMES = ("seconds", "fps")
 PARTS = ("engines", "worker", "head", "kills", "disk", "together")
-_CLOCK = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d|, \d+ s</span>|[\d.]+ minutes over all runs|--engine \w+")
+_CLOCK = re.compile(
+    r"\d{4}-\d\d-\d\d \d\d:\d\d|, \d+ s</span>|[\d.]+ minutes over all runs|--engine \w+"
+    r"| --(?:cpus-per-run|gpus-per-run|retries) \d+"  # what only Ray is told
+)
 
 
 class Bench:
