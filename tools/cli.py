@@ -33,7 +33,7 @@ BAD_INPUT = (
 )
 """What the library raises at its border, beside its own error types; shown as one line."""
 
-WORK_FAILED = ("NonFiniteError",)
+WORK_FAILED = ("NonFiniteError", "ClusterLostError")
 """Own error types that do not mean bad input."""
 
 

@@ -16,7 +16,7 @@ import pytest
 from arcade_torch.agents.lease import LOCK, Lease
 from arcade_torch.tools.studies import ray_task
 from arcade_torch.tools.studies.engines import Job, JobResult, Processes
-from arcade_torch.tools.studies.ray_engine import Ray
+from arcade_torch.tools.studies.ray_engine import ClusterLostError, Ray
 from arcade_torch.tools.studies.ray_task import Order, Outcome, carry_out
 from arcade_torch.tools.studies.runner import study
 from tests.tools.fabricated import small_study
@@ -109,6 +109,15 @@ def test_a_run_that_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         run_all(FakeRay(lambda order: Outcome(0)), some_jobs(tmp_path), cpus_per_run=4)
     with pytest.raises(ValueError, match="cpus-per-run must be above 0"):
         Ray(module=FakeRay(lambda order: Outcome(0)), cpus_per_run=0)
+
+
+def test_a_cluster_that_is_gone_is_said_to_be_gone_and_results_are_kept(tmp_path: Path) -> None:
+    ray = FakeRay(lambda order: Outcome(0), cores=2)
+    results = Ray(module=ray, poll_s=0.0).run(some_jobs(tmp_path, 4))
+    assert next(results).exit_code == 0
+    ray.cores = 0  # what Ray tells when the only node died
+    with pytest.raises(ClusterLostError, match="finished runs are kept"):
+        list(results)
 
 
 PROGRAM = (

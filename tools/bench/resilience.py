@@ -131,11 +131,12 @@ def descendants(pid: int) -> list[int]:
 
 
 def ray_workers(pid: int) -> list[int]:
-    """Processes in which the Ray cluster of a study carries out runs."""
+    """Processes in which the Ray cluster of a study carries out runs, or waits for one; Ray's own agents left out."""
     found = []
     for each in descendants(pid):
         with contextlib.suppress(OSError):
-            if b"ray::" in Path(f"/proc/{each}/cmdline").read_bytes():
+            name = Path(f"/proc/{each}/cmdline").read_bytes()
+            if name.startswith(b"ray::") and b"Agent" not in name:
                 found.append(each)
     return found
 

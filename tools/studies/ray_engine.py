@@ -26,6 +26,10 @@ OBJECT_STORE_BYTES = 128 << 20
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 
 
+class ClusterLostError(RuntimeError):
+    """The cluster that a study started for itself is no more; what is finished is kept."""
+
+
 @dataclass
 class _Attempt:
     order: Order
@@ -118,6 +122,11 @@ class Ray:
     def _room(self, ray: Any) -> int:
         """Runs that the cluster has room for now; machines may come and go. One more on a cluster that can grow."""
         have = ray.cluster_resources()
+        if not self.address and not have.get("CPU"):  # it began with all cores of this machine
+            raise ClusterLostError(
+                "Ray's node on this machine is gone (killed, or out of memory); finished runs are kept, "
+                "the same command goes on with the others"
+            )
         room = int(have.get("CPU", 0) / self.cpus_per_run)
         if self.gpus_per_run:
             room = min(room, int(have.get("GPU", 0) / self.gpus_per_run))
