@@ -104,6 +104,17 @@ def test_closing_the_engine_cancels_what_still_runs(tmp_path: Path) -> None:
     assert not list((tmp_path / "s" / "runs").glob(".shared*"))
 
 
+def test_what_a_killed_study_left_is_swept_away_a_week_later(tmp_path: Path) -> None:
+    runs = tmp_path / "s" / "runs"
+    runs.mkdir(parents=True)
+    old, young = runs / ".shared-old", runs / ".shared-young"
+    for file in (old, young):
+        file.touch()
+    os.utime(old, (time.time() - 8 * 86_400,) * 2)
+    run_all(FakeRay(lambda order: Outcome(0)), some_jobs(tmp_path))
+    assert not old.exists() and young.exists()
+
+
 def test_a_run_that_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="wants 4 cores and 0 GPUs, this machine has 2 and 0"):
         run_all(FakeRay(lambda order: Outcome(0)), some_jobs(tmp_path), cpus_per_run=4)

@@ -93,7 +93,7 @@ def digest(data: bytes) -> str:
 def fingerprint(root: Path) -> dict[str, str]:
     """What a study found, without what a clock says: its table, and every run's curve, returns and weights."""
     found = {"results.csv": digest((root / "results.csv").read_bytes())}
-    for run in sorted((root / "runs").iterdir()):
+    for run in sorted(path for path in (root / "runs").iterdir() if path.is_dir()):
         final = read_json(run / "eval.json")
         rows = [[row[key] for key in row if key not in TIMES] for row in read_csv(run / "metrics.csv")]
         weights = sorted(run.glob("checkpoints/frames-*/weights.safetensors"))[-1]

@@ -23,6 +23,8 @@ from arcade_torch.tools.studies.engines import Job, JobResult, Jobs, available_c
 from arcade_torch.tools.studies.ray_task import Order, Outcome, carry_out
 
 OBJECT_STORE_BYTES = 128 << 20
+PROBE_DAYS = 7
+"""Older files named .shared-... are litter: left by studies that were killed."""
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 
 
@@ -191,12 +193,21 @@ def _order(job: Job, probes: dict[Path, str], threads: int) -> Order:
     root = folder.parent if folder is not None else job.log.absolute().parent
     probe = next((file for file in probes if file.parent == root), None)
     if probe is None:
+        _sweep(root)
         probe = root / f".shared-{uuid.uuid4().hex}"
         probes[probe] = uuid.uuid4().hex
         write_bytes(probe, probes[probe].encode())
     environment = {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     environment |= {VARIABLE: os.environ[VARIABLE]} if VARIABLE in os.environ else {}
     return Order(job.name, words, job.log.absolute(), folder, (probe, probes[probe]), environment)
+
+
+def _sweep(root: Path) -> None:
+    """Remove the files by which studies that were killed showed their disk; younger ones may still be needed."""
+    for old in root.glob(".shared-*"):
+        with contextlib.suppress(OSError):
+            if time.time() - old.stat().st_mtime > PROBE_DAYS * 86_400:
+                old.unlink()
 
 
 def _outcome(ray: Any, reference: Any) -> Outcome:
