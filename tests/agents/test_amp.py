@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import load, preset, train
+from arcade_torch.agents import load, preset
 from arcade_torch.agents.agent import build_network
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.models import Encoder, PaperEncoder, SmallEncoder
-from tests.agents.test_training import assert_same_run, stop_after
+from tests.agents.test_training import assert_goes_on_to_the_bit
 
 CONFIG = preset("smoke", env="SignpostEasy-v0", total_frames=192, checkpoint_every=64, amp=True)
 
@@ -39,15 +39,7 @@ def test_every_encoder_of_a_network_follows_the_config(algorithm: str) -> None:
 
 
 def test_a_run_goes_on_to_the_bit_and_its_agent_acts_as_it_was_trained(tmp_path: Path) -> None:
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    train(CONFIG, tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, tmp_path / "parts", progress=stop_after(2, stop))
-    train(CONFIG, tmp_path / "parts", resume=True)
-    assert_same_run(tmp_path / "whole", tmp_path / "parts")
-    assert load(tmp_path / "parts").network.encoder.amp
+    assert load(assert_goes_on_to_the_bit(CONFIG, tmp_path)).network.encoder.amp
 
 
 def test_it_belongs_to_the_identity_of_a_run_and_is_true_or_false() -> None:

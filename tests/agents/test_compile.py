@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import load, preset, train, train_seeds, trainer
+from arcade_torch.agents import load, preset, train_seeds, trainer
 from arcade_torch.agents.agent import build_network
 from arcade_torch.agents.config import TrainConfig
-from tests.agents.test_training import assert_same_run, stop_after
+from tests.agents.test_training import assert_goes_on_to_the_bit
 
 CONFIG = preset("smoke", env="SignpostEasy-v0", total_frames=192, checkpoint_every=64, compile=True)
 
@@ -55,15 +55,7 @@ def test_generated_code_agrees_too() -> None:
 
 
 def test_a_run_goes_on_to_the_bit_and_its_agent_is_loaded_plain(tmp_path: Path) -> None:
-    def stop() -> None:
-        raise KeyboardInterrupt
-
-    train(CONFIG, tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, tmp_path / "parts", progress=stop_after(2, stop))
-    train(CONFIG, tmp_path / "parts", resume=True)
-    assert_same_run(tmp_path / "whole", tmp_path / "parts")
-    assert "encode" not in load(tmp_path / "parts").network.__dict__
+    assert "encode" not in load(assert_goes_on_to_the_bit(CONFIG, tmp_path)).network.__dict__
 
 
 def test_it_belongs_to_the_identity_of_a_run_and_seeds_together_refuse_it(tmp_path: Path) -> None:

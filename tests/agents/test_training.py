@@ -18,6 +18,7 @@ from arcade_torch.agents import (
     CheckpointError,
     NonFiniteError,
     RunFolderError,
+    TrainConfig,
     evaluate,
     held_out_seed,
     load,
@@ -67,6 +68,20 @@ def stop_after(updates, action):
             action()
 
     return progress
+
+
+def assert_goes_on_to_the_bit(config: TrainConfig, folder: Path) -> Path:
+    """Train once through and once interrupted after two updates; returns the folder of the second."""
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    train(config, folder / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(config, folder / "parts", progress=stop_after(2, stop))
+    train(config, folder / "parts", resume=True)
+    assert_same_run(folder / "whole", folder / "parts")
+    return folder / "parts"
 
 
 def test_a_run_leaves_its_files(whole):
