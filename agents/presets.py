@@ -23,9 +23,9 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the last step of a
       window is trained in the next (PQN), targets are stored (DQN), no last action (PPO), no skip connection around the
       memory, the games' law of the published numbers.
-    * ``small``: a small network that learns CartPoleEasy or MineSweeperEasy in one to two minutes on one core with PQN.
-      Time limits end like terminations: what comes after them is no part of the score. Which of the two learns better
-      in runs this short is not settled.
+    * ``small``: a small network that learns CartPoleEasy, SkittlesEasy or MineSweeperEasy in one to three minutes on
+      one core with PQN. Time limits end like terminations: what comes after them is no part of the score. Which of the
+      two learns better in runs this short is not settled.
     * ``smoke``: ``small`` cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -94,7 +94,7 @@ _SMALL_PQN = PQNConfig(
     num_steps=32,
     context=0,
     epochs=2,
-    minibatches=8,
+    minibatches=16,
     lam=0.8,
     learning_rate=1e-3,
     learning_rate_end=5e-5,

@@ -48,9 +48,9 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
 
-def test_the_small_preset_takes_1552_gradient_steps_in_200k_frames():
+def test_the_small_preset_takes_3104_gradient_steps_in_200k_frames():
     c = preset("small")
-    assert c.num_updates * c.pqn.grad_steps_per_update == 1552
+    assert c.num_updates * c.pqn.grad_steps_per_update == 3104
 
 
 @pytest.mark.parametrize("name", preset_names())
