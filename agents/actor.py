@@ -1,12 +1,16 @@
 """Acting: epsilon-greedy with a recurrent Q-network, or by sampling a recurrent policy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.protocols import ActorCritic, QNetwork
+
+Step = Callable[[Tensor, Tensor, Tensor, TensorDictBase], tuple[Tensor, TensorDictBase]]
+"""``(pixels [N, ...], last_action int64 [N], is_init bool [N, 1], state [N]) -> (outputs [N, A], state [N])``."""
 
 
 class EpsilonGreedyActor:
@@ -23,7 +27,8 @@ class EpsilonGreedyActor:
         greedy: never explore, whatever ``epsilon`` says.
         record_q: also return the Q-values, as the extra ``q_value`` float32 [N, A].
 
-    ``actor.uniform = True`` makes every action random until it is taken back, as epsilon 1 does.
+    ``actor.uniform = True`` makes every action random until it is taken back, as epsilon 1 does. ``actor.step`` is what
+    runs the network, a :data:`Step`; assign another way of running the same one.
 
     Raises:
         ValueError: ``epsilon`` lies outside [0, 1], or exploring was asked for without a generator.
@@ -43,6 +48,7 @@ class EpsilonGreedyActor:
             raise ValueError("an exploring actor needs a torch.Generator; pass generator=, or greedy=True")
         self.network, self.epsilon, self.generator = network, epsilon, generator
         self.greedy, self.record_q, self.uniform = greedy, record_q, False
+        self.step: Step = partial(_one_step, network)
 
     def initial_state(self, batch_size: int) -> TensorDictBase:
         """Recurrent state before the first observation, TensorDict [N]."""
@@ -59,7 +65,7 @@ class EpsilonGreedyActor:
         Returns:
             ``(action int64 [N], extras, new state)``.
         """
-        q, state = _one_step(self.network, obs, state)
+        q, state = self.step(*_seen(obs), state)
         action = q.argmax(-1)
         if not self.greedy:
             action = self._explore(action, q.shape[-1])
@@ -98,7 +104,7 @@ class CategoricalActor:
         greedy: take the most likely action; of equal ones the lowest number.
 
     ``actor.uniform = True`` makes every action uniformly random until it is taken back; the recorded log-probabilities
-    are then still those of the policy.
+    are then still those of the policy. ``actor.step`` is what runs the network, as in :class:`EpsilonGreedyActor`.
 
     Raises:
         ValueError: sampling was asked for without a generator.
@@ -108,6 +114,7 @@ class CategoricalActor:
         if generator is None and not greedy:
             raise ValueError("a sampling actor needs a torch.Generator; pass generator=, or greedy=True")
         self.network, self.generator, self.greedy, self.uniform = network, generator, greedy, False
+        self.step: Step = partial(_one_step, network)
 
     def initial_state(self, batch_size: int) -> TensorDictBase:
         """Recurrent state before the first observation, TensorDict [N]."""
@@ -125,7 +132,7 @@ class CategoricalActor:
             ``(action int64 [N], extras, new state)`` with the extras ``state_value`` float32 [N] and, if greedy,
             ``logits`` float32 [N, A], else ``action_log_prob`` float32 [N].
         """
-        out, state = _one_step(self.network, obs, state)
+        out, state = self.step(*_seen(obs), state)
         logits, value = self.network.split(out)
         if self.greedy:
             return logits.argmax(-1), {"logits": logits, "state_value": value}, state
@@ -145,9 +152,14 @@ def _perturbed(action: Tensor, num_actions: int, epsilon: float, generator: torc
     return torch.where(coin < epsilon, other, action)
 
 
-def _one_step(network: QNetwork, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+def _seen(obs: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    return obs.get("pixels"), obs.get("last_action"), obs.get("is_init")
+
+
+def _one_step(
+    network: QNetwork, pixels: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDictBase
+) -> tuple[Tensor, TensorDictBase]:
     """Outputs [N, A] of a network for one observation of every environment, and the state after it."""
-    pixels, last_action, is_init = obs.get("pixels"), obs.get("last_action"), obs.get("is_init")
     steps = pixels.shape[0], 1
     out, state = network(pixels.unsqueeze(1), last_action.reshape(steps), is_init.reshape(steps), state)
     return out.squeeze(1), state

@@ -55,6 +55,8 @@ class TrainConfig:
     compile: bool = False
     """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and rounding of its own.
     Meant for GPUs: two cores are no faster with it. What is saved is the same; a loaded agent is not compiled."""
+    cuda_graphs: bool = False
+    """Replay the network's step while acting as one CUDA graph, which saves launches; needs a CUDA device."""
     threads: int = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
     eval_every: int = 1_000_000
@@ -87,6 +89,8 @@ class TrainConfig:
         require(self.algorithm in GROUPS, "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
         loggers = ("none", "tensorboard", "wandb")
         require(self.logger in loggers, "logger", self.logger, "'none', 'tensorboard' or 'wandb'")
+        on_cuda = self.device.startswith("cuda") or not self.cuda_graphs
+        require(on_cuda, "cuda_graphs", self.cuda_graphs, f"false on device {self.device!r}; it needs a CUDA device")
         require(self.obs_size >= 1, "obs_size", self.obs_size, "a number of pixels >= 1")
         require(0 <= self.seed < SEED_LIMIT, "seed", self.seed, f"in [0, {SEED_LIMIT})")
         for name in ("threads", "eval_every", "checkpoint_every"):

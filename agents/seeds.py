@@ -63,8 +63,8 @@ def train_seeds(
 
     Raises:
         ValueError: seeds that are out of range or given twice, another algorithm than PQN, the logger wandb,
-            ``compile``, a game, memory model or network that does not exist, or a memory model that does not run
-            under ``torch.vmap``. Nothing was changed.
+            ``compile`` or ``cuda_graphs``, a game, memory model or network that does not exist, or a memory model that
+            does not run under ``torch.vmap``. Nothing was changed.
         RunFolderError: see :func:`train`.
         CheckpointError: ``resume`` found no moment at which all seeds have a whole checkpoint.
         NonFiniteError: see :func:`train`; names the seed. All seeds stop, and can go on alone.
@@ -99,7 +99,9 @@ def _check(config: TrainConfig, seeds: Sequence[int]) -> None:
     require(len(set(seeds)) == len(seeds), "seeds", list(seeds), "all different")
     require(config.algorithm == "pqn", "algorithm", config.algorithm, "'pqn' for several seeds in one process")
     require(config.logger != "wandb", "logger", config.logger, "'none' or 'tensorboard' for several seeds")
-    require(not config.compile, "compile", config.compile, "false for several seeds in one process")
+    for name in ("compile", "cuda_graphs"):
+        value = getattr(config, name)
+        require(not value, name, value, "false for several seeds in one process")
 
 
 def _paths(run_dirs: Any, seeds: Sequence[int]) -> list[Path]:

@@ -15,6 +15,7 @@ from arcade_torch.agents.agent import build_network
 from arcade_torch.agents.algorithms import ALGORITHMS, Network, PlayingActor
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.evaluation import twins
+from arcade_torch.agents.graphs import graphed
 from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.learner_config import LearnerConfig
 from arcade_torch.agents.metrics import EpisodeStats
@@ -43,6 +44,8 @@ class Trainer:
         self.explore = torch.Generator(config.device).manual_seed(config.seed)
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
         self.actor = algorithm.make_actor(self.network, self.explore)
+        if config.cuda_graphs:
+            self.actor.step = graphed(self.actor.step, config.device)
         self.learner = algorithm.make_learner(self.network, config, self.total_frames, self.shuffle, replay_folder)
         self.collector = make_collector([config], self.actor, self.network)
         self.env = self.collector.env

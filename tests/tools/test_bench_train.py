@@ -9,6 +9,7 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
+from arcade_torch.agents import trainer
 from arcade_torch.models import PaperEncoder, SmallEncoder
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import train as bench
@@ -72,10 +73,14 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
         bench, "preset", lambda name, **changes: bench.dataclasses.replace(smoke, **{**changes, "network": "small"})
     )
     file = tmp_path / "speed.csv"
+    monkeypatch.setattr(trainer, "COMPILE_BACKEND", "eager")
     words = ["--networks", "small", "--memories", "gru", "--env", "SignpostEasy", "--grad-steps", "2", "--repeats", "1"]
+    words += ["--forms", "amp", "compiled+amp"]
     assert cli.main(["bench", "train", *words, "--note", "loaded machine", "--out", str(file)]) == cli.EXIT_OK
     with file.open(newline="") as stream:
-        (row,) = csv.DictReader(stream)
+        row, compiled = csv.DictReader(stream)
+    assert (row["form"], compiled["form"]) == ("amp", "compiled+amp")
+    assert float(compiled["train_fps"]) > 0 and compiled["encoder_gflops"] == compiled["learning: memory"] == ""
     assert (row["memory"], row["num_envs"], row["grad_steps"], row["note"]) == ("gru", "8", "8", "loaded machine")
     for group in ("collecting", "learning", "kinds"):
         shares = [float(value) for key, value in row.items() if key.startswith(f"{group}: ")]
@@ -85,7 +90,7 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
     both = 1 / float(row["collect_fps"]) + 1 / float(row["learn_fps"])
     assert float(row["train_fps"]) == pytest.approx(1 / both)
     shown = capsys.readouterr().out
-    assert "small, gru" in shown and "frames/s both" in shown and "torch_threads" in shown
+    assert "small, gru, amp" in shown and "frames/s both" in shown and "torch_threads" in shown
 
 
 @pytest.mark.parametrize(
@@ -95,6 +100,8 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
         (["--grad-steps", "0"], "grad_steps must be at least 1, got 0"),
         (["--networks", "tiny"], "unknown preset 'tiny'"),
         (["--threads", "-1"], "--threads must be 0 or more"),
+        (["--forms", "amp+fast"], "a form is eager, amp, compiled, graphs, or several of them joined by '+'; got"),
+        (["--forms", "graphs"], "cuda_graphs must be false on device 'cpu'; it needs a CUDA device"),
     ],
 )
 def test_wrong_options_get_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

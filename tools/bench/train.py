@@ -11,6 +11,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from math import isnan, nan
 from statistics import median
 from typing import Any
 
@@ -42,15 +43,23 @@ KINDS = {
     "copies and casts": ("copy", "aten::cat", "clone", "index_select", "aten::fill_", "aten::zero_"),
 }
 """Kinds of operation in a profile, by parts of their names; the rest is elementwise, most of it the optimiser's."""
+FORMS: dict[str, dict[str, bool]] = {
+    "eager": {},
+    "amp": {"amp": True},
+    "compiled": {"compile": True},
+    "graphs": {"cuda_graphs": True},
+}
+"""Ways to run a network, by the settings of a run that ask for them."""
 
 
 @dataclass(frozen=True)
 class TrainSpeed:
-    """What one network costs.
+    """What one network costs. Shares and the encoder's rate are NaN where its parts run as one and cannot be timed.
 
     Attributes:
         network: preset of the network.
         memory: name of the memory model.
+        form: how it is run, forms of `FORMS` joined by "+".
         parameters: of the network.
         num_envs: environments.
         num_steps: steps of each in a window.
@@ -69,6 +78,7 @@ class TrainSpeed:
 
     network: str
     memory: str
+    form: str
     parameters: int
     num_envs: int
     num_steps: int
@@ -84,11 +94,11 @@ class TrainSpeed:
     kinds: dict[str, float] = field(default_factory=dict)
 
     def flat(self) -> dict[str, Any]:
-        """All numbers in one row, for CSV."""
+        """All numbers in one row, for a table file; None where there is none."""
         row = asdict(self)
         for group in ("collecting", "learning", "kinds"):
             row |= {f"{group}: {part}": share for part, share in row.pop(group).items()}
-        return row
+        return {key: None if isinstance(value, float) and isnan(value) else value for key, value in row.items()}
 
 
 def bench_train(
@@ -96,6 +106,7 @@ def bench_train(
     memories: Sequence[str] = ("lru", "gru"),
     env: str = "MineSweeperEasy",
     device: str = "cpu",
+    forms: Sequence[str] = ("eager",),
     grad_steps: int = 4,
     repeats: int = 3,
     tell: Callable[[str], None] = lambda text: None,
@@ -107,12 +118,13 @@ def bench_train(
         memories: names of memory models.
         env: game; its POMDP twin is played.
         device: of the network.
+        forms: names of `FORMS`, or several joined by "+", such as "compiled+amp".
         grad_steps: gradient steps in each timed pass; an update has more, all alike.
         repeats: passes; the median counts.
         tell: called with a line before each network.
 
     Returns:
-        One result for every network and memory.
+        One result for every network, memory and form.
 
     Raises:
         ValueError: an unknown name, or a number below 1.
@@ -120,18 +132,24 @@ def bench_train(
     for name, number in (("grad_steps", grad_steps), ("repeats", repeats)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    configs = [_config(network, memory, env, device) for network in networks for memory in memories]
+    plans = list(itertools.product(networks, memories, forms))
+    configs = [_config(network, memory, env, device, form) for network, memory, form in plans]
     found = []
-    for config in configs:
-        tell(f"{config.network} network, {config.memory}")
+    for config, (_, _, form) in zip(configs, plans, strict=True):
+        tell(f"{config.network} network, {config.memory}, {form}")
         with _closing(Trainer(config)) as trainer:
-            found.append(_measure(trainer, grad_steps, repeats))
+            found.append(_measure(trainer, form, grad_steps, repeats))
     return found
 
 
-def _config(network: str, memory: str, env: str, device: str) -> TrainConfig:
-    """The preset of that name without its random play."""
-    config = preset(network, env=env, memory=memory, observability="partial", device=device)
+def _config(network: str, memory: str, env: str, device: str, form: str) -> TrainConfig:
+    """The preset of that name without its random play, run in that form."""
+    settings: dict[str, Any] = {}
+    for name in form.split("+"):
+        if name not in FORMS:
+            raise ValueError(f"a form is {', '.join(FORMS)}, or several of them joined by '+'; got {form!r}")
+        settings |= FORMS[name]
+    config = preset(network, env=env, memory=memory, observability="partial", device=device, **settings)
     return dataclasses.replace(config, pqn=dataclasses.replace(config.pqn, warmup_steps=0))
 
 
@@ -143,7 +161,7 @@ def _closing(trainer: Trainer) -> Iterator[Trainer]:
         trainer.close()
 
 
-def _measure(trainer: Trainer, grad_steps: int, repeats: int) -> TrainSpeed:
+def _measure(trainer: Trainer, form: str, grad_steps: int, repeats: int) -> TrainSpeed:
     numbers, device = trainer.config.learner, torch.device(trainer.config.device)
     frames = numbers.frames_per_update
     kept: list[TensorDictBase] = []  # the newest window: collecting overwrites the one before
@@ -161,14 +179,16 @@ def _measure(trainer: Trainer, grad_steps: int, repeats: int) -> TrainSpeed:
     shapes = convolutions_of(trainer.network.encoder, window.pixels.flatten(0, 1))
     plain = plain_pass(shapes)
     plain()
-    laps = Laps(device)
-    collecting: dict[str, float] = {}
-    learning: dict[str, float] = {}
+    laps, in_parts = Laps(device), not (trainer.config.compile or trainer.config.cuda_graphs)
+    collecting: dict[str, float] = {} if in_parts else dict.fromkeys(COLLECTING, nan)
+    learning: dict[str, float] = {} if in_parts else dict.fromkeys(LEARNING, nan)
     collect_s, learn_s, plain_s = [], [], []
     for _ in range(repeats):
         collect_s.append(_seconds(collect, device))
         learn_s.append(_seconds(learn, device) / grad_steps)
         plain_s += [plain() for _ in range(grad_steps)]
+        if not in_parts:
+            continue
         with _watched_collecting(laps, trainer):
             collecting = _added(collecting, laps, collect, COLLECTING)
         with _watched_learning(laps, trainer):
@@ -178,6 +198,7 @@ def _measure(trainer: Trainer, grad_steps: int, repeats: int) -> TrainSpeed:
     return TrainSpeed(
         network=trainer.config.network,
         memory=trainer.config.memory,
+        form=form,
         parameters=sum(p.numel() for p in trainer.network.parameters()),
         num_envs=numbers.num_envs,
         num_steps=numbers.num_steps,
@@ -190,7 +211,7 @@ def _measure(trainer: Trainer, grad_steps: int, repeats: int) -> TrainSpeed:
         plain_gflops=flops / median(plain_s) / 1e9,
         collecting=_shares(collecting),
         learning=_shares(learning),
-        kinds=_kinds(learn, device),
+        kinds=_kinds(learn, device) if in_parts else dict.fromkeys([*KINDS, "the rest"], nan),
     )
 
 

@@ -14,7 +14,7 @@ class BenchTrain:
     """Frames per second of training with PQN: collecting, learning, both, and the share of every part.
 
     The very trainer of `arcade-torch train` is timed with the numbers of the presets of that name: paper has 16 envs x
-    128 steps and 64 gradient steps an update, small 64 x 32 and 16. Beside the encoder's floating-point rate stands
+    128 steps and 64 gradient steps an update, small 64 x 32 and 32. Beside the encoder's floating-point rate stands
     that of its convolutions alone, on the same shapes in the same run.
 
     Example: arcade-torch bench train --networks small --memories lru gru --threads 1 --out runs/train.csv
@@ -28,6 +28,8 @@ class BenchTrain:
     """The game; its POMDP twin is played."""
     device: str = "cpu"
     """Torch device of the network."""
+    forms: tuple[str, ...] = ("eager",)
+    """How networks are run: eager, amp, compiled, graphs (CUDA graphs while acting), or several joined by "+"."""
     threads: int = 0
     """Torch threads; 0 leaves the setting alone."""
     grad_steps: int = 4
@@ -54,7 +56,14 @@ class BenchTrain:
         if self.threads:
             torch.set_num_threads(self.threads)
         told = bench_train(
-            self.networks, self.memories, self.env, self.device, self.grad_steps, self.repeats, lambda text: _tell(text)
+            self.networks,
+            self.memories,
+            self.env,
+            self.device,
+            self.forms,
+            self.grad_steps,
+            self.repeats,
+            lambda text: _tell(text),
         )
         device = torch.cuda.get_device_name(self.device) if self.device.startswith("cuda") else self.device
         about = {"env": self.env, "device": device, **machine(), "note": self.note}
@@ -73,8 +82,8 @@ def _tell(text: str) -> None:
 
 
 def _show(rows: list[dict[str, Any]], repeats: int) -> None:
-    """Rates in one table, shares in one table a group; a column for every network and memory."""
-    names = [f"{row['network']}, {row['memory']}" for row in rows]
+    """Rates in one table, shares in one table a group; a column for every network, memory and form."""
+    names = [", ".join(row[key] for key in ("network", "memory", "form")) for row in rows]
     rates = {
         "parameters": "parameters",
         "envs": "num_envs",
@@ -87,8 +96,9 @@ def _show(rows: list[dict[str, Any]], repeats: int) -> None:
         "GFLOP/s of the encoder": "encoder_gflops",
         "GFLOP/s of its convolutions alone": "plain_gflops",
     }
-    table = [(words, *(f"{row[key]:,.{_digits(key)}f}" for row in rows)) for words, key in rates.items()]
-    table.append(("of the convolutions alone", *(_percent(r["encoder_gflops"] / r["plain_gflops"]) for r in rows)))
+    table = [(words, *(_number(row[key], _digits(key)) for row in rows)) for words, key in rates.items()]
+    shares = [r["encoder_gflops"] and r["encoder_gflops"] / r["plain_gflops"] for r in rows]
+    table.append(("of the convolutions alone", *map(_percent, shares)))
     show_table(f"Training with PQN; medians of {repeats} passes", ("", *names), table)
     titles = {"collecting": "Collecting", "learning": "Learning, by part", "kinds": "Learning, by kind of operation"}
     for group, title in titles.items():
@@ -101,5 +111,9 @@ def _digits(key: str) -> int:
     return 1 if key.endswith("gflops") else 0
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
