@@ -162,7 +162,6 @@ class Lease:
         if file is None:
             return
         _heart.remove(self)
-        _tokens.discard(self._token)
         try:
             record = _read(file)
             if record is not None and record.get("token") == self._token:
@@ -170,6 +169,8 @@ class Lease:
             self.folder.rmdir()
         except OSError:  # others' files are in it, or it is gone
             return
+        finally:  # not before: who looks dead is swept, and its number, given out again, would be unlinked here
+            _tokens.discard(self._token)
 
     def __enter__(self) -> "Lease":
         """The lease, taken before."""

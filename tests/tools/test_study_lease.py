@@ -73,6 +73,28 @@ def test_counting_under_the_lock_loses_no_count(tmp_path: Path) -> None:
     assert count.read_text() == "100"
 
 
+def test_letting_go_never_removes_the_file_of_a_successor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two, three, four = (Lease(tmp_path / "lock") for _ in range(4))
+    assert one.try_take()
+    read = module._read
+
+    def interrupted(file: Path) -> object:
+        """Others come and go between the look of the releasing owner at its file and the removal."""
+        record = read(file)
+        monkeypatch.setattr(module, "_read", read)
+        if two.try_take():
+            two.release()
+        three.try_take()
+        return record
+
+    monkeypatch.setattr(module, "_read", interrupted)
+    one.release()
+    assert four.try_take() is not three.mine
+    for lease in (three, four):
+        lease.release()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_a_killed_process_held_is_free_at_once(tmp_path: Path) -> None:
     text = (
         "import os; from pathlib import Path; from arcade_torch.agents.lease import Lease\n"
