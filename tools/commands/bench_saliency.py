@@ -29,6 +29,8 @@ class BenchSaliency:
     """Turns."""
     threads: int = 1
     """Of torch."""
+    keep_memory: bool = True
+    """Keep freed memory, as this program does whenever it trains; a Python process of its own hands it back."""
     out: Path | None = None
     """CSV file of the table; overwritten."""
 
@@ -40,8 +42,8 @@ class BenchSaliency:
         from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.versions import versions
 
-        keep_freed_memory()
-
+        if self.keep_memory:
+            keep_freed_memory()
         found = bench_saliency(
             self.networks, self.memory, self.steps, self.chunk, self.repeats, self.threads, tell=_tell
         )
@@ -49,7 +51,8 @@ class BenchSaliency:
         if self.out is not None:
             write_csv(self.out, map(asdict, rows), [item.name for item in fields(rows[0])])
         show_table(
-            f"{self.steps} frames of 128 x 128, 5 actions, memory {self.memory}, torch threads: {self.threads}",
+            f"{self.steps} frames of 128 x 128, 5 actions, memory {self.memory}, torch threads: {self.threads}, "
+            f"freed memory {'kept' if self.keep_memory else 'handed back'}",
             ["network", "way", "seconds", "ratio", "peak MiB", "difference"],
             [
                 (r.network, r.way, f"{r.seconds:.2f}", f"{r.ratio:.2f}", f"{r.peak_mib:.0f}", f"{r.difference:.1e}")
