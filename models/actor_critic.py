@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from arcade_torch.models.networks import MemoryNetwork, make_network, preset_of
+from arcade_torch.models.pullback import Pull
 
 __all__ = ["ActorCriticNetwork", "make_actor_critic"]
 
@@ -43,6 +44,17 @@ class ActorCriticNetwork(nn.Module):
     def encode(self, pixels: Tensor) -> Tensor:
         """Frames to the features of both towers, float [..., 2 E], the actor's first."""
         return torch.cat((self.actor.encode(pixels), self.critic.encode(pixels)), dim=-1)
+
+    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
+        """:meth:`encode`, and how gradients reach the frames; see :meth:`Encoder.record`."""
+        shape, towers = frames.shape[1:], [tower.record(frames, dtype) for tower in (self.actor, self.critic)]
+
+        def pull(cotangents: Tensor, index: Tensor) -> Tensor:
+            halves = zip(towers, cotangents.chunk(2, dim=-1), strict=True)
+            gradients = [pull(half, index) for (_, pull), half in halves if half.any()]
+            return sum(gradients, cotangents.new_zeros(())).expand(*cotangents.shape[:2], *shape)
+
+        return torch.cat([features for features, _ in towers], dim=-1), pull
 
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
 from arcade_torch.models.feedforward import FeedForward
 from arcade_torch.models.heads import make_head
+from arcade_torch.models.pullback import Pull, recorded_twice
 from arcade_torch.models.stack import MemoryBlock
 
 __all__ = ["FEED_FORWARD", "PRESETS", "MemoryNetwork", "NetworkPreset", "make_network", "preset_of"]
@@ -197,6 +198,11 @@ class MemoryNetwork(nn.Module):
     def encode(self, pixels: Tensor) -> Tensor:
         """Frames, uint8 or float 0..255, full or compressed [..., S or s, S or s, 3], to features float [..., E]."""
         return self.encoder(pixels)  # type: ignore[no-any-return]
+
+    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
+        """:meth:`encode`, and how gradients reach the frames; see :meth:`Encoder.record`."""
+        record = getattr(self.encoder, "record", None)  # an encoder of somebody's own has none
+        return recorded_twice(self.encoder, frames, dtype) if record is None else record(frames, dtype)
 
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.tools.analysis.policy import Target, evaluation, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.two_stage import Norm, Reduce, encode_all, encoder_stage, memory_stage
+from arcade_torch.tools.analysis.two_stage import Norm, Reduce, encoder_stage, memory_stage, record_all
 
 __all__ = ["Norm", "Reduce", "Saliency", "Target", "frame_gradients", "saliency"]
 
@@ -132,9 +132,9 @@ def frame_gradients(
         raise ValueError(f"chunk must be at least 1, got {chunk}")
     policy, scalars = policy_of(model), outputs(model, target)
     with evaluation(policy), torch.enable_grad():
-        features = encode_all(policy.encode, frames, chunk, dtype)
+        features, pulls = record_all(policy, frames, chunk, dtype)
         cotangents, output = memory_stage(policy, scalars, features, last_action, is_init, state, reduce)
-        pixels, totals = encoder_stage(policy.encode, frames, cotangents, norm, chunk, dtype, maps)
+        pixels, totals = encoder_stage(pulls, frames.shape, cotangents, norm, chunk, dtype, maps)
     return None if pixels is None else pixels.detach(), totals.detach(), output
 
 

@@ -22,6 +22,8 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from arcade_torch.models.pullback import Record, record_of
+
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Encode = Callable[[Tensor], Tensor]
 Remember = Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
@@ -62,6 +64,7 @@ class Policy:
         read: what its outputs mean: ``(out, one of TARGETS) -> [..., A or 1]``.
         offers: which of `TARGETS` its outputs can be read as.
         module: put into evaluation mode while an analysis runs.
+        record: ``encode`` with a way back for gradients, where there is a faster one than autograd's.
     """
 
     encode: Encode
@@ -70,6 +73,7 @@ class Policy:
     read: Callable[[Tensor, str], Tensor] = read_plain
     offers: tuple[str, ...] = TARGETS
     module: nn.Module | None = None
+    record: Record | None = None
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""
@@ -111,7 +115,8 @@ def policy_of(model: Any) -> Policy:
         module = network if isinstance(network, nn.Module) else None
         read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
         offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
-        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module)
+        record = record_of(network, "encode")
+        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module, record)
     raise TypeError(
         "model must be an agent, a network with encode and remember, a Policy or a pair (encode, remember), "
         f"got {type(model).__name__}"

@@ -1,16 +1,19 @@
 """Gradients of a decision with respect to every frame before it, in two stages.
 
 The encoder works frame by frame, so memory and head are differentiated once, with respect to the features (giving J,
-outputs x steps x features), and J is then pushed through the encoder in chunks of frames. The cost is one backward
-pass of the encoder for each frame and output, whatever the memory model; memory use is that of one chunk. Frames whose
-row of J is exactly zero have no gradient and are skipped.
+outputs x steps x features), and J is then pulled back through the encoder in chunks of frames. The cost is one backward
+pass of the encoder for each frame and output, whatever the memory model; memory use is that of one chunk, and for the
+paper's encoder a tape smaller than the frames are as floats. Frames whose row of J is exactly zero have no gradient and
+are skipped.
 """
 
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from arcade_torch.models.pullback import Pull, recorded_twice
 from arcade_torch.tools.analysis.policy import Encode, Outputs, Policy
 
 Reduce = Literal["per_action", "sum"]
@@ -46,7 +49,7 @@ def memory_stage(
     if state is None:
         state = policy.initial_state(1)
     with torch.no_grad():
-        raw, _ = policy.remember(features[None], last_action[None], is_init[None], state)
+        raw, _ = policy.remember(features[None, :1], last_action[None, :1], is_init[None, :1], state)
         count = 1 if reduce == "sum" else scalars(raw[:, -1]).shape[-1]
     leaf = features.expand(count, *features.shape).clone().requires_grad_()
     out, _ = policy.remember(leaf, last_action.expand(count, -1), is_init.expand(count, -1), repeated(state, count))
@@ -66,57 +69,60 @@ def repeated(state: Any, count: int) -> Any:
     return state.expand(count, *state.shape[1:])
 
 
+def record_all(policy: Policy, frames: Tensor, chunk: int, dtype: torch.dtype) -> tuple[Tensor, list[Pull]]:
+    """Features [T, E] of frames [T, H, W, C], without gradients, and the way back for each ``chunk`` of them."""
+    record = policy.record or partial(recorded_twice, policy.encode)
+    parts = [record(part, dtype) for part in frames.split(chunk)]
+    return torch.cat([features for features, _ in parts]), [pull for _, pull in parts]
+
+
 def encoder_stage(
-    encode: Encode, frames: Tensor, cotangents: Tensor, norm: Norm, chunk: int, dtype: torch.dtype, maps: bool = True
+    pulls: list[Pull],
+    shape: torch.Size,
+    cotangents: Tensor,
+    norm: Norm,
+    chunk: int,
+    dtype: torch.dtype,
+    maps: bool = True,
 ) -> tuple[Tensor | None, Tensor]:
-    """Push J through the encoder chunk by chunk and reduce at once.
+    """Pull J back through the encoder chunk by chunk and reduce at once.
 
     Args:
-        encode: the encoder.
-        frames: uint8 or float [T, H, W, C].
+        pulls: one for each chunk of frames, see `record_all`.
+        shape: of the frames, [T, H, W, C].
         cotangents: J, float [K, T, E].
         norm: see `norms`.
         chunk: frames at once.
-        dtype: of the differentiated frames.
+        dtype: of the gradients.
         maps: whether single pixels are wanted.
 
     Returns:
         ``(sums over outputs of the norm over channels [T, H, W] or None, of the norm over the frame [T])``.
     """
-    steps = frames.shape[0]
-    totals = cotangents.new_zeros(steps, dtype=dtype)
-    pixels = cotangents.new_zeros(frames.shape[:-1], dtype=dtype) if maps else None
-    alive = cotangents.ne(0).any(-1).any(0).nonzero().squeeze(-1)
-    for index in alive.split(chunk):
-        part = frames[index].to(dtype).requires_grad_()
-        features = encode(part)
-        for row in cotangents[:, index]:
-            (gradient,) = torch.autograd.grad(
-                features, part, row.to(features.dtype), retain_graph=True, allow_unused=True
-            )
-            if gradient is not None:
-                per_pixel, per_frame = norms(gradient, norm, maps)
-                totals[index] += per_frame
-                if pixels is not None and per_pixel is not None:
-                    pixels[index] += per_pixel
+    totals = cotangents.new_zeros(shape[0], dtype=dtype)
+    pixels = cotangents.new_zeros(shape[:-1], dtype=dtype) if maps else None
+    alive = cotangents.ne(0).any(-1).any(0)
+    for start, pull in zip(range(0, shape[0], chunk), pulls, strict=True):
+        index = alive[start : start + chunk].nonzero().squeeze(-1)
+        if len(index):
+            per_pixel, totals[start + index] = norms(pull(cotangents[:, start + index].to(dtype), index), norm, maps)
+            if pixels is not None and per_pixel is not None:
+                pixels[start + index] = per_pixel
     return pixels, totals
 
 
-def norms(gradient: Tensor, norm: Norm, maps: bool = True) -> tuple[Tensor | None, Tensor]:
-    """Norm over channels [T, H, W] (None without ``maps``) and over whole frames [T] of gradients [T, H, W, C]."""
-    if not maps:
-        flat = gradient.flatten(1)
-        if norm == "l1":
-            return None, flat.abs().sum(1)
-        squares = (flat * flat).sum(1)
-        return None, squares if norm == "l2sq" else squares.sqrt()
-    if norm == "l1":
-        per_pixel = gradient.abs().sum(-1)
-        return per_pixel, per_pixel.sum((1, 2))
-    squares = gradient.square().sum(-1)
-    if norm == "l2sq":
-        return squares, squares.sum((1, 2))
-    return squares.sqrt(), squares.sum((1, 2)).sqrt()
+def norms(gradients: Tensor, norm: Norm, maps: bool = True) -> tuple[Tensor | None, Tensor]:
+    """Norms of gradients [K, n, H, W, C], added up over K.
+
+    Returns:
+        ``(over channels [n, H, W] or None without ``maps``, over whole frames [n])``.
+    """
+    size = gradients.abs() if norm == "l1" else gradients.square()
+    if norm == "l2":
+        per_frame = size.sum((2, 3, 4)).sqrt().sum(0)
+        return (size.sum(-1).sqrt().sum(0) if maps else None), per_frame
+    per_pixel = size.sum(0).sum(-1)
+    return (per_pixel if maps else None), per_pixel.sum((1, 2))
 
 
 def encode_all(encode: Encode, frames: Tensor, chunk: int, dtype: torch.dtype) -> Tensor:
