@@ -1,8 +1,8 @@
 """Frames per second of training: collecting, learning, both, and the share of every part.
 
 The very trainer of ``arcade-torch train`` is timed, on whole windows and whole minibatches. Rates come from passes
-without a stopwatch in them, shares from passes with one, and the kinds of operation from a pass under torch's
-profiler; beside them stand the convolutions of the encoder alone, on the same shapes in the same run.
+without a stopwatch in them, shares from passes with one, the kinds of operation from one in which each operation is
+timed (see ``kinds.py``); beside them stand the convolutions of the encoder alone, on the same shapes in the same run.
 """
 
 import contextlib
@@ -23,6 +23,7 @@ from arcade_torch.agents.presets import preset
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.models import MemoryNetwork
 from arcade_torch.tools.bench.convolutions import convolutions_of, plain_pass
+from arcade_torch.tools.bench.kinds import KINDS, REST, shares_of_kinds
 from arcade_torch.tools.bench.laps import Laps
 
 COLLECTING = (
@@ -34,15 +35,6 @@ COLLECTING = (
     "storing and the rest",
 )
 LEARNING = ("encoder", "memory", "heads", "targets and loss", "optimiser", "minibatches and the rest")
-KINDS = {
-    "convolutions": ("convolution",),
-    "pooling": ("max_pool",),
-    "recurrence": ("linear_scan", "matrix_scan"),
-    "matrix products": ("addmm", "::mm", "bmm", "matmul"),
-    "activations": ("leaky_relu",),
-    "copies and casts": ("copy", "aten::cat", "clone", "index_select", "aten::fill_", "aten::zero_"),
-}
-"""Kinds of operation in a profile, by parts of their names; the rest is elementwise, most of it the optimiser's."""
 FORMS: dict[str, dict[str, bool]] = {
     "eager": {},
     "amp": {"amp": True},
@@ -211,7 +203,7 @@ def _measure(trainer: Trainer, form: str, grad_steps: int, repeats: int) -> Trai
         plain_gflops=flops / median(plain_s) / 1e9,
         collecting=_shares(collecting),
         learning=_shares(learning),
-        kinds=_kinds(learn, device) if in_parts else dict.fromkeys([*KINDS, "the rest"], nan),
+        kinds=shares_of_kinds(learn, device) if in_parts else dict.fromkeys([*KINDS, REST], nan),
     )
 
 
@@ -270,28 +262,3 @@ def _added(before: dict[str, float], laps: Laps, work: Callable[[], object], par
 def _shares(seconds: dict[str, float]) -> dict[str, float]:
     total = sum(seconds.values())
     return {part: value / total for part, value in seconds.items()}
-
-
-def _kinds(learn: Callable[[], object], device: torch.device) -> dict[str, float]:
-    """Shares of the kinds of operation, each operation's own time without its callees."""
-    from torch.profiler import ProfilerActivity, profile
-
-    cuda = device.type == "cuda"
-    activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if cuda else [])]
-    with profile(activities=activities) as profiler:
-        learn()
-    seconds = dict.fromkeys([*KINDS, "the rest"], 0.0)
-    for event in profiler.key_averages():
-        own = event.self_device_time_total if cuda else event.self_cpu_time_total
-        seconds[kind_of(event.key)] += own
-    return _shares(seconds)
-
-
-def kind_of(name: str) -> str:
-    """Kind of an operation by its name in a profile.
-
-    Example:
-        >>> kind_of("aten::mkldnn_convolution"), kind_of("aten::max_pool2d_with_indices_backward"), kind_of("aten::mul")
-        ('convolutions', 'pooling', 'the rest')
-    """
-    return next((kind for kind, words in KINDS.items() if any(word in name for word in words)), "the rest")
