@@ -6,7 +6,7 @@ with it. On the **POMDP** twin the sign is shown in the first frame alone, on th
 We train three agents: with a memory (LRU) on each twin, and without any on the POMDP. Then we ask each of them, at the
 gate, which pixels of which past frame its action values depend on.
 
-This takes about a minute on one core.
+This takes one to two minutes on one core.
 """
 
 # %%
@@ -20,7 +20,7 @@ import arcade_torch
 from arcade_torch.agents import load, preset, train
 from arcade_torch.tools import greedy_window, saliency, saliency_figure
 
-FRAMES = 60_000  # of training, for each agent
+FRAMES = 80_000  # of training, for each agent
 scratch = TemporaryDirectory()  # the runs go here; name a folder to keep them
 
 # %%
