@@ -59,9 +59,9 @@ for name, density in found.items():
 
 # %% [markdown]
 # * Without memory everything stands in the last part: a law, not a finding.
-# * With memory on the POMDP about half of the gradient lies on the past; on the MDP, where the sign is still in view, an
-#   eighth. The frame with the sign does not stand out from the empty corridor behind it: what the state carries along
-#   is as sensitive to the frames on the way.
+# * With memory on the POMDP about half of the gradient lies on the past; on the MDP, where the sign is still in view,
+#   an eighth. The frame with the sign does not stand out from the empty corridor behind it: what the state carries
+#   along is as sensitive to the frames on the way.
 # * The dotted line is a memory that treats all frames alike. The last frame is always above it, because the network has
 #   a way past the memory, and because the gate is seen there.
 # * On the MDP a gradient on the past is not needed. What is there is what the memory mixes in all the same: see
