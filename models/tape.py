@@ -43,7 +43,7 @@ def recorded_on_tape(
     if x.shape[2:] != (1, 1):
         return None
 
-    shape, on_cpu = frames.shape[1:], frames.device.type == "cpu"
+    shape, alone = frames.shape[1:], one_by_one(frames.device)
 
     @torch.no_grad()
     def pull(cotangents: Tensor, index: Tensor) -> Tensor:
@@ -51,9 +51,8 @@ def recorded_on_tape(
         for layer in reversed(tape[1:]):
             g = layer.backward(g, layer.mask(index), {})
         first, scratch = tape[0], _Scratch()
-        if not on_cpu:
+        if not alone:
             return first.backward(g, first.mask(index), scratch)
-        # A frame and a row at a time: what the widest layer needs stays in the cache.
         gradients = cotangents.new_empty(*cotangents.shape[:2], *shape)
         for i, frame in enumerate(index.split(1)):
             mask = first.mask(frame)
@@ -62,6 +61,11 @@ def recorded_on_tape(
         return gradients
 
     return x.flatten(1), pull
+
+
+def one_by_one(device: torch.device) -> bool:
+    """Whether to do the widest layer a frame and a row at a time: what it then needs stays in a CPU's cache."""
+    return device.type == "cpu"
 
 
 def _in_threes(layers: nn.Sequential) -> Iterator[tuple[nn.Module, nn.Module | None, nn.Module | None]]:

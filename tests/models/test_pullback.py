@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from arcade_torch.models import PaperEncoder, SmallEncoder, make_actor_critic, make_network
+from arcade_torch.models import PaperEncoder, SmallEncoder, make_actor_critic, make_network, tape
 from arcade_torch.models.pullback import record_of, recorded_twice
 from arcade_torch.models.tape import recorded_on_tape
 
@@ -40,6 +40,15 @@ def test_what_comes_back_is_what_autograd_gives(make, dtype: torch.dtype, tolera
     for _ in range(2):  # a recording can be pulled at more than once
         found = pull(cotangents, index)
         assert float((found - wanted).abs().max() / wanted.abs().max()) < tolerance
+
+
+def test_all_frames_and_rows_at_once_as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, pixels, index = PaperEncoder().to(F64), frames(3, 128), torch.tensor([2, 0])
+    cotangents = torch.randn(2, 2, 512, dtype=F64)
+    alone = encoder.record(pixels, F64)[1](cotangents, index)
+    monkeypatch.setattr(tape, "one_by_one", lambda device: False)
+    together = encoder.record(pixels, F64)[1](cotangents, index)
+    torch.testing.assert_close(together, alone, rtol=1e-10, atol=1e-12 * float(alone.abs().max()))
 
 
 def test_the_papers_encoder_is_read_from_its_tape() -> None:
