@@ -53,3 +53,14 @@ def _same_random_numbers() -> Iterator[None]:
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(0)
     yield
+
+
+@pytest.fixture(autouse=True)
+def _memories_as_before() -> Iterator[None]:
+    """Forget memory models that a test has registered: others compare the list with the documentation."""
+    registry = sys.modules.get("arcade_torch.models.registry")
+    before = None if registry is None else dict(registry._FACTORIES)
+    yield
+    if registry is not None and before is not None:
+        registry._FACTORIES.clear()
+        registry._FACTORIES.update(before)
