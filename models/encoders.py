@@ -146,7 +146,7 @@ class PaperEncoder(Encoder):
         return rest(convolved).flatten(1)  # type: ignore[no-any-return]
 
     def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
-        """See :meth:`Encoder.record`: one forward pass, and gradients in half of autograd's time on a CPU."""
+        """See :meth:`Encoder.record`: one forward pass, and gradients from a tape of winners and signs."""
         unchanged = record_of(self, "forward", "features", "compress", "_frames") is not None
         if unchanged and not self.amp:
             taped = recorded_on_tape(self.layers, self._frames(frames), dtype, 255)
