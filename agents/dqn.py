@@ -32,7 +32,7 @@ class DQNConfig(QConfig):
     lam: float = 0.0
     """Lambda of the return, in [0, 1]; 0 is the one-step target."""
     replay_frames: int = 132_000
-    """Capacity in frames (of 49,152 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
+    """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
     of all environments."""
     replay_ram: int = 2_000_000_000
     """Bytes; a replay that may grow beyond is kept in memory-mapped files in the run folder."""

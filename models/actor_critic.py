@@ -1,6 +1,6 @@
 """Actor and critic with a memory each: two towers that share nothing but the frames."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from arcade_torch.models.networks import MemoryNetwork, make_network, preset_of
-from arcade_torch.models.pullback import Pull
+from arcade_torch.models.pullback import Pull, gathered
+from arcade_torch.models.tiles import as_tiles
 
 __all__ = ["ActorCriticNetwork", "make_actor_critic"]
 
@@ -47,12 +48,18 @@ class ActorCriticNetwork(nn.Module):
 
     def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
         """:meth:`encode`, and how gradients reach the frames; see :meth:`Encoder.record`."""
-        shape, towers = frames.shape[1:], [tower.record(frames, dtype) for tower in (self.actor, self.critic)]
+        towers = [tower.record(frames, dtype) for tower in (self.actor, self.critic)]
 
-        def pull(cotangents: Tensor, index: Tensor) -> Tensor:
+        def pull(cotangents: Tensor, index: Tensor) -> Iterator[Tensor]:
             halves = zip(towers, cotangents.chunk(2, dim=-1), strict=True)
-            gradients = [pull(half, index) for (_, pull), half in halves if half.any()]
-            return sum(gradients, cotangents.new_zeros(())).expand(*cotangents.shape[:2], *shape)
+            alive = [pull(half, index) for (_, pull), half in halves if half.any()]
+            if len(alive) == 1:  # as for probabilities and for the value
+                yield from alive[0]
+                return
+            whole = cotangents.new_zeros(*cotangents.shape[:2], *frames.shape[1:])
+            for gradients in alive:
+                whole += gathered(gradients, *frames.shape[1:3])
+            yield as_tiles(whole)
 
         return torch.cat([features for features, _ in towers], dim=-1), pull
 

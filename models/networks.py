@@ -187,7 +187,7 @@ class MemoryNetwork(nn.Module):
             pixels: uint8 [..., S, S, 3].
 
         Returns:
-            uint8 [..., s, s, 3]: 32x32 block means for "small", the frames themselves for "paper".
+            uint8 [..., s, s, 3]: 32x32 block means for "small", the upper left 120x120 (of 256: 218x218) for "paper".
         """
         return self.encoder.compress(pixels)
 

@@ -5,16 +5,22 @@ twice. A ``record`` method gives the features and a function that pulls cotangen
 by a second forward pass (:func:`recorded_twice`), for the paper's from a small tape (``tape.py``).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Pull", "Record", "record_of", "recorded_twice"]
+from arcade_torch.models.tiles import as_pictures, as_tiles
 
-Pull = Callable[[Tensor, Tensor], Tensor]
-"""``(cotangents [K, n, E], index int64 [n] of the frames they belong to) -> gradients [K, n, S, S, C]``"""
+__all__ = ["Pull", "Record", "gathered", "record_of", "recorded_twice"]
+
+Pull = Callable[[Tensor, Tensor], Iterator[Tensor]]
+"""``(cotangents [K, n, E], index int64 [n] of the frames they belong to) -> gradients``, some frames after the other.
+
+Each is [K, m, C, p, p, h, w], for the next m frames: tiles of p x p pixels, see :func:`as_pictures`. It is good until
+the next is asked for. :func:`gathered` puts all together.
+"""
 
 Record = Callable[[Tensor, torch.dtype], tuple[Tensor, Pull]]
 """``(frames uint8 or float [N, S, S, C], dtype that they are given to the encoder in) -> (features [N, E], Pull)``"""
@@ -55,7 +61,7 @@ def recorded_twice(
     with torch.no_grad():
         features = encode(frames.to(dtype))
 
-    def pull(cotangents: Tensor, index: Tensor) -> Tensor:
+    def pull(cotangents: Tensor, index: Tensor) -> Iterator[Tensor]:
         with torch.enable_grad():
             part = frames[index].to(dtype).requires_grad_()
             again = encode(part)
@@ -64,6 +70,11 @@ def recorded_twice(
                 (found,) = torch.autograd.grad(again, part, row, retain_graph=True, allow_unused=True)
                 if found is not None:
                     gradient.copy_(found)
-        return gradients
+        yield as_tiles(gradients)
 
     return features, pull
+
+
+def gathered(gradients: Iterator[Tensor], height: int, width: int) -> Tensor:
+    """What a `Pull` gives, as one tensor [K, n, height, width, C]."""
+    return torch.cat([as_pictures(part, height, width).clone() for part in gradients], dim=1).movedim(2, -1)

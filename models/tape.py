@@ -1,8 +1,8 @@
 """Convolutions, max pools and LeakyReLUs, differentiated with respect to their input from a tape.
 
 All that such a gradient depends on, beside the weights, is which value of each pool's window won and whether it was
-positive: two bytes for each pooled value, less than a tenth of what autograd keeps. The way back is written for a CPU's
-caches and registers: a frame at a time, and for the picture's three channels one row of the kernel after the other.
+positive: two bytes for each pooled value, less than a tenth of what autograd keeps. The last step of the way back, to
+the frames, is by far the widest; it is done by ``tiles.py``.
 """
 
 from collections.abc import Iterator
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.pullback import Pull
+from arcade_torch.models.tiles import Tiles
 
 __all__ = ["in_phases", "recorded_on_tape"]
 
@@ -43,28 +44,22 @@ def recorded_on_tape(
     if x.shape[2:] != (1, 1):
         return None
 
-    shape, alone = frames.shape[1:], one_by_one(frames.device)
-
     @torch.no_grad()
-    def pull(cotangents: Tensor, index: Tensor) -> Tensor:
+    def pull(cotangents: Tensor, index: Tensor) -> Iterator[Tensor]:
         g = cotangents[:, :, None, None] / divisor  # division is where the numbers are fewest
         for layer in reversed(tape[1:]):
-            g = layer.backward(g, layer.mask(index), {})
-        first, scratch = tape[0], _Scratch()
-        if not alone:
-            return first.backward(g, first.mask(index), scratch)
-        gradients = cotangents.new_empty(*cotangents.shape[:2], *shape)
-        for i, frame in enumerate(index.split(1)):
-            mask = first.mask(frame)
-            for row, gradient in zip(g, gradients, strict=True):
-                gradient[i] = first.backward(row[None, i, None], mask, scratch)[0, 0]
-        return gradients
+            g = layer.backward(g, layer.mask(index))
+        size = 1 if one_by_one(g.device) else len(index)
+        groups = g.split(size, dim=1)
+        to_frames = Tiles(tape[0].conv.weight, tape[0].conv.stride[0], tape[0].window, groups[0].shape)
+        for group, part in zip(groups, index.split(size), strict=True):
+            yield to_frames(group, tape[0].mask(part))
 
     return x.flatten(1), pull
 
 
 def one_by_one(device: torch.device) -> bool:
-    """Whether to do the widest layer a frame and a row at a time: what it then needs stays in a CPU's cache."""
+    """Whether to do the last step a frame at a time: what it then needs stays in a CPU's cache."""
     return device.type == "cpu"
 
 
@@ -75,10 +70,6 @@ def _in_threes(layers: nn.Sequential) -> Iterator[tuple[nn.Module, nn.Module | N
         conv = rest.pop(0)
         pool = rest.pop(0) if rest and isinstance(rest[0], nn.MaxPool2d) else None
         yield conv, pool, rest.pop(0) if rest else None
-
-
-_Scratch = dict[str, Tensor]
-"""Buffers of one layer's way back, used again for every frame of a chunk."""
 
 
 @dataclass(frozen=True)
@@ -133,62 +124,36 @@ class _Layer:
         """What cotangents of some frames, int64 [n], are multiplied with: slopes for winners, zeros for the others.
 
         Returns:
-            float [n, h, k, w, k, C] with k the side of the pool's windows.
+            float [k, k, n, h, w, C], row and column in windows of k x k first.
         """
         slopes = self.positive[index].to(self.conv.weight.dtype).mul_(1 - self.slope).add_(self.slope)
-        slopes = slopes[:, :, None, :, None]
         if self.winner is None:
-            return slopes
+            return slopes[None, None]
         side = torch.arange(self.window, device=index.device)
-        places = (side[:, None] * self.shape[1] + side).to(torch.uint8).unsqueeze(1).unsqueeze(-1)
-        mask = slopes.new_empty(*slopes.shape[:2], self.window, slopes.shape[3], self.window, slopes.shape[5])
-        return torch.eq(self.winner[index][:, :, None, :, None], places, out=mask).mul_(slopes)
+        places = (side[:, None] * self.shape[1] + side).to(torch.uint8)[..., None, None, None, None]
+        mask = slopes.new_empty(self.window, self.window, *slopes.shape)
+        return torch.eq(self.winner[index], places, out=mask).mul_(slopes)
 
-    def backward(self, g: Tensor, mask: Tensor, scratch: _Scratch) -> Tensor:
+    def backward(self, g: Tensor, mask: Tensor) -> Tensor:
         """Pull cotangents back.
 
         Args:
             g: float [K, n, h, w, C].
             mask: of the same frames.
-            scratch: the same buffers call after call, for equal K and n.
 
         Returns:
             float [K, n, height, width, C'].
         """
-        (_, h, k, w, _, channels), lead = mask.shape, g.shape[:2]
-        if "full" not in scratch:  # what no window covers stays zero
-            scratch["full"] = g.new_zeros(*lead, *self.shape, channels)
-        full = scratch["full"]
+        (k, _, _, h, w, channels), lead, (high, wide) = mask.shape, g.shape[:2], self.shape
+        full = g.new_zeros(*lead, high, wide, channels)  # what no window covers stays zero
         windows = full[:, :, : h * k, : w * k].unflatten(2, (h, k)).unflatten(4, (w, k))
-        torch.mul(g[:, :, :, None, :, None], mask, out=windows)
-        pulled = self._transposed(full.flatten(0, 1).permute(0, 3, 1, 2), scratch).permute(0, 2, 3, 1)
-        return pulled.reshape(*lead, *pulled.shape[1:])
-
-    def _transposed(self, g: Tensor, scratch: _Scratch) -> Tensor:
-        """The transposed convolution, [B, C, h, w] -> [B, C', height, width]."""
-        if suits_phases(self.conv, self.height, self.width):
-            return self._row_by_row(g, scratch)
+        torch.mul(g[:, :, :, None, :, None], mask.permute(2, 3, 0, 4, 1, 5), out=windows)
         weight, stride = self.conv.weight, self.conv.stride[0]
-        made = [(out - 1) * stride + kernel for out, kernel in zip(g.shape[2:], weight.shape[2:], strict=True)]
+        made = [(out - 1) * stride + kernel for out, kernel in zip((high, wide), weight.shape[2:], strict=True)]
         missing = (self.height - made[0], self.width - made[1])
-        return F.conv_transpose2d(g, weight, stride=stride, output_padding=missing)
-
-    def _row_by_row(self, g: Tensor, scratch: _Scratch) -> Tensor:
-        """Stride 2 and few channels: one row of the kernel after the other, each two pixels at a time.
-
-        All rows together are one convolution along the width, whose channels (row, pixel of two, colour) fill the
-        registers: 30 of 32 for a kernel of 5 and three colours.
-        """
-        (out, channels, kernel, _), (batch, _, high, _) = self.conv.weight.shape, g.shape
-        if "weight" not in scratch:
-            padded = F.pad(self.conv.weight, (0, kernel % 2)).unflatten(3, (-1, 2)).permute(0, 2, 4, 1, 3)
-            weight = padded.reshape(out, -1, 1, padded.shape[-1])
-            scratch["weight"] = weight.contiguous(memory_format=torch.channels_last)
-        rows = F.conv_transpose2d(g, scratch["weight"]).permute(0, 2, 3, 1).chunk(kernel, dim=3)
-        picture = g.new_zeros(batch, self.height // 2, 2, self.width // 2, 2 * channels)
-        for i, row in enumerate(rows):
-            picture[:, i // 2 : i // 2 + high, i % 2] += row
-        return picture.view(batch, self.height, self.width, channels).permute(0, 3, 1, 2)
+        batch = full.flatten(0, 1).permute(0, 3, 1, 2)
+        pulled = F.conv_transpose2d(batch, weight, stride=stride, output_padding=missing)
+        return pulled.permute(0, 2, 3, 1).unflatten(0, lead)  # type: ignore[no-any-return]
 
 
 def _pooled(pool: nn.Module, y: Tensor) -> tuple[int, Tensor, Tensor] | None:

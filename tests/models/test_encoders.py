@@ -94,7 +94,24 @@ def test_full_and_compressed_frames_give_the_same_features():
     encoder = SmallEncoder()
     pixels = frames(3)
     assert torch.equal(encoder(pixels), encoder(encoder.compress(pixels)))
-    assert torch.equal(PaperEncoder().compress(pixels), pixels)
+
+
+@pytest.mark.parametrize(("size", "seen", "stored"), [(128, 119, 120), (256, 217, 218)])
+def test_the_papers_encoder_depends_on_the_upper_left_part_which_is_all_it_stores(size, seen, stored):
+    encoder, pixels = PaperEncoder(size).eval(), frames(2, size=size)
+    assert encoder.stored_size == stored
+    assert encoder.compress(pixels).shape == (2, stored, stored, 3)
+    with torch.no_grad():
+        features = encoder(pixels)
+        whole = encoder.layers(pixels.permute(0, 3, 1, 2) / 255).flatten(1)
+        torch.testing.assert_close(features, whole)
+        torch.testing.assert_close(encoder(encoder.compress(pixels)), features)
+        for axis in (1, 2):
+            changed = pixels.clone()
+            changed.narrow(axis, seen, size - seen).fill_(7)
+            assert torch.equal(encoder(changed), features)
+            changed.select(axis, seen - 1).fill_(7)
+            assert not torch.equal(encoder(changed), features)
 
 
 @pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])

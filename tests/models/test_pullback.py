@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from arcade_torch.models import PaperEncoder, SmallEncoder, make_actor_critic, make_network, tape
-from arcade_torch.models.pullback import record_of, recorded_twice
+from arcade_torch.models.pullback import Pull, gathered, record_of, recorded_twice
 from arcade_torch.models.tape import recorded_on_tape
 
 F64 = torch.float64
@@ -17,6 +17,10 @@ def frames(count: int, size: int) -> Tensor:
     noise[0] = 93
     noise[1] = (torch.arange(size) // 9 % 2 * 200).to(torch.uint8)[:, None, None]
     return noise
+
+
+def pulled(pull: Pull, cotangents: Tensor, index: Tensor, size: int = 128) -> Tensor:
+    return gathered(pull(cotangents, index), size, size)
 
 
 def by_autograd(encode: nn.Module, pixels: Tensor, cotangents: Tensor, index: Tensor) -> Tensor:
@@ -38,16 +42,16 @@ def test_what_comes_back_is_what_autograd_gives(make, dtype: torch.dtype, tolera
         torch.testing.assert_close(features, encoder(pixels.to(dtype)), rtol=tolerance, atol=tolerance)
     wanted = by_autograd(encoder, pixels, cotangents, index)
     for _ in range(2):  # a recording can be pulled at more than once
-        found = pull(cotangents, index)
+        found = pulled(pull, cotangents, index, encoder.obs_size)
         assert float((found - wanted).abs().max() / wanted.abs().max()) < tolerance
 
 
 def test_all_frames_and_rows_at_once_as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     encoder, pixels, index = PaperEncoder().to(F64), frames(3, 128), torch.tensor([2, 0])
     cotangents = torch.randn(2, 2, 512, dtype=F64)
-    alone = encoder.record(pixels, F64)[1](cotangents, index)
+    alone = pulled(encoder.record(pixels, F64)[1], cotangents, index)
     monkeypatch.setattr(tape, "one_by_one", lambda device: False)
-    together = encoder.record(pixels, F64)[1](cotangents, index)
+    together = pulled(encoder.record(pixels, F64)[1], cotangents, index)
     torch.testing.assert_close(together, alone, rtol=1e-10, atol=1e-12 * float(alone.abs().max()))
 
 
@@ -57,14 +61,14 @@ def test_the_papers_encoder_is_read_from_its_tape() -> None:
     calls: list[int] = []
     encoder.layers[3].register_forward_hook(lambda *_: calls.append(1))
     _, pull = encoder.record(frames(2, 128))
-    pull(torch.randn(1, 2, 512), torch.arange(2))
+    pulled(pull, torch.randn(1, 2, 512), torch.arange(2))
     assert len(calls) == 1, "the encoder ran a second time"
 
 
 def test_parameters_and_graphs_are_left_alone() -> None:
     encoder, pixels = PaperEncoder(), frames(2, 128)
     features, pull = encoder.record(pixels)
-    gradients = pull(torch.randn(1, 2, 512), torch.arange(2))
+    gradients = pulled(pull, torch.randn(1, 2, 512), torch.arange(2))
     assert not features.requires_grad and not gradients.requires_grad
     assert all(parameter.grad is None for parameter in encoder.parameters())
 
@@ -99,7 +103,7 @@ def test_any_stride_and_kernel(size: int, kernel: int, stride: int) -> None:
     assert recorded is not None
     plain = _Channels(layers)
     torch.testing.assert_close(recorded[0], plain(pixels))
-    found = recorded[1](cotangents, torch.arange(3))
+    found = pulled(recorded[1], cotangents, torch.arange(3), size)
     torch.testing.assert_close(found, by_autograd(plain, pixels, cotangents, torch.arange(3)))
 
 
@@ -129,7 +133,7 @@ def test_a_subclass_that_sees_something_else_is_not_recorded_as_its_parent() -> 
         torch.testing.assert_close(features, encoder(pixels.float()))
     cotangents = torch.randn(1, 2, 512)
     wanted = by_autograd(encoder, pixels, cotangents, torch.arange(2))
-    torch.testing.assert_close(pull(cotangents, torch.arange(2)), wanted)
+    torch.testing.assert_close(pulled(pull, cotangents, torch.arange(2)), wanted)
 
     network = make_network("paper", "lru")
     assert record_of(network, "encode") is not None
@@ -155,11 +159,13 @@ def test_both_towers_of_an_actor_critic() -> None:
     leaf = pixels.float().requires_grad_()
     again = network.encode(leaf)
     wanted = torch.stack([torch.autograd.grad(again, leaf, row, retain_graph=True)[0] for row in cotangents])
-    torch.testing.assert_close(pull(cotangents, index), wanted, rtol=1e-4, atol=1e-5 * float(wanted.abs().max()))
+    torch.testing.assert_close(
+        pulled(pull, cotangents, index), wanted, rtol=1e-4, atol=1e-5 * float(wanted.abs().max())
+    )
     cotangents[..., 512:] = 0
     mine, _ = network.actor.record(pixels)[1], None
-    torch.testing.assert_close(pull(cotangents, index), mine(cotangents[..., :512], index))
-    assert not pull(torch.zeros(2, 2, 1024), index).any()
+    torch.testing.assert_close(pulled(pull, cotangents, index), pulled(mine, cotangents[..., :512], index))
+    assert not pulled(pull, torch.zeros(2, 2, 1024), index).any()
 
 
 def test_frames_are_kept_as_they_came() -> None:
@@ -171,6 +177,6 @@ def test_frames_are_kept_as_they_came() -> None:
 
     pixels = frames(2, 32)
     features, pull = recorded_twice(encode, pixels, F64)
-    found = pull(torch.ones(1, 1, 32 * 32 * 3, dtype=F64), torch.tensor([1]))
+    found = pulled(pull, torch.ones(1, 1, 32 * 32 * 3, dtype=F64), torch.tensor([1]), 32)
     assert seen == [F64, F64] and features.dtype == F64
     torch.testing.assert_close(found[0, 0], 2 * pixels[1].to(F64))

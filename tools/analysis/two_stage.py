@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from arcade_torch.models.pullback import Pull, recorded_twice
+from arcade_torch.models.tiles import as_pictures
 from arcade_torch.tools.analysis.policy import Encode, Outputs, Policy
 
 Reduce = Literal["per_action", "sum"]
@@ -104,25 +105,28 @@ def encoder_stage(
     alive = cotangents.ne(0).any(-1).any(0)
     for start, pull in zip(range(0, shape[0], chunk), pulls, strict=True):
         index = alive[start : start + chunk].nonzero().squeeze(-1)
-        if len(index):
-            per_pixel, totals[start + index] = norms(pull(cotangents[:, start + index].to(dtype), index), norm, maps)
+        done = 0
+        for gradients in pull(cotangents[:, start + index].to(dtype), index) if len(index) else ():
+            per_pixel, per_frame = norms(gradients, norm, maps)
+            where = start + index[done : (done := done + len(per_frame))]
+            totals[where] = per_frame
             if pixels is not None and per_pixel is not None:
-                pixels[start + index] = per_pixel
+                pixels[where] = as_pictures(per_pixel, *shape[1:3])
     return pixels, totals
 
 
 def norms(gradients: Tensor, norm: Norm, maps: bool = True) -> tuple[Tensor | None, Tensor]:
-    """Norms of gradients [K, n, H, W, C], added up over K.
+    """Norms of gradients [K, n, C, ...], added up over K, whatever the dimensions of a picture are.
 
     Returns:
-        ``(over channels [n, H, W] or None without ``maps``, over whole frames [n])``.
+        ``(over channels [n, ...] or None without ``maps``, over whole frames [n])``.
     """
     size = gradients.abs() if norm == "l1" else gradients.square()
     if norm == "l2":
-        per_frame = size.sum((2, 3, 4)).sqrt().sum(0)
-        return (size.sum(-1).sqrt().sum(0) if maps else None), per_frame
-    per_pixel = size.sum(0).sum(-1)
-    return (per_pixel if maps else None), per_pixel.sum((1, 2))
+        per_frame = size.flatten(2).sum(2).sqrt().sum(0)
+        return (size.sum(2).sqrt().sum(0) if maps else None), per_frame
+    per_pixel = size.sum((0, 2))
+    return (per_pixel if maps else None), per_pixel.flatten(1).sum(1)
 
 
 def encode_all(encode: Encode, frames: Tensor, chunk: int, dtype: torch.dtype) -> Tensor:
