@@ -145,7 +145,8 @@ class _Layer:
             float [K, n, height, width, C'].
         """
         (k, _, _, h, w, channels), lead, (high, wide) = mask.shape, g.shape[:2], self.shape
-        full = g.new_zeros(*lead, high, wide, channels)  # what no window covers stays zero
+        covered = (h * k, w * k) == (high, wide)  # what no window covers stays zero
+        full = (g.new_empty if covered else g.new_zeros)(*lead, high, wide, channels)
         windows = full[:, :, : h * k, : w * k].unflatten(2, (h, k)).unflatten(4, (w, k))
         torch.mul(g[:, :, :, None, :, None], mask.permute(2, 3, 0, 4, 1, 5), out=windows)
         weight, stride = self.conv.weight, self.conv.stride[0]

@@ -28,7 +28,7 @@ class Tiles:
 
     def __init__(self, weight: Tensor, stride: int, window: int, shape: torch.Size) -> None:
         (out, colours, kernel, _), (*_, h, w, _) = weight.shape, shape
-        self.window, self.side = window, stride * window
+        self.side = stride * window
         reach = (stride * (window - 1) + kernel - 1) // self.side  # windows that a contribution can move
         self.high, self.wide, count = h + reach, w + reach, shape[:2].numel()
         self.padded = weight.new_zeros(*shape[:2], h, self.wide, out)

@@ -2,11 +2,15 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from arcade_torch.models import PaperEncoder, SmallEncoder, make_actor_critic, make_network, tape
 from arcade_torch.models.pullback import Pull, gathered, record_of, recorded_twice
 from arcade_torch.models.tape import recorded_on_tape
+from arcade_torch.models.tiles import Tiles, as_pictures, as_tiles
 
 F64 = torch.float64
 
@@ -105,6 +109,44 @@ def test_any_stride_and_kernel(size: int, kernel: int, stride: int) -> None:
     torch.testing.assert_close(recorded[0], plain(pixels))
     found = pulled(recorded[1], cotangents, torch.arange(3), size)
     torch.testing.assert_close(found, by_autograd(plain, pixels, cotangents, torch.arange(3)))
+
+
+@given(
+    kernel=st.integers(1, 7),
+    stride=st.integers(1, 3),
+    window=st.integers(1, 3),
+    grid=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    sizes=st.tuples(*[st.integers(1, 3)] * 4),
+    spare=st.integers(0, 5),
+)
+def test_tiles_are_the_gradient_of_a_convolution_and_a_pool(kernel, stride, window, grid, sizes, spare) -> None:
+    rows, count, colours, channels = sizes
+    side = [(windows * window - 1) * stride + kernel + spare for windows in grid]
+    draw = torch.Generator().manual_seed(0)
+    weight = torch.randn(channels, colours, kernel, kernel, dtype=F64, generator=draw)
+    x = torch.randn(count, colours, *side, dtype=F64, generator=draw).requires_grad_()
+    y = F.conv2d(x, weight, stride=stride)[..., : grid[0] * window, : grid[1] * window]
+    windows = y.unflatten(3, (-1, window)).unflatten(2, (-1, window))  # [n, C', h, k, w, k]
+    pooled = windows.amax((3, 5))
+    mask = (windows == pooled[:, :, :, None, :, None]).to(F64).permute(3, 5, 0, 2, 4, 1)
+    tiles = Tiles(weight, stride, window, torch.Size((rows, count, *grid, channels)))
+    for _ in range(2):  # the buffers are used again
+        cotangents = torch.randn(rows, count, *grid, channels, dtype=F64, generator=draw)
+        found = as_pictures(tiles(cotangents, mask), *side)
+        for row, mine in zip(cotangents, found, strict=True):
+            (wanted,) = torch.autograd.grad(pooled, x, row.permute(0, 3, 1, 2), retain_graph=True)
+            torch.testing.assert_close(mine, wanted)
+
+
+@given(p=st.integers(1, 3), q=st.integers(1, 3), h=st.integers(1, 3), w=st.integers(1, 3), spare=st.integers(0, 2))
+def test_every_pixel_of_a_tile_finds_its_place(p: int, q: int, h: int, w: int, spare: int) -> None:
+    tiles = torch.arange(2.0 * p * q * h * w).view(2, p, q, h, w) + 1
+    pictures = as_pictures(tiles, h * p + spare, w * q)
+    for y in range(h * p):
+        for x in range(w * q):
+            assert torch.equal(pictures[:, y, x], tiles[:, y % p, x % q, y // p, x // q])
+    assert not pictures[:, h * p :].any()
+    assert torch.equal(as_pictures(as_tiles(pictures[..., None]), *pictures.shape[1:])[:, 0], pictures)
 
 
 class _Channels(nn.Module):

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.tools.analysis.policy import policy_of
-from arcade_torch.tools.analysis.two_stage import repeated
 from arcade_torch.tools.analysis.windows import Window
 
 WHITE = 255.0
@@ -83,3 +82,12 @@ def replayed(model: Any, window: Window, features: Tensor, touched: NDArray[np.i
         out, state = policy.remember(features[:, t : t + 1], chosen, starts[:, t : t + 1], state)
         parts.append(out)
     return torch.cat(parts, 1)
+
+
+def repeated(state: Any, count: int) -> Any:
+    """A batch of equal states from a batch of one: a TensorDict, a tensor, or None."""
+    if state is None:
+        return None
+    if hasattr(state, "batch_size"):
+        return state.reshape(1).expand(count).clone()
+    return state.expand(count, *state.shape[1:])

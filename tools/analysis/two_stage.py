@@ -32,8 +32,8 @@ def memory_stage(
 ) -> tuple[Tensor, Tensor]:
     """Gradients of the outputs at the last step with respect to the features.
 
-    One copy of the window for each output stands in the batch, so that a single backward pass gives all rows of J with
-    any memory model, without batching rules for its operators.
+    One forward pass, and one backward pass for all outputs at once (vmap). If the memory uses an operator that cannot
+    be batched this way, one backward pass for each output.
 
     Args:
         policy: whose ``remember`` is differentiated.
@@ -45,29 +45,26 @@ def memory_stage(
         reduce: ``sum`` adds the outputs up before differentiating.
 
     Returns:
-        ``(J [K, T, E] (K = 1 for "sum"), outputs at the last step [K])``.
+        ``(J [K, T, E] (K = 1 for "sum"), outputs at the last step [A])``.
     """
-    if state is None:
-        state = policy.initial_state(1)
-    with torch.no_grad():
-        raw, _ = policy.remember(features[None, :1], last_action[None, :1], is_init[None, :1], state)
-        count = 1 if reduce == "sum" else scalars(raw[:, -1]).shape[-1]
-    leaf = features.expand(count, *features.shape).clone().requires_grad_()
-    out, _ = policy.remember(leaf, last_action.expand(count, -1), is_init.expand(count, -1), repeated(state, count))
-    chosen = scalars(out[:, -1])
-    scalar = chosen.sum() if reduce == "sum" else chosen.diagonal().sum()
-    (gradient,) = torch.autograd.grad(scalar, leaf, allow_unused=True)
-    gradient = torch.zeros_like(leaf) if gradient is None else gradient
-    return gradient.detach(), chosen[0].detach()
+    leaf = features.clone().requires_grad_()
+    start = policy.initial_state(1) if state is None else state
+    out, _ = policy.remember(leaf[None], last_action[None], is_init[None], start)
+    chosen = scalars(out[:, -1])[0]
+    rows = torch.ones_like(chosen)[None] if reduce == "sum" else torch.eye(len(chosen)).to(chosen)
+    return pulled_rows(chosen, leaf, rows), chosen.detach()
 
 
-def repeated(state: Any, count: int) -> Any:
-    """A batch of equal states from a batch of one: a TensorDict, a tensor, or None."""
-    if state is None:
-        return None
-    if hasattr(state, "batch_size"):
-        return state.reshape(1).expand(count).clone()
-    return state.expand(count, *state.shape[1:])
+def pulled_rows(y: Tensor, x: Tensor, rows: Tensor) -> Tensor:
+    """Gradients of products of rows [K, *y] with y with respect to x, [K, *x]; zeros if y does not depend on x."""
+    if not y.requires_grad:
+        return x.new_zeros(len(rows), *x.shape)
+    try:
+        (found,) = torch.autograd.grad(y, x, rows, retain_graph=True, is_grads_batched=True, allow_unused=True)
+    except RuntimeError:  # an operator without a batching rule
+        each = [torch.autograd.grad(y, x, row, retain_graph=True, allow_unused=True)[0] for row in rows]
+        found = None if each[0] is None else torch.stack(each)
+    return x.new_zeros(len(rows), *x.shape) if found is None else found
 
 
 def record_all(policy: Policy, frames: Tensor, chunk: int, dtype: torch.dtype) -> tuple[Tensor, list[Pull]]:

@@ -1,6 +1,8 @@
 """The twelve laws that pin the analyses, by number; the files beside this one go further into each of them."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -148,6 +150,39 @@ def test_law_07_two_stages_equal_plain_differentiation_for_any_chunk(chunk: int)
     found = saliency(net, o, norm="l1", chunk=chunk, dtype=F64)
     np.testing.assert_allclose(found.maps, wanted.abs().sum((0, 4)), rtol=1e-5)
     np.testing.assert_allclose(found.per_frame, wanted.abs().sum((0, 2, 3, 4)), rtol=1e-9)
+
+
+class _Plain(torch.autograd.Function):
+    """A square whose gradient asks for values, which vmap has no answer to."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return x.square()
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> Tensor:
+        assert g.abs().max().item() >= 0
+        return 2 * ctx.saved_tensors[0] * g
+
+
+@pytest.mark.parametrize("reduce", ["per_action", "sum"])
+def test_law_07_a_memory_that_cannot_be_batched_is_differentiated_action_by_action(reduce: Literal["sum"]) -> None:
+    net = Net("mingru")
+
+    def through(square: Callable[[Tensor], Tensor]) -> Policy:
+        def remember(e: Tensor, last_action: Tensor, is_init: Tensor, state: Any) -> tuple[Tensor, Any]:
+            return net.remember(square(e), last_action, is_init, state)
+
+        return Policy(net.encode, remember, net.initial_state)
+
+    wanted = saliency(through(torch.square), frames(5), dtype=F64, reduce=reduce)
+    found = saliency(through(_Plain.apply), frames(5), dtype=F64, reduce=reduce)
+    assert wanted.maps.any()
+    np.testing.assert_allclose(found.maps, wanted.maps, rtol=1e-9)
+    with pytest.raises(RuntimeError, match="Batching rule"):
+        leaf = frames(2).to(F64).requires_grad_()
+        torch.autograd.grad(_Plain.apply(leaf), leaf, torch.ones(3, *leaf.shape, dtype=F64), is_grads_batched=True)
 
 
 def test_law_08_probabilities_of_two_actions_give_the_density_of_their_log_odds() -> None:
