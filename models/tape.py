@@ -126,13 +126,13 @@ class _Layer:
         Returns:
             float [k, k, n, h, w, C], row and column in windows of k x k first.
         """
-        slopes = self.positive[index].to(self.conv.weight.dtype).mul_(1 - self.slope).add_(self.slope)
+        slopes = self.positive.index_select(0, index).to(self.conv.weight.dtype).mul_(1 - self.slope).add_(self.slope)
         if self.winner is None:
             return slopes[None, None]
         side = torch.arange(self.window, device=index.device)
         places = (side[:, None] * self.shape[1] + side).to(torch.uint8)[..., None, None, None, None]
         mask = slopes.new_empty(self.window, self.window, *slopes.shape)
-        return torch.eq(self.winner[index], places, out=mask).mul_(slopes)
+        return torch.eq(self.winner.index_select(0, index), places, out=mask).mul_(slopes)
 
     def backward(self, g: Tensor, mask: Tensor) -> Tensor:
         """Pull cotangents back.

@@ -7,7 +7,8 @@ paper's encoder a tape smaller than the frames are as floats. Frames whose row o
 are skipped.
 """
 
-from functools import partial
+from collections.abc import Iterable
+from functools import partial, reduce
 from typing import Any, Literal
 
 import torch
@@ -118,12 +119,18 @@ def norms(gradients: Tensor, norm: Norm, maps: bool = True) -> tuple[Tensor | No
     Returns:
         ``(over channels [n, ...] or None without ``maps``, over whole frames [n])``.
     """
-    size = gradients.abs() if norm == "l1" else gradients.square()
     if norm == "l2":
-        per_frame = size.flatten(2).sum(2).sqrt().sum(0)
-        return (size.sum(2).sqrt().sum(0) if maps else None), per_frame
-    per_pixel = size.sum((0, 2))
+        size = gradients.square()
+        per_frame = size.sum(tuple(range(2, size.ndim))).sqrt().sum(0)
+        return (_added(_added(size.unbind(2)).sqrt().unbind(0)) if maps else None), per_frame
+    rows = (row.abs() if norm == "l1" else row.square() for row in gradients)
+    per_pixel = _added(_added(rows).unbind(1))
     return (per_pixel if maps else None), per_pixel.flatten(1).sum(1)
+
+
+def _added(parts: Iterable[Tensor]) -> Tensor:
+    """The sum of tensors, in the memory of the first: `Tensor.sum` is slow where channels lie innermost."""
+    return reduce(Tensor.add_, parts)
 
 
 def encode_all(encode: Encode, frames: Tensor, chunk: int, dtype: torch.dtype) -> Tensor:
