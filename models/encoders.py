@@ -79,8 +79,8 @@ class Encoder(nn.Module):
             dtype: of the parameters; frames are encoded as floats.
 
         Returns:
-            (features [N, E] without a graph, function ``(cotangents [K, n, E], index of frames int64 [n]) ->
-            gradients [K, n, S, S, 3]``).
+            (features [N, E] without a graph, function from cotangents [K, n, E] and the index of their frames, int64
+            [n], to gradients, some frames after the other: see :data:`~arcade_torch.models.pullback.Pull`).
 
         Raises:
             ValueError: as :meth:`forward`.

@@ -106,7 +106,8 @@ def encoder_stage(
         done = 0
         for gradients in pull(cotangents[:, start + index].to(dtype), index) if len(index) else ():
             per_pixel, per_frame = norms(gradients, norm, maps)
-            where = start + index[done : (done := done + len(per_frame))]
+            where = start + index[done : done + len(per_frame)]
+            done += len(per_frame)
             totals[where] = per_frame
             if pixels is not None and per_pixel is not None:
                 pixels[where] = as_pictures(per_pixel, *shape[1:3])
