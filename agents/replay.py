@@ -91,7 +91,17 @@ class SequenceReplay:
         Args:
             batch: sequences [n] of ``ArcadeCollector.collect()``.
             **extras: further entries [n, ...], given back under ``("extras", name)``.
+
+        Raises:
+            CheckpointError: the frames at hand, of a run that goes on, have another size.
         """
+        size, key = batch.get(_KEYS.pixels).shape[2:], _text(_KEYS.pixels)
+        if self._segments and (held := self._segments[-1].tensors[key].shape[2:]) != size:
+            raise CheckpointError(
+                f"the replay holds frames of {held[0]}x{held[1]} pixels and the encoder now stores "
+                f"{size[0]}x{size[1]}: the run began with an earlier version, which can finish it; "
+                "or begin it anew in another folder"
+            )
         tensors = {_text(key): _own(batch.get(key)) for key in _ENTRIES}
         state = batch.get(_KEYS.initial_state)
         tensors |= {_STATE + _text(key): _own(state.get(key)) for key in state.keys(True, True)}

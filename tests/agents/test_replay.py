@@ -129,3 +129,12 @@ def test_a_file_that_is_not_whole_is_refused(tmp_path, how):
     file.unlink() if how == "missing" else file.write_bytes(file.read_bytes()[:-3] + b"abc")
     with pytest.raises(CheckpointError, match=how):
         SequenceReplay(100, tmp_path).load_state_dict(state)
+
+
+def test_frames_of_another_size_than_those_at_hand_are_refused_in_one_line():
+    first, second = windows(2)
+    replay = filled([first])
+    second["pixels"] = second["pixels"][:, :, :-1]
+    with pytest.raises(CheckpointError, match=r"replay holds frames of \d+x\d+ pixels and the encoder now stores"):
+        replay.add(second)
+    assert len(replay) == first.batch_size[0]
