@@ -4,17 +4,19 @@ A memory model is an ``nn.Module`` with two methods: ``forward(x [B, T, D], stat
 state)`` and ``initial_state(batch_size)``. Acting is the same call with T = 1; the state is a TensorDict of fixed-shape
 tensors; ``is_init`` marks the steps that open an episode, before which everything is forgotten.
 
-* :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru gru mlp fart
-  attention gdn ttt``).
-* :func:`check_memory`: do the laws hold for this module? Yours too. :class:`MemoryLawError` says which does not.
+* :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru gru mlp
+  linear_transformer attention gdn ttt``).
+* :func:`check_memory`: check that a module, ours or yours, is a correct memory model; :class:`MemoryLawError` says what
+  is wrong with it.
 * :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of ``LSTMModule``.
 * :func:`make_network`, :class:`MemoryNetwork`: pixels to Q-values, presets "paper" and "small".
-* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, two separate towers.
+* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, two separate towers. Both
+  networks are TensorDict modules.
 * :class:`MemoryBlock`: the stack of cells between encoder and head.
 * :func:`linear_scan`: the recurrence h_t = a_t h_{t-1} + b_t as a torch operator; :func:`matrix_scan`: the delta rule
   S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T in chunks.
 
-Nothing here knows an environment or JAX. TorchRL is imported only when :class:`MemoryModule` is asked for.
+Nothing here knows an environment or JAX. TorchRL is imported only when a TensorDict module runs or makes its primer.
 
 Example:
     >>> import torch
@@ -25,21 +27,15 @@ Example:
     torch.Size([4, 10, 16])
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
 from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
-from arcade_torch.models.base import Memory, MemoryContract, ReplayableMemory
+from arcade_torch.models.checks import MemoryLawError, check_memory
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
-from arcade_torch.models.laws import MemoryLawError, check_memory
-from arcade_torch.models.networks import MemoryNetwork, make_network
+from arcade_torch.models.memory import Memory, MemoryContract, MemoryModule, ReplayableMemory
+from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
+from arcade_torch.models.presets import make_network
 from arcade_torch.models.registry import make_memory, memory_names, register_memory
 from arcade_torch.models.scan import linear_scan, linear_scan_loop
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_loop
-from arcade_torch.models.stack import MemoryBlock
-
-if TYPE_CHECKING:
-    from arcade_torch.models.module import MemoryModule
 
 __all__ = [
     "ActorCriticNetwork",
@@ -65,12 +61,3 @@ __all__ = [
     "memory_names",
     "register_memory",
 ]
-
-
-if not TYPE_CHECKING:  # a checker is to find misspelt names
-
-    def __getattr__(name: str) -> Any:
-        """Import ``MemoryModule``, and TorchRL with it, on first use."""
-        if name != "MemoryModule":
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
-        return import_module("arcade_torch.models.module").MemoryModule

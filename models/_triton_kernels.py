@@ -81,7 +81,7 @@ def _place(F, CHUNK: tl.constexpr, LANES: tl.constexpr):
 def forward_real(
     a, b, start, h0, out, T, F, a_by, b_by, start_by, h0_by, out_by, CHUNK: tl.constexpr, LANES: tl.constexpr
 ):
-    """``scan_ops.scan``: reads a, b, start and h0, writes out; ``x_by`` are the strides of x."""
+    """``scan.scan``: reads a, b, start and h0, writes out; ``x_by`` are the strides of x."""
     row, lane, used, index = _place(F, CHUNK, LANES)
     state = tl.load(h0 + row * h0_by[0] + lane * h0_by[1], mask=used, other=0.0)
     for begin in range(0, T, CHUNK):
@@ -102,7 +102,7 @@ def backward_real(
     a, start, h0, h, grad, grad_a, grad_b, T, F, a_by, start_by, h0_by, h_by, grad_by, out_by,
     CHUNK: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """``scan_ops.scan_backward``: reads a, start, h0, h and grad, writes grad_a and grad_b (strides ``out_by``)."""
+    """``scan.scan_backward``: reads a, start, h0, h and grad, writes grad_a and grad_b (strides ``out_by``)."""
     row, lane, used, index = _place(F, CHUNK, LANES)
     initial = tl.load(h0 + row * h0_by[0] + lane * h0_by[1], mask=used, other=0.0)
     state = tl.zeros_like(initial)

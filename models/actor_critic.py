@@ -1,27 +1,30 @@
 """Actor and critic with a memory each: two towers that share nothing but the frames."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from arcade_torch.models.networks import MemoryNetwork, make_network, preset_of
-from arcade_torch.models.pullback import Pull, gathered
-from arcade_torch.models.tiles import as_tiles
+from arcade_torch.models.memory import Store
+from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.models.presets import make_network, preset_of
 
 __all__ = ["ActorCriticNetwork", "make_actor_critic"]
 
 
-class ActorCriticNetwork(nn.Module):
-    """Two networks behind one interface, that of :class:`MemoryNetwork`: A logits and, last, the value of the state.
+class ActorCriticNetwork(TensorDictModuleBase):
+    """Two networks as one TensorDict module: the actor writes A logits, the critic the value of the state.
 
-    The recurrent state has an entry for each tower, ``("actor", ...)`` and ``("critic", ...)``.
+    Each tower is a :class:`MemoryNetwork` of its own and can be used alone. The plain-tensor methods are those of
+    :class:`MemoryNetwork`; their output is [..., A + 1], the value last, and their state has an entry for each tower,
+    ``("actor", ...)`` and ``("critic", ...)``.
 
     Args:
         actor: gives A logits.
-        critic: gives one value; sees frames of the same size.
+        critic: gives one value; sees frames of the same size. Its output and state keys differ from the actor's.
 
     Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent actor-critic.
     """
@@ -32,6 +35,13 @@ class ActorCriticNetwork(nn.Module):
     def __init__(self, actor: MemoryNetwork, critic: MemoryNetwork) -> None:
         super().__init__()
         self.actor, self.critic = actor, critic
+        self.in_keys = list(dict.fromkeys([*actor.in_keys, *critic.in_keys]))
+        self.out_keys = [*actor.out_keys, *critic.out_keys]
+
+    @dispatch  # type: ignore[untyped-decorator]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Run both towers, see :meth:`MemoryNetwork.forward`; the value is [*batch, 1]."""
+        return self.critic(self.actor(tensordict))
 
     def compress(self, pixels: Tensor) -> Tensor:
         """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for both towers."""
@@ -46,48 +56,17 @@ class ActorCriticNetwork(nn.Module):
         """Frames to the features of both towers, float [..., 2 E], the actor's first."""
         return torch.cat((self.actor.encode(pixels), self.critic.encode(pixels)), dim=-1)
 
-    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
-        """:meth:`encode`, and how gradients reach the frames; see :meth:`Encoder.record`."""
-        towers = [tower.record(frames, dtype) for tower in (self.actor, self.critic)]
-
-        def pull(cotangents: Tensor, index: Tensor) -> Iterator[Tensor]:
-            halves = zip(towers, cotangents.chunk(2, dim=-1), strict=True)
-            alive = [pull(half, index) for (_, pull), half in halves if half.any()]
-            if len(alive) == 1:  # as for probabilities and for the value
-                yield from alive[0]
-                return
-            whole = cotangents.new_zeros(*cotangents.shape[:2], *frames.shape[1:])
-            for gradients in alive:
-                whole += gathered(gradients, *frames.shape[1:3])
-            yield as_tiles(whole)
-
-        return torch.cat([features for features, _ in towers], dim=-1), pull
-
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
     ) -> tuple[Tensor, TensorDict]:
-        """Everything behind the encoders.
-
-        Args:
-            features: float [B, T, 2 E].
-            last_action: int64 [B, T], the action that led to each frame.
-            is_init: bool [B, T], True where an episode begins.
-            state: TensorDict [B], the recurrent state before step 0.
-
-        Returns:
-            (float [B, T, A + 1], state TensorDict [B] after the last step); see :meth:`split`.
+        """Everything behind the encoders, see :meth:`MemoryNetwork.remember`: features are [B, T, 2 E], the output is
+        [B, T, A + 1], see :meth:`split`.
         """
         mine, theirs = features.split(features.shape[-1] // 2, dim=-1)
         logits, actor = self.actor.remember(mine, last_action, is_init, state["actor"])
         value, critic = self.critic.remember(theirs, last_action, is_init, state["critic"])
         after = TensorDict({"actor": actor, "critic": critic}, batch_size=state.batch_size)
         return torch.cat((logits, value), dim=-1), after
-
-    def forward(
-        self, pixels: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
-    ) -> tuple[Tensor, TensorDict]:
-        """:meth:`encode` and :meth:`remember` in one."""
-        return self.remember(self.encode(pixels), last_action, is_init, state)
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """Recurrent state at the start of an episode, TensorDict [batch_size]."""
@@ -96,14 +75,7 @@ class ActorCriticNetwork(nn.Module):
 
     @staticmethod
     def split(out: Tensor) -> tuple[Tensor, Tensor]:
-        """Take an output apart.
-
-        Args:
-            out: float [..., A + 1].
-
-        Returns:
-            (logits float [..., A], value float [...]).
-        """
+        """An output [..., A + 1] as (logits [..., A], value [...])."""
         return out[..., :-1], out[..., -1]
 
     def select(self, out: Tensor, what: str) -> Tensor:
@@ -133,6 +105,7 @@ def make_actor_critic(
     obs_size: int = 128,
     num_actions: int = 5,
     memory_options: dict[str, Any] | None = None,
+    store: Store = "sequence",
     **options: Any,
 ) -> ActorCriticNetwork:
     """Make an actor and a critic, separate from the first convolution on, each with its own initial weights.
@@ -143,11 +116,13 @@ def make_actor_critic(
         obs_size: side of the frames in pixels.
         num_actions: A.
         memory_options: options of the cells, over those of the preset.
+        store: see :func:`make_network`.
         **options: see :func:`make_network`. ``use_last_action=False`` is the published network, which differs from
             the published table in this.
 
     Returns:
-        The two towers.
+        The two towers: the actor writes ``"logits"``, the critic ``"state_value"``; their states stand under
+        ``("memory", "actor")`` and ``("memory", "critic")``.
 
     Raises:
         ValueError: unknown preset, memory, size, or value of an option.
@@ -157,7 +132,7 @@ def make_actor_critic(
         >>> network = make_actor_critic("small", "gru")
         >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
         >>> last_action, is_init = torch.zeros(2, 7, dtype=torch.int64), torch.zeros(2, 7, dtype=torch.bool)
-        >>> out, state = network(frames, last_action, is_init, network.initial_state(2))
+        >>> out, state = network.remember(network.encode(frames), last_action, is_init, network.initial_state(2))
         >>> [tuple(part.shape) for part in network.split(out)]
         [(2, 7, 5), (2, 7)]
     """
@@ -170,8 +145,11 @@ def make_actor_critic(
             num_outputs=outputs,
             num_actions=num_actions,
             memory_options=memory_options,
+            out_key=key,
+            state_key=("memory", tower),
+            store=store,
             **options,
         )
-        for outputs in (num_actions, 1)
+        for tower, outputs, key in (("actor", num_actions, "logits"), ("critic", 1, "state_value"))
     )
     return ActorCriticNetwork(actor, critic)

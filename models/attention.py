@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from arcade_torch.models.base import Memory, replay_by_steps
+from arcade_torch.models.memory import Memory, replay_by_steps
 from arcade_torch.models.rotary import angles, rotate, rotate_pairs
 
 __all__ = ["Attention", "window_attention", "window_attention_loop"]
@@ -19,11 +19,13 @@ class Attention(Memory):
     """y_t = sum_j softmax_j(q_t . k_j / sqrt(H)) v_j over the last W steps of the episode; one head, H wide.
 
     q and k are linear in x without bias and rotated by their positions (RoPE), v is linear with bias; no projection and
-    no skip follow. Only the distance of two steps matters, so keys are kept unrotated.
+    no skip follow.
 
-    The state is the window: ``"key"`` and ``"value"`` [W, H], newest last, and ``"valid"`` bool [W], which of them
-    belong to the running episode (the others hold zeros). At H = 512 and W = 128 that is 131,200 numbers: keep it once
-    a sequence, not once a step (``MemoryModule(store="sequence")``, ``ArcadeCollector``).
+    The state is the window as a ring buffer: ``"key"`` (rotated) and ``"value"`` [W, H], and ``"step"`` int64 [], the
+    number of steps of the episode so far. Step i of an episode, from 0, stands in slot i mod W; unused slots hold
+    zeros. Acting writes one slot of a copy, because a rollout may keep the state of every step. At H = 512 and W = 128
+    the state has 131,073 numbers: keep it once a sequence, not once a step (``MemoryModule(store="sequence")``,
+    ``ArcadeCollector``).
 
     Args:
         input_size: D.
@@ -56,27 +58,55 @@ class Attention(Memory):
     def state_leaves(self) -> dict[str, tuple[tuple[int, ...], torch.dtype | None]]:
         """See ``Memory.state_leaves``."""
         rows = (self.window, self.hidden_size)
-        return {"key": (rows, None), "value": (rows, None), "valid": ((self.window,), torch.bool)}
+        return {"key": (rows, None), "value": (rows, None), "step": ((), torch.int64)}
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See ``MemoryContract``."""
         self._check(x, state, is_init)
-        valid = state["valid"][:, 1:] & ~is_init[:, :1]
-        if not self.carry_cache and x.shape[1] > 1:
-            valid = torch.zeros_like(valid)
-        episode = torch.cat([torch.where(valid, 0, -1), is_init.cumsum(1)], dim=1)
-        keys = torch.cat([state["key"][:, 1:], self.key(x)], dim=1)
-        values = torch.cat([state["value"][:, 1:], self.value(x)], dim=1)
-        if x.shape[1] > 1 or not _known_to_be_none(is_init):  # else what is hidden holds zeros already
-            hidden = (episode < 0).unsqueeze(-1)
-            keys, values = keys.masked_fill_(hidden, 0), values.masked_fill_(hidden, 0)
-        y = window_attention(self.query(x), keys, values, episode, self.window)
-        valid = episode[:, -self.window :] == episode[:, -1:]
-        if x.shape[1] > 1:  # else nothing else is hidden
-            hidden = ~valid.unsqueeze(-1)
-            keys, values = (rows[:, -self.window :].masked_fill(hidden, 0) for rows in (keys, values))
-        after = {"key": keys, "value": values, "valid": valid}
-        return y, TensorDict(after, batch_size=[x.shape[0]])
+        read = self._act if x.shape[1] == 1 else self._read_chunk
+        y, key, value, step = read(x, state["key"], state["value"], state["step"], is_init)
+        return y, TensorDict({"key": key, "value": value, "step": step}, batch_size=[x.shape[0]])
+
+    def _act(self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
+        """One step: write one slot of a copy of the ring, attend to all that are in use."""
+        begins = _known_starts(is_init)
+        if begins is None:
+            keys, values = (rows.masked_fill(is_init.unsqueeze(-1), 0) for rows in (keys, values))
+        step = torch.where(is_init[:, 0], 0, step)
+        rotation = angles(step.unsqueeze(1), self.hidden_size, x.dtype)
+        slot = (step % self.window)[:, None, None].expand(-1, 1, self.hidden_size)
+        keys = keys.scatter(1, slot, rotate_pairs(self.key(x), *rotation).to(keys.dtype))
+        values = values.scatter(1, slot, self.value(x).to(values.dtype))
+        if begins is not None and len(begins):  # in the copies that scatter made; cheaper than a copy with holes before
+            for rows in (keys, values):
+                rows[:, 1:].index_fill_(0, begins, 0)
+        query = rotate_pairs(self.query(x), *rotation) / math.sqrt(self.hidden_size)
+        unused = torch.arange(self.window, device=x.device) > step.unsqueeze(-1)
+        score = (query @ keys.mT).masked_fill(unused.unsqueeze(1), -torch.inf)
+        return score.softmax(-1) @ values, keys, values, step + 1
+
+    def _read_chunk(self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
+        """Several steps: put the ring in order of time, append the chunk, keep the last W steps as a ring again."""
+        window = self.window
+        lost = is_init[:, 0] if self.carry_cache else torch.ones_like(is_init[:, 0])
+        step = torch.where(lost, 0, step)
+        order = torch.arange(window, device=x.device)
+        past = step.unsqueeze(-1) - window + order  # positions of the W steps before the chunk; negative: there is none
+        keys = rotate_pairs(_take(keys, past % window), *_angles_from(past[:, 0], window, -1, keys))
+        none = past < 0
+        keys, values = (rows.masked_fill(none.unsqueeze(-1), 0) for rows in (keys, _take(values, past % window)))
+        keys, values = (torch.cat(pair, dim=1)[:, 1:] for pair in ((keys, self.key(x)), (values, self.value(x))))
+        episode = torch.cat([torch.where(none, -1, 0)[:, 1:], is_init.cumsum(1)], dim=1)
+        y = window_attention(self.query(x), keys, values, episode, window)
+        index = torch.arange(1, x.shape[1] + 1, device=x.device)
+        begun = torch.where(is_init, index - 1, -step.unsqueeze(-1)).amax(1)  # where the last episode begins
+        step = x.shape[1] - begun
+        first = step - window  # position of the oldest of the last W steps
+        keys = rotate_pairs(keys[:, -window:], *_angles_from(first, window, 1, keys))
+        slots = (order - first.unsqueeze(-1)) % window  # which of them stands in each slot
+        unused = (order >= step.unsqueeze(-1)).unsqueeze(-1)
+        keys, values = (_take(rows, slots).masked_fill(unused, 0) for rows in (keys, values[:, -window:]))
+        return y, keys, values, step
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See ``ReplayableMemory``; step by step (slow): windows are not meant to be stored for every step."""
@@ -88,14 +118,34 @@ class Attention(Memory):
         return f"{super().extra_repr()}, window={self.window}, carry_cache={self.carry_cache}"
 
 
-def _known_to_be_none(flags: Tensor) -> bool:
-    """Whether no flag is set; False where finding out costs something (a card, a graph) or cannot be done (vmap)."""
-    if torch.compiler.is_compiling() or flags.device.type != "cpu":
-        return False
+def _take(rows: Tensor, index: Tensor) -> Tensor:
+    """Rows [B, W, H] in the order of an index int64 [B, W]."""
+    of_row = torch.arange(0, rows.shape[0] * rows.shape[1], rows.shape[1], device=rows.device).unsqueeze(-1)
+    return rows.flatten(0, 1).index_select(0, (of_row + index).flatten()).unflatten(0, rows.shape[:2])  # type: ignore[no-any-return]
+
+
+def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine [B, count, W // 2] of positions first, first + 1, ..., by the sum of angles (B + count of them).
+
+    Args:
+        first: int64 [B].
+        count: how many positions.
+        sign: -1 for the angles of the way back.
+        like: gives width and dtype.
+    """
+    cos, sin = angles(first.unsqueeze(-1), like.shape[-1], like.dtype)
+    cosine, sine = angles(torch.arange(count, device=first.device), like.shape[-1], like.dtype)
+    return cos * cosine - sin * sine, sign * (sin * cosine + cos * sine)
+
+
+def _known_starts(is_init: Tensor) -> Tensor | None:
+    """Rows that begin an episode, int64 [n]; None where finding out costs (a card, a graph) or is refused (vmap)."""
+    if torch.compiler.is_compiling() or is_init.device.type != "cpu":
+        return None
     try:
-        return not bool(flags.any())
+        return is_init[:, 0].nonzero().squeeze(-1)
     except RuntimeError:  # vmap: every row has flags of its own
-        return False
+        return None
 
 
 def window_attention(
@@ -119,8 +169,10 @@ def window_attention(
         float [B, T, H].
     """
     length = query.shape[1]
-    count = math.ceil(length / block)
-    size = math.ceil(length / count)
+    count = 1
+    while count * block < length:  # a loop: a compiled graph then has one number of blocks and any length
+        count += 1
+    size = (length + count - 1) // count
     spare = count * size - length
     past = window - 1
     stretch = past + size
@@ -133,16 +185,18 @@ def window_attention(
     if bad is not None:
         value = value.masked_fill(bad.unsqueeze(-1), 0)  # a weight of zero would not stop it
     queries = rotate_pairs(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
-    keys, values = (x.unfold(1, stretch, size).mT for x in (key, value))
-    episodes = episode.unfold(1, stretch, size)
+    # Not unfold: its backward is slower, and a graph that is compiled with it has one length.
+    each = (torch.arange(count, device=query.device).unsqueeze(-1) * size + index).flatten()
+    keys, values, episodes = (x.index_select(1, each).unflatten(1, (count, stretch)) for x in (key, value, episode))
     distance = index[past:, None] - index
     seen = (distance >= 0) & (distance < window) & (episodes[..., past:, None] == episodes[..., None, :])
     # Spelled out: on a CPU as fast as scaled_dot_product_attention with a mask, which vmap runs row by row.
     score = queries / math.sqrt(query.shape[-1]) @ rotate_pairs(keys, cosine, sine).mT
     if bad is not None:
-        score = score + torch.where(bad, torch.nan, 0.0).to(score.dtype).unfold(1, stretch, size).unsqueeze(-2)
+        lost = torch.where(bad, torch.nan, 0.0).to(score.dtype).index_select(1, each)
+        score = score + lost.unflatten(1, (count, 1, stretch))
     y = torch.where(seen, score, -torch.inf).softmax(-1) @ values
-    return y.flatten(1, 2)[:, :length]
+    return y.flatten(1, 2)[:, :length]  # type: ignore[no-any-return]
 
 
 def window_attention_loop(query: Tensor, key: Tensor, value: Tensor, episode: Tensor, window: int) -> Tensor:

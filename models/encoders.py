@@ -5,14 +5,9 @@ An encoder also says what of a frame is worth storing (``compress``) and learns 
 and gradients reach them.
 """
 
-from typing import cast
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-from arcade_torch.models.pullback import Pull, record_of, recorded_twice
-from arcade_torch.models.tape import in_phases, recorded_on_tape
 
 __all__ = ["Encoder", "PaperEncoder", "SmallEncoder"]
 
@@ -31,6 +26,9 @@ class Encoder(nn.Module):
         self.obs_size, self.stored_size, self.feature_size = obs_size, stored_size, feature_size
         self.amp = False
         """Whether convolutions and products are taken in bfloat16; weights and features stay as they are."""
+        self.register_buffer("like", torch.empty(0), persistent=False)
+        self.like: Tensor
+        """An empty tensor with the dtype and the device of the parameters."""
 
     def compress(self, pixels: Tensor) -> Tensor:
         """The part of a frame that the encoder looks at; here the frame itself.
@@ -62,7 +60,7 @@ class Encoder(nn.Module):
         if self.amp:
             with torch.autocast(frames.device.type, torch.bfloat16):
                 features = self.features(frames)
-            features = features.to(next(self.parameters()).dtype)
+            features = features.to(self.like.dtype)
         else:
             features = self.features(frames)
         return features.reshape(*pixels.shape[:-3], self.feature_size)
@@ -70,22 +68,6 @@ class Encoder(nn.Module):
     def features(self, frames: Tensor) -> Tensor:
         """Encode compressed frames [N, s, s, 3] -> [N, E]."""
         raise NotImplementedError
-
-    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
-        """Encode frames and keep what their gradients will need.
-
-        Args:
-            frames: uint8 or float (0..255) [N, S, S, 3], full or compressed.
-            dtype: of the parameters; frames are encoded as floats.
-
-        Returns:
-            (features [N, E] without a graph, function from cotangents [K, n, E] and the index of their frames, int64
-            [n], to gradients, some frames after the other: see :data:`~arcade_torch.models.pullback.Pull`).
-
-        Raises:
-            ValueError: as :meth:`forward`.
-        """
-        return recorded_twice(self, frames, dtype)
 
     def _frames(self, pixels: Tensor) -> Tensor:
         """Compressed frames with one batch dimension, [N, s, s, 3]."""
@@ -165,23 +147,12 @@ class PaperEncoder(Encoder):
 
     def features(self, frames: Tensor) -> Tensor:
         """[N, s, s, 3] -> [N, 512]."""
-        first, rest = cast(nn.Conv2d, self.layers[0]), self.layers[1:]
-        x = frames.permute(0, 3, 1, 2).to(first.weight.dtype) / 255
-        convolved = in_phases(x, first) if x.requires_grad else first(x)
-        return rest(convolved).flatten(1)  # type: ignore[no-any-return]
-
-    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
-        """See :meth:`Encoder.record`: one forward pass, and gradients from a tape of winners and signs."""
-        unchanged = record_of(self, "forward", "features", "compress", "_frames") is not None
-        if unchanged and not self.amp:
-            taped = recorded_on_tape(self.layers, self._frames(frames), dtype, 255)
-            if taped is not None:
-                return taped
-        return recorded_twice(self, frames, dtype)
+        x = frames.permute(0, 3, 1, 2).to(self.like.dtype) / 255
+        return self.layers(x).flatten(1)  # type: ignore[no-any-return]
 
 
 class SmallEncoder(Encoder):
-    """A CNN for one CPU core: frames pooled to 32x32, two convolutions, 128 features.
+    """A CNN for one CPU core: frames pooled to 32x32, two convolutions, one layer over all places, 128 features.
 
     Pooled frames are uint8 (floor of the block's mean), 3 KiB each, so they are pooled once and stored pooled. Input
     scaling: minus a per-pixel mean, divided by one number, the RMS of the centred pixels; :meth:`calibrate` sets both
@@ -202,8 +173,9 @@ class SmallEncoder(Encoder):
         super().__init__(obs_size, self.SIDE, 128)
         self.conv1 = nn.Conv2d(3, 32, 4, 4)
         self.conv2 = nn.Conv2d(32, 32, 3)
-        self.linear = nn.Linear(32 * 6 * 6, 128)
-        self.register_buffer("mean", torch.zeros(3, self.SIDE, self.SIDE))
+        self.linear = nn.Conv2d(32, 128, 6)
+        self.linear.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.register_buffer("mean", torch.zeros(self.SIDE, self.SIDE, 3).permute(2, 0, 1))
         self.register_buffer("inverse_rms", torch.tensor(1 / 255))
         self.mean: Tensor
         self.inverse_rms: Tensor
@@ -226,17 +198,18 @@ class SmallEncoder(Encoder):
         return self._pool(pixels).reshape(*lead, side, side, 3)
 
     def _pool(self, pixels: Tensor) -> Tensor:
-        """uint8 [..., S, S, 3] -> uint8 [N, 32, 32, 3], floor of the block mean."""
-        side, block = self.SIDE, self.obs_size // self.SIDE
-        # Sums fit int16 (8 * 8 * 255). Rows first, on whole lines; then columns, moved so that 96 values lie in a row.
-        lines = pixels.reshape(-1, side, block, self.obs_size * 3).unbind(2)
-        rows = lines[0].to(torch.int16)
+        """uint8 [..., S, S, 3] -> uint8 [N * 32, 32, 3], floor of the block mean."""
+        block = self.obs_size // self.SIDE
+        # Sums fit int16 (8 * 8 * 255). Whole lines are added, never pixels of three values: rows first, then each line
+        # to itself, moved by 1, 2 and 4 pixels; what every block-th pixel then holds is the sum of its block.
+        lines = pixels.reshape(-1, block, self.obs_size * 3).unbind(1)
+        total = lines[0].to(torch.int16)
         for line in lines[1:]:
-            rows = rows.add_(line)
-        columns = rows.view(-1, side, side, block, 3).permute(0, 1, 3, 4, 2).contiguous()
-        total = columns.sum(2, dtype=torch.int16)
-        mean = (total >> (2 * (block.bit_length() - 1))).to(torch.uint8)
-        return mean.permute(0, 1, 3, 2).contiguous()
+            total = total.add_(line)
+        for step in (3, 6, 12)[: block.bit_length() - 1]:
+            total = total[:, :-step] + total[:, step:]
+        mean = total.unfold(1, 3, 3 * block) >> (2 * (block.bit_length() - 1))
+        return mean.to(torch.uint8)
 
     @torch.no_grad()
     def calibrate(self, pixels: Tensor) -> None:
@@ -260,7 +233,7 @@ class SmallEncoder(Encoder):
 
     def features(self, frames: Tensor) -> Tensor:
         """[N, 32, 32, 3] -> [N, 128]."""
-        x = torch.sub(frames.permute(0, 3, 1, 2).contiguous(), self.mean) * self.inverse_rms
-        x = F.leaky_relu_(self.conv1(x))
-        x = F.leaky_relu_(self.conv2(x)).flatten(1)
-        return F.leaky_relu_(F.layer_norm(self.linear(x), (self.feature_size,)))
+        x = torch.sub(frames, self.mean.permute(1, 2, 0)).mul_(self.inverse_rms)  # colours stay last, as they arrive
+        x = F.leaky_relu_(self.conv1(x.permute(0, 3, 1, 2)))
+        x = F.leaky_relu_(self.conv2(x))
+        return F.leaky_relu_(F.layer_norm(self.linear(x).flatten(1), (self.feature_size,)))

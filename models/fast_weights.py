@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.models.base import Memory
+from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_stored
 
 __all__ = ["FastWeights", "unit_length"]

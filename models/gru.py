@@ -1,11 +1,14 @@
 """Gated recurrent unit, the paper's variant (not torch's)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from arcade_torch.models.base import Memory
+from arcade_torch.models.memory import Memory
 
-__all__ = ["GRU"]
+__all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward"]
 
 
 class GRU(Memory):
@@ -13,6 +16,9 @@ class GRU(Memory):
 
     Sequential in time. Not ``torch.nn.GRU``: the reset gate acts on h *before* U_h, z has the other sense, and U has no
     bias.
+
+    The loop over time is one operator, so a graph that ``torch.compile`` makes does not depend on the length. It has
+    first derivatives only.
 
     Args:
         input_size: D.
@@ -34,19 +40,129 @@ class GRU(Memory):
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`."""
-        sizes = [2 * self.hidden_size, self.hidden_size]
-        gates, candidates = (part.unbind(1) for part in self.from_input(x).split(sizes, dim=-1))
-        to_gates, to_candidate = self.gates_from_state.weight.t(), self.candidate_from_state.weight.t()
-        per_step = h0.ndim == x.ndim
-        h = h0[:, 0] if per_step else h0
-        fresh = h0.unbind(1) if per_step else [h0.new_zeros(())] * x.shape[1]
-        begins = is_init.unsqueeze(-1).unbind(1)
-        states = []
-        for t in range(x.shape[1]):
-            h = torch.where(begins[t], fresh[t], h)
-            z, r = torch.sigmoid(torch.addmm(gates[t], h, to_gates)).chunk(2, dim=-1)
-            c = torch.tanh(torch.addmm(candidates[t], r * h, to_candidate))
-            h = torch.lerp(h, c, z)
-            states.append(h)
-        y = torch.stack(states, dim=1)
+        steps = self.from_input(x)
+        if h0.ndim < x.ndim:  # every start but index 0 loads zeros
+            first = torch.where(is_init[:, :1], 0, h0)
+            stored = F.pad(first.unsqueeze(1), (0, 0, 0, x.shape[1] - 1))
+        else:
+            stored = h0
+        start = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
+        scan: Any = gru_loop if x.shape[1] == 1 else gru_scan
+        weights = self.gates_from_state.weight, self.candidate_from_state.weight
+        y = scan(steps, *(weight.to(steps.dtype) for weight in weights), start, stored.to(steps.dtype))[0]
         return y, y
+
+
+def gru_loop(
+    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The recurrence in plain torch operators: what acting runs, and the oracle of :func:`gru_scan`.
+
+    Args:
+        steps: float [B, T, 3 H], what the input adds to z, r and c.
+        gates_weight: U, [2 H, H].
+        candidate_weight: U_h, [H, H].
+        start: bool [B, T], where the state is loaded; set at index 0.
+        stored: [B, T, H], the state to load there; not looked at elsewhere.
+
+    Returns:
+        (the state after each step [B, T, H], z and r [B, T, 2 H], c [B, T, H]).
+    """
+    size = candidate_weight.shape[0]
+    gates, candidates = (part.unbind(1) for part in steps.split([2 * size, size], dim=-1))
+    h, kept = stored[:, 0], []
+    for t, (begins, fresh) in enumerate(zip(start.unsqueeze(-1).unbind(1), stored.unbind(1), strict=True)):
+        h = torch.where(begins, fresh, h) if t else h
+        both = torch.sigmoid(torch.addmm(gates[t], h, gates_weight.t()))
+        z, r = both.chunk(2, dim=-1)
+        c = torch.tanh(torch.addmm(candidates[t], r * h, candidate_weight.t()))
+        h = torch.lerp(h, c, z)
+        kept.append((h, both, c))
+    states, gates, candidates = (torch.stack(rows, dim=1) for rows in zip(*kept, strict=True))
+    return states, gates, candidates
+
+
+@torch.library.custom_op("arcade_torch::gru_scan", mutates_args=())
+def gru_scan(
+    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`gru_loop` as one operator; gradients flow from the states, not from the gates and candidates."""
+    return gru_loop(steps, gates_weight, candidate_weight, start, stored)
+
+
+@torch.library.custom_op("arcade_torch::gru_scan_backward", mutates_args=())
+def gru_scan_backward(
+    gates_weight: Tensor,
+    candidate_weight: Tensor,
+    start: Tensor,
+    stored: Tensor,
+    states: Tensor,
+    gates: Tensor,
+    candidates: Tensor,
+    grad: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of :func:`gru_scan` with respect to its float arguments, from what it took and returned, and the
+    gradient [B, T, H] that arrives at the states.
+    """
+    size = candidate_weight.shape[0]
+    begins = start.unsqueeze(-1)
+    before = torch.where(begins, stored, torch.cat([stored[:, :1], states[:, :-1]], dim=1))
+    z, r = gates.chunk(2, dim=-1)
+    # What does not depend on the gradient from later steps, for all steps at once.
+    to_c, to_gates = z * (1 - candidates * candidates), gates * (1 - gates)
+    to_gates[..., :size] *= candidates - before
+    to_gates[..., size:] *= before
+    columns = [x.unbind(1) for x in (to_c, to_gates, 1 - z, r, begins, grad)]
+    grad_steps, grad_before = grad.new_empty(*grad.shape[:2], 3 * size), torch.empty_like(states)
+    carried = torch.zeros_like(states[:, 0])
+    for t in range(grad.shape[1] - 1, -1, -1):
+        to_c_t, to_gates_t, keep, r_t, begins_t, grad_t = (column[t] for column in columns)
+        d_h = grad_t + carried
+        d_c = d_h * to_c_t
+        d_reset = d_c @ candidate_weight
+        d_gates = torch.cat([d_h, d_reset], dim=-1) * to_gates_t
+        d_before = torch.addmm(d_h * keep + d_reset * r_t, d_gates, gates_weight)
+        grad_steps[:, t, : 2 * size], grad_steps[:, t, 2 * size :], grad_before[:, t] = d_gates, d_c, d_before
+        carried = d_before.masked_fill(begins_t, 0)
+    d_gates, d_c = (part.flatten(0, 1) for part in grad_steps.split([2 * size, size], dim=-1))
+    to_weights = d_gates.t() @ before.flatten(0, 1), d_c.t() @ (r * before).flatten(0, 1)
+    return grad_steps, *to_weights, grad_before.masked_fill(~begins, 0)
+
+
+@gru_scan.register_fake
+def _(steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor) -> Any:
+    batch, length, size = stored.shape
+    return tuple(steps.new_empty(batch, length, width) for width in (size, 2 * size, size))
+
+
+@gru_scan_backward.register_fake
+def _(gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor, *rest: Tensor) -> Any:
+    grad_steps = stored.new_empty(*stored.shape[:2], 3 * stored.shape[2])
+    return grad_steps, *(x.new_empty(x.shape) for x in (gates_weight, candidate_weight, stored))
+
+
+def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.save_for_backward(*inputs[1:], *output)
+
+
+def _differentiate(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    to_steps, to_gates, to_candidate, to_stored = gru_scan_backward(*ctx.saved_tensors, grad)
+    return to_steps, to_gates, to_candidate, None, to_stored
+
+
+gru_scan.register_autograd(_differentiate, setup_context=_save)
+
+
+def _one_by_one(op: Any) -> Any:
+    """A vmap rule: the operator once for each entry of the mapped dimension (the weights may differ)."""
+
+    def rule(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> Any:
+        rows = [[x] * info.batch_size if d is None else x.unbind(d) for x, d in zip(args, in_dims, strict=True)]
+        found = [op(*row) for row in zip(*rows, strict=True)]
+        return tuple(torch.stack(parts) for parts in zip(*found, strict=True)), (0,) * len(found[0])
+
+    return rule
+
+
+gru_scan.register_vmap(_one_by_one(gru_scan))
+gru_scan_backward.register_vmap(_one_by_one(gru_scan_backward))

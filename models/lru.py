@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from arcade_torch.models.base import Memory
+from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
 __all__ = ["LRU"]

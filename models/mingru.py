@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from arcade_torch.models.base import Memory
+from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
 __all__ = ["MinGRU"]

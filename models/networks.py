@@ -1,168 +1,151 @@
-"""Whole networks: encoder, last action, memory block, head."""
+"""Whole networks: encoder, last action, memory block, head; each is a TensorDict module."""
 
-import difflib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
-from arcade_torch.models.feedforward import FeedForward
-from arcade_torch.models.heads import make_head
-from arcade_torch.models.pullback import Pull, recorded_twice
-from arcade_torch.models.stack import MemoryBlock
+from arcade_torch.models.encoders import Encoder
+from arcade_torch.models.memory import Key, MemoryModule, Store, replay
+from arcade_torch.models.registry import make_memory
 
-__all__ = ["FEED_FORWARD", "PRESETS", "MemoryNetwork", "NetworkPreset", "make_network", "preset_of"]
+if TYPE_CHECKING:
+    from torchrl.envs import TensorDictPrimer
 
-FEED_FORWARD = "feedforward"
-"""In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see :class:`FeedForward`)."""
-
-
-@dataclass(frozen=True)
-class NetworkPreset:
-    """A network up to its memory model and its number of outputs; every field is an option of :func:`make_network`."""
-
-    encoder: Callable[[int], Encoder]
-    """called with ``obs_size``"""
-    hidden_size: int
-    """H, width of the memory block"""
-    layers: int
-    """cells in the memory block"""
-    skip: str = "residual"
-    """"residual" or "none", see :class:`MemoryBlock`"""
-    head: str = "reference"
-    """see :func:`make_head`"""
-    actor_critic_head: str = "actor_critic"
-    """head of the two towers of :func:`make_actor_critic`"""
-    feedforward_size: int = 256
-    """width of the layers that stand in for the memory block of a feed-forward network"""
-    use_last_action: bool = True
-    """append the one-hot last action to the features"""
-    zero_action_on_reset: bool = False
-    """no last action at the first step of an episode; False shows the last action of the episode before"""
-    memory_options: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """options of the cells, by name of the memory"""
+__all__ = ["MemoryBlock", "MemoryNetwork"]
 
 
-PRESETS = {
-    "paper": NetworkPreset(encoder=PaperEncoder, hidden_size=512, layers=2),
-    "small": NetworkPreset(
-        encoder=SmallEncoder,
-        hidden_size=128,
-        layers=1,
-        head="linear",
-        actor_critic_head="linear",
-        feedforward_size=128,
-        zero_action_on_reset=True,
-        memory_options={"mingru": {"slow_gates": True}},
-    ),
-}
+class MemoryBlock(nn.Module):
+    """x = W u; then per layer y = cell(x), z = LeakyReLU(LayerNorm(V y)), and x + z (skip "residual") or z ("none").
 
-
-def preset_of(name: str) -> NetworkPreset:
-    """The preset of a name.
-
-    Raises:
-        ValueError: unknown name; the message has the nearest match and the list.
-    """
-    if name not in PRESETS:
-        near = difflib.get_close_matches(str(name), PRESETS, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"unknown network {name!r}: {hint}known are {', '.join(PRESETS)}")
-    return PRESETS[name]
-
-
-def make_network(
-    preset: str = "paper",
-    memory: str | Callable[..., nn.Module] = "lru",
-    *,
-    obs_size: int = 128,
-    num_outputs: int = 5,
-    num_actions: int = 5,
-    memory_options: dict[str, Any] | None = None,
-    **options: Any,
-) -> "MemoryNetwork":
-    """Make a network.
+    Keeps the contract of a memory model itself (``MemoryContract``), with one nested state per layer:
+    ``("layer0", ...)``, ``("layer1", ...)``. LayerNorm has no parameters.
 
     Args:
-        preset: "paper" (1,428,613 parameters plus two cells) or "small" (225,733 with MinGRU; learns the easiest games
-            in minutes on one CPU core).
-        memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) -> nn.Module``, or
-            "feedforward": no memory block and no last action, the paper's memory-free agent (704,901 parameters).
-        obs_size: side of the frames in pixels.
-        num_outputs: A; one per action for Q-values or logits, 1 for a state value.
-        num_actions: number of actions, for the one-hot last action.
-        memory_options: options of the cells, over those of the preset.
-        **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``, ``head``,
-            ``use_last_action``, ``zero_action_on_reset``, ``encoder``.
-
-    Returns:
-        a :class:`MemoryNetwork`.
+        input_size: D.
+        hidden_size: H, width of the cells and of the output.
+        memory: a name (:func:`memory_names`) or a factory ``(input_size, hidden_size, **options) -> nn.Module``.
+        layers: number of cells.
+        skip: "residual" lets the input bypass the memory, as the paper says; "none" is what its code does.
+        memory_options: passed on to the cells.
 
     Raises:
-        ValueError: unknown preset, memory, size, or value of an option.
-        TypeError: unknown option.
-
-    Example:
-        >>> network = make_network("small", "mingru")
-        >>> sum(p.numel() for p in network.parameters())
-        225733
-        >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
-        >>> last_action, is_init = torch.zeros(2, 7, dtype=torch.int64), torch.zeros(2, 7, dtype=torch.bool)
-        >>> out, state = network(frames, last_action, is_init, network.initial_state(2))
-        >>> out.shape
-        torch.Size([2, 7, 5])
+        ValueError: unknown memory or skip, or fewer than one layer.
     """
-    chosen = preset_of(preset)
-    if unknown := set(options) - set(NetworkPreset.__dataclass_fields__):
-        allowed = ", ".join(NetworkPreset.__dataclass_fields__)
-        raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
-    chosen = replace(chosen, **options)
-    if memory == FEED_FORWARD:
-        return _feed_forward(chosen, obs_size, num_outputs)
-    encoder = chosen.encoder(obs_size)
-    actions = num_actions if chosen.use_last_action else 0
-    block = _block(chosen, encoder.feature_size + actions, memory, memory_options or {})
-    head = make_head(chosen.head, chosen.hidden_size, num_outputs)
-    return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=chosen.zero_action_on_reset)
+
+    def __init__(
+        self,
+        input_size: int,
+        hidden_size: int,
+        memory: str | Callable[..., nn.Module] = "lru",
+        *,
+        layers: int = 2,
+        skip: Literal["residual", "none"] = "residual",
+        memory_options: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        if skip not in ("residual", "none"):
+            raise ValueError(f"skip must be 'residual' or 'none', got {skip!r}")
+        if layers < 1:
+            raise ValueError(f"layers must be at least 1, got {layers}")
+        options = memory_options or {}
+        self.input_size, self.hidden_size, self.residual = input_size, hidden_size, skip == "residual"
+        self.linear = nn.Linear(input_size, hidden_size)
+        self.cells = nn.ModuleList(
+            make_memory(memory, hidden_size, hidden_size, **options)
+            if isinstance(memory, str)
+            else memory(hidden_size, hidden_size, **options)
+            for _ in range(layers)
+        )
+        self.linears = nn.ModuleList(nn.Linear(hidden_size, hidden_size) for _ in range(layers))
+        self.names = [f"layer{i}" for i in range(layers)]
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """Read a chunk of steps.
+
+        Args:
+            x: float [B, T, D].
+            state: TensorDict [B] with one nested state per layer.
+            is_init: bool [B, T].
+
+        Returns:
+            (float [B, T, H], state TensorDict [B]).
+        """
+        return self._run(x, state, is_init, list(self.cells), [x.shape[0]])
+
+    def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """Read stored sequences, one stored state per step (see ``ReplayableMemory``); all [B, T]."""
+        return self._run(x, stored, is_init, [partial(replay, cell) for cell in self.cells], x.shape[:2])
+
+    def _run(
+        self,
+        x: Tensor,
+        state: TensorDict,
+        is_init: Tensor,
+        readers: Sequence[Callable[[Tensor, TensorDict, Tensor], tuple[Tensor, TensorDict]]],
+        batch_size: Sequence[int],
+    ) -> tuple[Tensor, TensorDict]:
+        x = self.linear(x)
+        states = {}
+        for name, read, linear in zip(self.names, readers, self.linears, strict=True):
+            y, states[name] = read(x, state[name], is_init)
+            y = F.leaky_relu_(F.layer_norm(linear(y), (self.hidden_size,)))
+            x = x + y if self.residual else y
+        return x, TensorDict(states, batch_size=batch_size)
+
+    def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
+        """The cells' initial states, TensorDict [batch_size] with one entry per layer."""
+        cells = zip(self.names, self.cells, strict=True)
+        states = {name: cell.initial_state(batch_size) for name, cell in cells}  # type: ignore[operator]
+        return TensorDict(states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))
 
 
-def _block(
-    chosen: NetworkPreset, input_size: int, memory: str | Callable[..., nn.Module], options: dict[str, Any]
-) -> MemoryBlock:
-    of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
-    return MemoryBlock(
-        input_size,
-        chosen.hidden_size,
-        memory,
-        layers=chosen.layers,
-        skip=chosen.skip,  # type: ignore[arg-type]
-        memory_options=of_preset | options,
-    )
+class MemoryNetwork(TensorDictModuleBase):
+    """From frames, last actions and start flags to one number per action; a TensorDict module with a recurrent state.
 
-
-def _feed_forward(chosen: NetworkPreset, obs_size: int, num_outputs: int) -> "MemoryNetwork":
-    """The published memory-free network; its two layers take the place of a deep head's as well."""
-    encoder = chosen.encoder(obs_size)
-    block = FeedForward(encoder.feature_size, chosen.feedforward_size)
-    head = make_head("linear" if chosen.head == "linear" else "plain", chosen.feedforward_size, num_outputs)
-    return MemoryNetwork(encoder, block, head, num_actions=0)
-
-
-class MemoryNetwork(nn.Module):
-    """From frames, last actions and start flags to one number per action and step.
+    It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next", *state keys)]``; a
+    network whose block has no state has no state keys. Modes and states are those of :class:`MemoryModule`: one step by
+    default, sequences in recurrent mode. :meth:`encode` and :meth:`remember` do the same on plain tensors.
 
     Args:
         encoder: frames to features [..., E].
         block: a memory model, E + num_actions to H.
         head: [..., H] to [..., A].
-        num_actions: length of the one-hot last action; 0 leaves it out.
-        zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is set.
+        num_actions: length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is not read.
+        zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is set. Not with
+            ``store="step"``: there TorchRL also sets ``is_init`` in mid-episode (slices, the next observations of
+            ``GAE``).
+        out_key: where the output is written.
+        state_key: where the recurrent state stands; give actor and critic different ones.
+        store: which states a stored sequence holds, see :class:`MemoryModule`.
+
+    Raises:
+        ValueError: ``zero_action_on_reset`` with ``store="step"``.
 
     Source: POPGym Arcade, network tables.
+
+    Example:
+        >>> from arcade_torch.models import make_network
+        >>> from torchrl.modules import set_recurrent_mode
+        >>> network = make_network("small", "gru")
+        >>> network.in_keys
+        ['pixels', 'last_action', 'is_init', ('memory', 'layer0', 'h')]
+        >>> network.out_keys
+        ['action_value', ('next', 'memory', 'layer0', 'h')]
+        >>> flags = torch.ones(2, 7, 1, dtype=torch.bool)
+        >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
+        >>> actions = torch.zeros(2, 7, dtype=torch.int64)
+        >>> data = TensorDict({"pixels": frames, "last_action": actions, "is_init": flags}, [2, 7])
+        >>> network(data[:, 0])["next", "memory", "layer0", "h"].shape
+        torch.Size([2, 128])
+        >>> with set_recurrent_mode(True):
+        ...     network(data)["action_value"].shape
+        torch.Size([2, 7, 5])
     """
 
     def __init__(
@@ -173,12 +156,63 @@ class MemoryNetwork(nn.Module):
         *,
         num_actions: int = 5,
         zero_action_on_reset: bool = False,
+        out_key: Key = "action_value",
+        state_key: Key = "memory",
+        store: Store = "sequence",
     ) -> None:
         super().__init__()
+        if zero_action_on_reset and store == "step":
+            raise ValueError("zero_action_on_reset needs store='sequence': with 'step', is_init also marks cuts")
         self.encoder, self.block, self.head = encoder, block, head
         self.obs_size, self.num_actions, self.zero_action_on_reset = encoder.obs_size, num_actions, zero_action_on_reset
         self.register_buffer("actions", torch.arange(num_actions), persistent=False)
         self.actions: Tensor
+        # In a tuple, so that the block is registered once and its weights are called "block...." alone.
+        self._recurrent = (MemoryModule(block, "pixels", out_key, state_key, store=store),)
+        module = self._recurrent[0]
+        self.in_keys = ["pixels", *["last_action"] * bool(num_actions), module.is_init_key, *module.state_keys]
+        self.out_keys = module.out_keys
+
+    @property
+    def out_key(self) -> Key:
+        """Where the output is written."""
+        return self._recurrent[0].out_key  # type: ignore[no-any-return]
+
+    @property
+    def store(self) -> Store:
+        """Which states a stored sequence holds."""
+        return self._recurrent[0].store
+
+    @property
+    def state_keys(self) -> Sequence[tuple[str, ...]]:
+        """Keys of the recurrent state, without "next"."""
+        return self._recurrent[0].state_keys
+
+    def make_tensordict_primer(self) -> "TensorDictPrimer":
+        """The transform that puts initial states into an env's resets; see :class:`MemoryModule`."""
+        return self._recurrent[0].make_tensordict_primer()
+
+    @dispatch  # type: ignore[untyped-decorator]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Read one step, or in recurrent mode sequences, and write output and next state.
+
+        Args:
+            tensordict: any batch shape (in recurrent mode [*, T]) with ``in_keys``; frames may be full or compressed,
+                state keys may be missing, which means the initial state.
+
+        Returns:
+            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"`` without the next states).
+
+        Raises:
+            ValueError: recurrent mode without a time dimension, or start flags that are not [*batch, 1].
+            KeyError: an entry is missing.
+        """
+        x = self.encode(tensordict["pixels"])
+        recurrent = self._recurrent[0]
+        if self.num_actions:
+            x = self._append(x, tensordict["last_action"], recurrent.start_flags(tensordict))
+        tensordict.set(recurrent.out_key, self.head(recurrent.read(tensordict, x)))
+        return tensordict
 
     def compress(self, pixels: Tensor) -> Tensor:
         """What of the frames is worth storing.
@@ -199,11 +233,6 @@ class MemoryNetwork(nn.Module):
         """Frames, uint8 or float 0..255, full or compressed [..., S or s, S or s, 3], to features float [..., E]."""
         return self.encoder(pixels)  # type: ignore[no-any-return]
 
-    def record(self, frames: Tensor, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Pull]:
-        """:meth:`encode`, and how gradients reach the frames; see :meth:`Encoder.record`."""
-        record = getattr(self.encoder, "record", None)  # an encoder of somebody's own has none
-        return recorded_twice(self.encoder, frames, dtype) if record is None else record(frames, dtype)
-
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
     ) -> tuple[Tensor, TensorDict]:
@@ -213,35 +242,23 @@ class MemoryNetwork(nn.Module):
             features: float [B, T, E].
             last_action: int64 [B, T], the action that led to each frame.
             is_init: bool [B, T], True where an episode begins.
-            state: TensorDict [B], the recurrent state before step 0.
+            state: TensorDict [B], the recurrent state before step 0, see :meth:`initial_state`.
 
         Returns:
             (float [B, T, A], state TensorDict [B] after the last step).
         """
         if self.num_actions:
-            one_hot = last_action.unsqueeze(-1) == self.actions
-            if self.zero_action_on_reset:
-                one_hot = one_hot & ~is_init.unsqueeze(-1)
-            features = torch.cat([features, one_hot.to(features.dtype)], dim=-1)
+            features = self._append(features, last_action, is_init)
         y, state = self.block(features, state, is_init)
         return self.head(y), state
 
-    def forward(
-        self, pixels: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
-    ) -> tuple[Tensor, TensorDict]:
-        """:meth:`encode` and :meth:`remember` in one.
-
-        Args:
-            pixels: uint8 or float 0..255 [B, T, S, S, 3], full or compressed.
-            last_action: int64 [B, T].
-            is_init: bool [B, T].
-            state: TensorDict [B].
-
-        Returns:
-            (float [B, T, A], state TensorDict [B] after the last step).
-        """
-        return self.remember(self.encode(pixels), last_action, is_init, state)
-
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
-        """Recurrent state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""
+        """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""
         return self.block.initial_state(batch_size)  # type: ignore[operator]
+
+    def _append(self, features: Tensor, last_action: Tensor, is_init: Tensor) -> Tensor:
+        """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool [...]."""
+        one_hot = last_action.unsqueeze(-1) == self.actions
+        if self.zero_action_on_reset:
+            one_hot = one_hot & ~is_init.unsqueeze(-1)
+        return torch.cat([features, one_hot.to(features.dtype)], dim=-1)

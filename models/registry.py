@@ -7,15 +7,15 @@ from typing import Any
 from torch import nn
 
 from arcade_torch.models.attention import Attention
-from arcade_torch.models.fart import LinearTransformer
 from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
+from arcade_torch.models.linear_transformer import LinearTransformer
 from arcade_torch.models.lru import LRU
 from arcade_torch.models.mingru import MinGRU
 from arcade_torch.models.stateless import Stateless
 from arcade_torch.models.ttt import TTTLinear
 
-__all__ = ["make_memory", "memory_names", "register_memory"]
+__all__ = ["ALIASES", "make_memory", "memory_names", "register_memory"]
 
 MemoryFactory = Callable[..., nn.Module]
 
@@ -24,11 +24,14 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "mingru": MinGRU,
     "gru": GRU,
     "mlp": Stateless,
-    "fart": LinearTransformer,
+    "linear_transformer": LinearTransformer,
     "attention": Attention,
     "gdn": GatedDeltaNet,
     "ttt": TTTLinear,
 }
+
+ALIASES = {"fart": "linear_transformer"}
+"""Other names that :func:`make_memory` accepts: what the paper calls a model."""
 
 
 def memory_names() -> list[str]:
@@ -36,7 +39,7 @@ def memory_names() -> list[str]:
 
     Example:
         >>> memory_names()[:8]
-        ['lru', 'mingru', 'gru', 'mlp', 'fart', 'attention', 'gdn', 'ttt']
+        ['lru', 'mingru', 'gru', 'mlp', 'linear_transformer', 'attention', 'gdn', 'ttt']
     """
     return list(_FACTORIES)
 
@@ -45,7 +48,7 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     """Make a memory model.
 
     Args:
-        name: one of :func:`memory_names`.
+        name: one of :func:`memory_names`, or ``"fart"``, the paper's name of the linear transformer.
         input_size: D, features of an input step.
         hidden_size: H, features of an output step.
         **options: those of the model, such as ``candidate="linear"`` of MinGRU.
@@ -65,6 +68,7 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
         >>> y.shape, state["h"].shape
         (torch.Size([2, 5, 4]), torch.Size([2, 4]))
     """
+    name = ALIASES.get(name, name)
     if name not in _FACTORIES:
         near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
@@ -89,6 +93,6 @@ def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = Fals
         raise ValueError(f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}")
     if not callable(factory):
         raise TypeError(f"factory must be callable as factory(input_size, hidden_size, **options), got {factory!r}")
-    if name in _FACTORIES and not overwrite:
+    if (name in _FACTORIES or name in ALIASES) and not overwrite:
         raise ValueError(f"memory {name!r} is registered already; choose another name or pass overwrite=True")
-    _FACTORIES[name] = factory
+    _FACTORIES[ALIASES.get(name, name)] = factory

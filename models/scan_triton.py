@@ -56,7 +56,7 @@ def runs_triton(x: Tensor) -> bool:
 
 
 def scan_triton(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
-    """``scan_ops.scan`` in one kernel.
+    """``scan.scan`` in one kernel.
 
     Args:
         a: float32, float64, complex64 or complex128 [B, T, ...], any strides.
@@ -76,7 +76,7 @@ def scan_triton(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tenso
 
 
 def scan_backward_triton(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
-    """``scan_ops.scan_backward`` in one kernel.
+    """``scan.scan_backward`` in one kernel.
 
     Args:
         a: float32, float64, complex64 or complex128 [B, T, ...], any strides.

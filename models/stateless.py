@@ -1,15 +1,19 @@
-"""The stateless cell: the control that has every part of a memory network except the memory."""
+"""Models without memory: the stateless cell, and the paper's feed-forward layers."""
+
+from collections.abc import Sequence
 
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.models.base import Memory
+from arcade_torch.models.memory import Memory
 
-__all__ = ["Stateless"]
+__all__ = ["FeedForward", "Stateless"]
 
 
 class Stateless(Memory):
     """y = LeakyReLU(W x + b); the state is an empty TensorDict.
+
+    A control: a network with this cell has every part of a memory network except the memory.
 
     Args:
         input_size: D.
@@ -34,3 +38,33 @@ class Stateless(Memory):
         """Apply the layer to each step; returns ([B, T, H], the given states)."""
         self._check(x, stored, is_init, batch_ndim=2)
         return nn.functional.leaky_relu(self.linear(x)), stored
+
+
+class FeedForward(nn.Module):
+    """Linear, LayerNorm with parameters, LeakyReLU, twice. Keeps the contract of a memory model, with an empty state.
+
+    The stateless cell ``"mlp"`` stands in the memory block; this takes the place of the whole block, as in the
+    published "MLP" agents.
+
+    Args:
+        input_size: D.
+        hidden_size: H, width of both layers.
+
+    Source: POPGym Arcade (ICML 2026), feed-forward learner of the reference implementation.
+    """
+
+    def __init__(self, input_size: int, hidden_size: int = 256) -> None:
+        super().__init__()
+        self.input_size, self.hidden_size = input_size, hidden_size
+        layers: list[nn.Module] = []
+        for size in (input_size, hidden_size):
+            layers += [nn.Linear(size, hidden_size), nn.LayerNorm(hidden_size), nn.LeakyReLU(inplace=True)]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """Each step on its own: float [B, T, D] to [B, T, H]; the state stays empty."""
+        return self.layers(x), state
+
+    def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
+        """An empty TensorDict [batch_size]."""
+        return TensorDict({}, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from arcade_torch.models import check_memory, make_memory, registry
-from arcade_torch.models.base import replay
+from arcade_torch.models.memory import replay
 from arcade_torch.tools import cli
 from arcade_torch.tools.extensions import VARIABLE
 

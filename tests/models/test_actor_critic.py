@@ -6,12 +6,16 @@ from torch import nn
 
 from arcade_torch.models import make_network
 from arcade_torch.models.actor_critic import make_actor_critic
-from arcade_torch.models.feedforward import FeedForward
-from arcade_torch.models.heads import make_head
+from arcade_torch.models.presets import make_head
+from arcade_torch.models.stateless import FeedForward
 
 
 def count(module):
     return sum(p.numel() for p in module.parameters())
+
+
+def run(network, pixels, last_action, is_init, state):
+    return network.remember(network.encode(pixels), last_action, is_init, state)
 
 
 def inputs(batch=2, steps=5, size=32):
@@ -27,17 +31,18 @@ def test_the_feed_forward_network_has_the_published_size_and_no_last_action():
     pixels, last_action, is_init = inputs(1, 2, 128)
     state = network.initial_state(1)
     with torch.no_grad():
-        one, after = network(pixels, last_action, is_init, state)
-        other, _ = network(pixels, (last_action + 1) % 5, ~is_init, state)
+        one, after = run(network, pixels, last_action, is_init, state)
+        other, _ = run(network, pixels, (last_action + 1) % 5, ~is_init, state)
     assert torch.equal(one, other) and after.is_empty() and state.is_empty()
 
 
 def test_the_feed_forward_network_looks_at_each_frame_alone():
     network = make_network("small", "feedforward")
     pixels, last_action, is_init = inputs(2, 4)
-    out, _ = network(pixels, last_action, is_init, network.initial_state(2))
+    out, _ = run(network, pixels, last_action, is_init, network.initial_state(2))
     alone = [
-        network(pixels[:, t : t + 1], last_action[:, :1], is_init[:, :1], network.initial_state(2))[0] for t in (3, 1)
+        run(network, pixels[:, t : t + 1], last_action[:, :1], is_init[:, :1], network.initial_state(2))[0]
+        for t in (3, 1)
     ]
     torch.testing.assert_close(torch.cat(alone, 1), out[:, [3, 1]])
     assert FeedForward(7, 3).initial_state([2, 4]).batch_size == (2, 4)
@@ -69,10 +74,10 @@ def test_each_tower_alone_gives_its_half_of_the_output(memory):
     pixels, last_action, is_init = inputs(3, 6)
     state = network.initial_state(3)
     with torch.no_grad():
-        out, after = network(pixels, last_action, is_init, state)
+        out, after = run(network, pixels, last_action, is_init, state)
         logits, value = network.split(out)
-        alone, mine = network.actor(pixels, last_action, is_init, state["actor"])
-        single, theirs = network.critic(pixels, last_action, is_init, state["critic"])
+        alone, mine = run(network.actor, pixels, last_action, is_init, state["actor"])
+        single, theirs = run(network.critic, pixels, last_action, is_init, state["critic"])
     torch.testing.assert_close(logits, alone)
     torch.testing.assert_close(value, single.squeeze(-1))
     for name, expected in (("actor", mine), ("critic", theirs)):

@@ -125,18 +125,39 @@ def test_acting_under_vmap_with_flags_that_differ_equals_one_batch():
         torch.testing.assert_close(ours, together)
 
 
-def test_the_state_is_the_window_newest_last_and_empty_slots_hold_zeros():
+@pytest.mark.parametrize("lengths", [(8,), (1,) * 8, (3, 5), (6, 1, 1)])
+def test_the_state_is_a_ring_of_rotated_keys_and_unused_slots_hold_zeros(lengths):
     memory = make_memory("attention", 3, 4, window=5)
-    x = torch.randn(1, 8, 3)
-    _, state = memory(x, memory.initial_state(1), flags(1, 8, 5))
-    assert state["valid"].tolist() == [[False, False, True, True, True]]
-    assert torch.equal(state["key"][:, 2:], memory.key(x)[:, 5:]) and (state["key"][:, :2] == 0).all()
-    torch.testing.assert_close(state["value"][:, 2:], memory.value(x)[:, 5:])
+    for start, steps in ((5, 3), (0, 8)):  # with three steps of an episode in it, and with more than fit
+        x, state, begin = torch.randn(1, 8, 3), memory.initial_state(1), 0
+        is_init = flags(1, 8, start)
+        for length in lengths:
+            _, state = memory(x[:, begin : begin + length], state, is_init[:, begin : begin + length])
+            begin += length
+        assert state["step"].tolist() == [steps]
+        for slot in range(5):
+            held = [i for i in range(steps) if i % 5 == slot][-1:]
+            for name, layer in (("key", memory.key), ("value", memory.value)):
+                row = layer(x[:, start + held[0]]) if held else torch.zeros(1, 4)
+                if name == "key" and held:
+                    row = rotate_pairs(row, *angles(torch.tensor(held), 4, row.dtype))
+                torch.testing.assert_close(state[name][:, slot], row)
     assert {key: tuple(leaf.shape) for key, leaf in make_memory("attention", 512, 512).initial_state(1).items()} == {
         "key": (1, 128, 512),
         "value": (1, 128, 512),
-        "valid": (1, 128),
+        "step": (1,),
     }
+
+
+def test_long_episodes_stay_exact_when_acted_step_by_step():
+    memory = make_memory("attention", 3, 4, window=4)
+    x, state, outputs = torch.randn(1, 40, 3), memory.initial_state(1), []
+    state["step"].fill_(1_000_000)  # a ring of zeros at a late position: the zeros are attended to
+    whole, _ = memory(x, state, flags(1, 40))
+    for t in range(40):
+        y, state = memory(x[:, t : t + 1], state, flags(1, 1))
+        outputs.append(y)
+    torch.testing.assert_close(torch.cat(outputs, 1), whole)
 
 
 def test_an_empty_window_for_every_chunk_is_an_option_and_breaks_the_law_of_several_calls():

@@ -166,13 +166,20 @@ def test_wrong_sizes_get_one_clear_line():
         SmallEncoder().calibrate(frames(0))
 
 
-def test_the_small_encoder_is_the_documented_stack_on_scaled_frames():
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
+def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_on_scaled_frames(dtype, tolerance):
     encoder, pixels = SmallEncoder(), frames(40) // 2
     encoder.calibrate(pixels)
-    pooled = encoder.compress(pixels).permute(0, 3, 1, 2).float()
-    centred = pooled - pooled.mean(0)
-    x = centred / centred.square().mean().sqrt()
-    x = F.leaky_relu(F.conv2d(x, encoder.conv1.weight, encoder.conv1.bias, stride=4))
+    encoder.to(dtype)
+    weights = [encoder.conv1, encoder.conv2, encoder.linear]
+    x = (encoder.compress(pixels).permute(0, 3, 1, 2).to(dtype) - encoder.mean) * encoder.inverse_rms
+    x = F.leaky_relu(F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=4))
     x = F.leaky_relu(F.conv2d(x, encoder.conv2.weight, encoder.conv2.bias))
-    x = F.leaky_relu(F.layer_norm(F.linear(x.flatten(1), encoder.linear.weight, encoder.linear.bias), (128,)))
-    torch.testing.assert_close(encoder(pixels), x, rtol=1e-4, atol=1e-4)
+    x = F.linear(x.flatten(1), encoder.linear.weight.flatten(1), encoder.linear.bias)
+    plain, found = F.leaky_relu(F.layer_norm(x, (128,))), encoder(pixels)
+    parameters = [p for layer in weights for p in layer.parameters()]
+    assert len(parameters) == len(list(encoder.parameters()))
+    cotangent = torch.randn_like(plain)
+    wanted = [plain, *torch.autograd.grad(plain, parameters, cotangent)]
+    for one, other in zip([found, *torch.autograd.grad(found, parameters, cotangent)], wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=tolerance * float(other.detach().abs().max()))

@@ -25,7 +25,7 @@ def projected(memory, x):
 
 @pytest.mark.parametrize("legacy", [False, True])
 def test_the_linear_transformer_divides_by_the_running_sum_of_keys_or_as_published_by_the_last(legacy):
-    memory, x, y, state = run("fart", legacy_normaliser=legacy)
+    memory, x, y, state = run("linear_transformer", legacy_normaliser=legacy)
     queries, keys, values = projected(memory, x)
     for t in range(STEPS):
         if t in (0, 5):
@@ -38,16 +38,16 @@ def test_the_linear_transformer_divides_by_the_running_sum_of_keys_or_as_publish
 
 def test_the_published_normaliser_is_lawful_but_for_the_law_of_averages():
     with pytest.raises(MemoryLawError, match="sum to one") as caught:
-        check_memory(make_memory("fart", 4, 4, legacy_normaliser=True))
+        check_memory(make_memory("linear_transformer", 4, 4, legacy_normaliser=True))
     assert caught.value.law == "an average of equal values is that value"
-    memory = make_memory("fart", 4, 4, legacy_normaliser=True)
+    memory = make_memory("linear_transformer", 4, 4, legacy_normaliser=True)
     memory.averages_values = False
     check_memory(memory)
 
 
 def test_the_input_passes_a_linear_transformer_unchanged_if_the_sizes_allow_it():
-    assert make_memory("fart", 8, 8).skip(torch.ones(8)).equal(torch.ones(8))
-    assert make_memory("fart", 3, 8).skip(torch.ones(3)).shape == (8,)
+    assert make_memory("linear_transformer", 8, 8).skip(torch.ones(8)).equal(torch.ones(8))
+    assert make_memory("linear_transformer", 3, 8).skip(torch.ones(3)).shape == (8,)
 
 
 @pytest.mark.parametrize("gate_alpha", [True, False])
@@ -135,7 +135,7 @@ def test_the_start_of_ttt_is_learned_and_an_episode_begins_there_not_at_the_carr
 
 
 def test_key_size_is_the_root_of_the_width_or_what_one_asks_for():
-    for name in ("fart", "gdn", "ttt"):
+    for name in ("linear_transformer", "gdn", "ttt"):
         assert make_memory(name, 512, 512).key_size == 23
         assert make_memory(name, 4, 4, key_size=7).initial_state(2)["h"].shape[:2] == (2, 7)
         check_memory(make_memory(name, 3, 4, key_size=3), gradients=False)

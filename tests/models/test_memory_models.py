@@ -9,8 +9,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from arcade_torch.models import linear_scan, make_memory, memory_names, register_memory
-from arcade_torch.models.base import Memory, MemoryContract, ReplayableMemory
-from arcade_torch.models.laws import check_memory
+from arcade_torch.models.checks import check_memory
+from arcade_torch.models.memory import Memory, MemoryContract, ReplayableMemory
 
 MODELS = [
     ("lru", {}),
@@ -19,7 +19,7 @@ MODELS = [
     ("mingru", {"candidate": "linear", "slow_gates": True}),
     ("gru", {}),
     ("mlp", {}),
-    ("fart", {}),
+    ("linear_transformer", {}),
     ("attention", {}),
     ("attention", {"window": 3}),
     ("attention", {"window": 1}),
@@ -52,7 +52,7 @@ def test_every_model_satisfies_the_protocols(name):
         ("mingru", 525_312),
         ("mlp", 262_656),
         ("attention", 786_944),
-        ("fart", 47_616),
+        ("linear_transformer", 47_616),
         ("gdn", 48_642),
         ("ttt", 48_658),  # our own variant, unpublished
     ],

@@ -6,13 +6,17 @@ from tensordict import TensorDict
 from torch import nn
 
 from arcade_torch.models import MemoryBlock, check_memory, make_network
-from arcade_torch.models.heads import HEADS, make_head
+from arcade_torch.models.presets import HEADS, make_head
 
 CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
 
 
 def count(module):
     return sum(p.numel() for p in module.parameters())
+
+
+def run(network, pixels, last_action, is_init, state):
+    return network.remember(network.encode(pixels), last_action, is_init, state)
 
 
 def inputs(batch=2, steps=5, size=32):
@@ -42,7 +46,7 @@ def test_acting_step_by_step_equals_learning_on_the_sequence(memory):
     network = make_network("small", memory)
     pixels, last_action, is_init = inputs(3, 9, 128)
     with torch.no_grad():
-        out, last = network(pixels, last_action, is_init, network.initial_state(3))
+        out, last = run(network, pixels, last_action, is_init, network.initial_state(3))
         state, stepped = network.initial_state(3), []
         for t in range(9):
             features = network.encode(network.compress(pixels[:, t])).unsqueeze(1)
@@ -57,10 +61,10 @@ def test_the_papers_network_acts_as_it_learns():
     network = make_network("paper", "lru")
     pixels, last_action, is_init = inputs(2, 3, 128)
     with torch.no_grad():
-        out, _ = network(pixels, last_action, is_init, network.initial_state(2))
+        out, _ = run(network, pixels, last_action, is_init, network.initial_state(2))
         state, stepped = network.initial_state(2), []
         for t in range(3):
-            q, state = network(pixels[:, t : t + 1], last_action[:, t : t + 1], is_init[:, t : t + 1], state)
+            q, state = run(network, pixels[:, t : t + 1], last_action[:, t : t + 1], is_init[:, t : t + 1], state)
             stepped.append(q)
     torch.testing.assert_close(torch.cat(stepped, 1), out, rtol=0, atol=1e-5)
 
@@ -80,8 +84,8 @@ def last_action_matters(network, is_init):
     pixels, last_action, _ = inputs(1, 1)
     state = network.initial_state(1)
     with torch.no_grad():
-        first, _ = network(pixels, last_action, torch.tensor([[is_init]]), state)
-        other, _ = network(pixels, (last_action + 1) % 5, torch.tensor([[is_init]]), state)
+        first, _ = run(network, pixels, last_action, torch.tensor([[is_init]]), state)
+        other, _ = run(network, pixels, (last_action + 1) % 5, torch.tensor([[is_init]]), state)
     return not torch.equal(first, other)
 
 
@@ -98,12 +102,12 @@ def test_saliency_reaches_every_earlier_frame_through_the_memory():
     network = make_network("small", "mingru")
     pixels, last_action, is_init = inputs(1, 4, 128)
     smooth = pixels.float().requires_grad_()
-    q, _ = network(smooth, last_action, torch.zeros_like(is_init), network.initial_state(1))
+    q, _ = run(network, smooth, last_action, torch.zeros_like(is_init), network.initial_state(1))
     q[0, -1].max().backward()
     assert (smooth.grad.abs().sum((0, 2, 3, 4)) > 0).all()
     smooth.grad = None
     is_init[:] = torch.tensor([[True, False, True, False]])
-    q, _ = network(smooth, last_action, is_init, network.initial_state(1))
+    q, _ = run(network, smooth, last_action, is_init, network.initial_state(1))
     q[0, -1].max().backward()
     assert (smooth.grad.abs().sum((0, 2, 3, 4)) > 0).tolist() == [False, False, True, True]
 
@@ -162,7 +166,7 @@ def test_calibration_goes_through_the_network_and_is_saved_with_it():
 def test_dtype_follows_the_parameters():
     network = make_network("small", "lru").double()
     pixels, last_action, is_init = inputs()
-    out, state = network(pixels, last_action, is_init, network.initial_state(2))
+    out, state = run(network, pixels, last_action, is_init, network.initial_state(2))
     assert out.dtype == torch.float64 and state["layer0", "h"].dtype == torch.float64
 
 
@@ -204,3 +208,9 @@ def test_wrong_options_get_one_clear_line(options, message):
 def test_an_unknown_option_is_refused_by_name():
     with pytest.raises(TypeError, match=r"width.*allowed are encoder, hidden_size"):
         make_network("small", "gru", width=3)
+
+
+@pytest.mark.parametrize("name", ["hidden_size", "layers", "feedforward_size"])
+def test_a_size_that_is_no_number_gets_one_line(name):
+    with pytest.raises(ValueError, match=rf"^{name} must be a whole number, got 'abc'$"):
+        make_network("small", "gru", **{name: "abc"})

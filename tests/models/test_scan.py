@@ -7,9 +7,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arcade_torch.models import scan_ops, scan_triton
-from arcade_torch.models.scan import linear_scan, linear_scan_loop
-from arcade_torch.models.scan_ops import back_end, scan, scan_backward, scan_backward_doubling, scan_doubling
+from arcade_torch.models import scan as scan_ops
+from arcade_torch.models import scan_triton
+from arcade_torch.models.scan import (
+    back_end,
+    linear_scan,
+    linear_scan_loop,
+    scan,
+    scan_backward,
+    scan_backward_doubling,
+    scan_doubling,
+)
 
 DTYPES = [torch.float64, torch.complex128]
 

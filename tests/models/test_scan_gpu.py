@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from arcade_torch.models import scan_triton
-from arcade_torch.models.scan_ops import back_end
+from arcade_torch.models.scan import back_end
 from arcade_torch.tools.bench.back_ends import bench_back_ends
 from tests.models.scan_cases import LENGTHS, assert_equals_the_loop, assert_nothing_crosses_a_start, problem
 

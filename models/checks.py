@@ -1,4 +1,4 @@
-"""The laws of a memory model, checked on any module that anybody hands in."""
+"""Checks that a module, ours or anybody's, is a correct memory model."""
 
 import copy
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.models.base import ReplayableMemory, replay
+from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
 
 __all__ = ["MemoryLawError", "check_memory"]
 
@@ -273,7 +273,7 @@ def _replay_loads(s: _Subject, law: str) -> float:
     x, _, flags = s.inputs(3, 9, 0.3)
     stored = torch.stack([s.inputs(3, 1)[1] for _ in range(9)], dim=1)
     y, states = s.module.replay(x, stored, flags)  # type: ignore[operator]
-    stepped, stepped_states = replay(_WithoutReplay(s.module), x, stored, flags)
+    stepped, stepped_states = replay_by_steps(s.module, x, stored, flags)
     return s.compare(
         law,
         "replay and a loop that loads stored states by hand differ",
@@ -299,17 +299,6 @@ def _averages(s: _Subject, law: str) -> float:
         (y, y[:, :1].expand_as(y)),
         tolerance=max(s.tolerance, GUARD),
     )
-
-
-class _WithoutReplay(nn.Module):
-    """The module with its ``replay`` method hidden, so that replaying it steps through time."""
-
-    def __init__(self, module: nn.Module) -> None:
-        super().__init__()
-        self.module = module
-
-    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-        return self.module(x, state, is_init)  # type: ignore[no-any-return]
 
 
 def _gradients(s: _Subject, law: str) -> float:

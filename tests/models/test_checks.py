@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from arcade_torch.models.laws import MemoryLawError, check_memory
+from arcade_torch.models.checks import MemoryLawError, check_memory
 from arcade_torch.models.mingru import MinGRU
 from arcade_torch.models.registry import make_memory
 
@@ -154,7 +154,7 @@ def test_a_reset_that_is_consistently_one_step_late_is_caught():
 
 def test_a_linear_transformer_without_a_running_normaliser_is_caught():
     with pytest.raises(MemoryLawError, match="normaliser that is not accumulated") as caught:
-        check_memory(make_memory("fart", 3, 4, legacy_normaliser=True))
+        check_memory(make_memory("linear_transformer", 3, 4, legacy_normaliser=True))
     assert caught.value.law == "an average of equal values is that value" and caught.value.discrepancy > 0.1
 
 

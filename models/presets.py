@@ -1,0 +1,192 @@
+"""Networks by name: presets, and :func:`make_network`."""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import nn
+
+from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
+from arcade_torch.models.memory import Key, Store
+from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
+from arcade_torch.models.stateless import FeedForward
+
+__all__ = ["FEED_FORWARD", "HEADS", "PRESETS", "NetworkPreset", "make_head", "make_network", "preset_of"]
+
+FEED_FORWARD = "feedforward"
+"""In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see :class:`FeedForward`)."""
+
+
+@dataclass(frozen=True)
+class NetworkPreset:
+    """A network up to its memory model and its number of outputs; every field is an option of :func:`make_network`."""
+
+    encoder: Callable[[int], Encoder]
+    """called with ``obs_size``"""
+    hidden_size: int
+    """H, width of the memory block"""
+    layers: int
+    """cells in the memory block"""
+    skip: str = "residual"
+    """"residual" or "none", see :class:`MemoryBlock`"""
+    head: str = "reference"
+    """see :func:`make_head`"""
+    actor_critic_head: str = "actor_critic"
+    """head of the two towers of :func:`make_actor_critic`"""
+    feedforward_size: int = 256
+    """width of the layers that stand in for the memory block of a feed-forward network"""
+    use_last_action: bool = True
+    """append the one-hot last action to the features"""
+    zero_action_on_reset: bool = False
+    """no last action at the first step of an episode; False shows the last action of the episode before"""
+    memory_options: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """options of the cells, by name of the memory"""
+
+
+PRESETS = {
+    "paper": NetworkPreset(encoder=PaperEncoder, hidden_size=512, layers=2),
+    "small": NetworkPreset(
+        encoder=SmallEncoder,
+        hidden_size=128,
+        layers=1,
+        head="linear",
+        actor_critic_head="linear",
+        feedforward_size=128,
+        zero_action_on_reset=True,
+        memory_options={"mingru": {"slow_gates": True}},
+    ),
+}
+
+
+def preset_of(name: str) -> NetworkPreset:
+    """The preset of a name.
+
+    Raises:
+        ValueError: unknown name; the message has the nearest match and the list.
+    """
+    if name not in PRESETS:
+        near = difflib.get_close_matches(str(name), PRESETS, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        raise ValueError(f"unknown network {name!r}: {hint}known are {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def make_network(
+    preset: str = "paper",
+    memory: str | Callable[..., nn.Module] = "lru",
+    *,
+    obs_size: int = 128,
+    num_outputs: int = 5,
+    num_actions: int = 5,
+    memory_options: dict[str, Any] | None = None,
+    out_key: Key = "action_value",
+    state_key: Key = "memory",
+    store: Store = "sequence",
+    **options: Any,
+) -> "MemoryNetwork":
+    """Make a network.
+
+    Args:
+        preset: "paper" (1,428,613 parameters plus two cells) or "small" (225,733 with MinGRU; learns the easiest games
+            in minutes on one CPU core).
+        memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) -> nn.Module``, or
+            "feedforward": no memory block and no last action, the paper's memory-free agent (704,901 parameters).
+        obs_size: side of the frames in pixels.
+        num_outputs: A; one per action for Q-values or logits, 1 for a state value.
+        num_actions: number of actions, for the one-hot last action.
+        memory_options: options of the cells, over those of the preset.
+        out_key: where the output is written.
+        state_key: where the recurrent state stands.
+        store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at every ``is_init``;
+            "step": every step has a stored state, see :class:`MemoryModule`; without ``zero_action_on_reset``.
+        **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``, ``head``,
+            ``use_last_action``, ``zero_action_on_reset``, ``encoder``.
+
+    Returns:
+        a :class:`MemoryNetwork`.
+
+    Raises:
+        ValueError: unknown preset, memory, size, or value of an option.
+        TypeError: unknown option.
+
+    Example:
+        >>> network = make_network("small", "mingru")
+        >>> sum(p.numel() for p in network.parameters())
+        225733
+        >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
+        >>> last_action, is_init = torch.zeros(2, 7, dtype=torch.int64), torch.zeros(2, 7, dtype=torch.bool)
+        >>> out, state = network.remember(network.encode(frames), last_action, is_init, network.initial_state(2))
+        >>> out.shape
+        torch.Size([2, 7, 5])
+    """
+    chosen = preset_of(preset)
+    if unknown := set(options) - set(NetworkPreset.__dataclass_fields__):
+        allowed = ", ".join(NetworkPreset.__dataclass_fields__)
+        raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
+    chosen = replace(chosen, **options)
+    for name in ("hidden_size", "layers", "feedforward_size"):
+        if not isinstance(getattr(chosen, name), int):
+            raise ValueError(f"{name} must be a whole number, got {getattr(chosen, name)!r}")
+    encoder = chosen.encoder(obs_size)
+    block: nn.Module
+    if memory == FEED_FORWARD:  # its two layers take the place of a deep head's as well
+        actions, hidden_size = 0, chosen.feedforward_size
+        block = FeedForward(encoder.feature_size, hidden_size)
+        head = make_head("linear" if chosen.head == "linear" else "plain", hidden_size, num_outputs)
+    else:
+        actions = num_actions if chosen.use_last_action else 0
+        of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
+        block = MemoryBlock(
+            encoder.feature_size + actions,
+            chosen.hidden_size,
+            memory,
+            layers=chosen.layers,
+            skip=chosen.skip,  # type: ignore[arg-type]
+            memory_options=of_preset | (memory_options or {}),
+        )
+        head = make_head(chosen.head, chosen.hidden_size, num_outputs)
+    keys: dict[str, Any] = {"out_key": out_key, "state_key": state_key, "store": store}
+    zero_action = chosen.zero_action_on_reset
+    if store == "step" and "zero_action_on_reset" not in options:
+        zero_action = False  # a start flag may stand where a sampler cut an episode
+    return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys)
+
+
+HEADS = ("reference", "paper", "actor_critic", "linear", "plain")
+
+
+def make_head(name: str, input_size: int, num_outputs: int) -> nn.Module:
+    """Make an output head.
+
+    Args:
+        name: "reference": Linear to 256, Linear (no activation between, as in the published Q-networks);
+            "paper": Linear to 256, Linear 256, LeakyReLU, LayerNorm, Linear (the paper's table; the LayerNorm has
+            parameters, which the table leaves open); "actor_critic": the same with LayerNorm before LeakyReLU, as in
+            the published PPO networks; "linear": one Linear, initial weights a tenth of torch's, bias 0 (small initial
+            values, so that action gaps are not drowned by the noise of the start); "plain": one Linear.
+        input_size: H.
+        num_outputs: A.
+
+    Returns:
+        module [..., H] -> [..., A].
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if name == "reference":
+        return nn.Sequential(nn.Linear(input_size, 256), nn.Linear(256, num_outputs))
+    if name in ("paper", "actor_critic"):
+        middle: list[nn.Module] = [nn.LeakyReLU(inplace=True), nn.LayerNorm(256)]
+        second = nn.Linear(256, 256), *(middle if name == "paper" else middle[::-1])
+        return nn.Sequential(nn.Linear(input_size, 256), *second, nn.Linear(256, num_outputs))
+    if name == "plain":
+        return nn.Linear(input_size, num_outputs)
+    if name == "linear":
+        head = nn.Linear(input_size, num_outputs)
+        with torch.no_grad():
+            head.weight.mul_(0.1)
+            head.bias.zero_()
+        return head
+    raise ValueError(f"head must be one of {', '.join(HEADS)}, got {name!r}")
