@@ -7,15 +7,14 @@ Public names are resolved on first use, so that importing the package costs litt
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from arcade_torch.gym_ids import register_when_gymnasium_is_there
+from arcade_torch.gym import register_games
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PUBLIC = {
     "ArcadeCollector": "arcade_torch.collector",
     "ArcadeEnv": "arcade_torch.env",
     "make": "arcade_torch.factory",
-    "next_pixels": "arcade_torch.frames",
     "registered_ids": "arcade_torch.envs_jax",
 }
 
@@ -24,11 +23,10 @@ if TYPE_CHECKING:
     from arcade_torch.env import ArcadeEnv
     from arcade_torch.envs_jax import registered_ids
     from arcade_torch.factory import make
-    from arcade_torch.frames import next_pixels
 
-__all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "next_pixels", "registered_ids"]
+__all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "registered_ids"]
 
-register_when_gymnasium_is_there()
+register_games()
 
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names

@@ -1,12 +1,14 @@
-"""The compiled functions of a game or a mixture of games, shared by all envs that play it."""
+"""The compiled functions of a game or a mixture of games, shared by all envs that play it. Loads no torch."""
 
-import functools
+import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
@@ -18,6 +20,9 @@ from arcade_torch.envs_jax.shown import shown
 REWARD, EPISODE_REWARD, STEP_COUNT, TERMINATED, TRUNCATED = range(5)
 NUM_NUMBERS = 5
 
+# One compiled shape draws final observations: an eighth of the batch, at least 4 frames, of at most 8 different steps.
+_SHARE, _MIN_FRAMES, _MAX_STEPS = 8, 4, 8
+
 _Ids = str | tuple[str, ...]
 
 
@@ -26,50 +31,125 @@ class Step(NamedTuple):
 
     root: Batch  # after the resets: the live state, so copy what is exported of it
     final_state: Any  # the games' state before the resets
-    outcome: Outcome  # reward float32 [N], terminated, truncated, done bool [N]
     pixels: jax.Array  # uint8 [N, S, S, 3] of the root
     numbers: jax.Array  # float32 [N, 5]: the outcome and the counts before the resets in one array, for one export
 
 
 class CompiledGame:
-    """A batched game, or several, and the fused step of the bridge; each is compiled once per number of envs.
-
-    Args:
-        game: The game, batched or not, or a mixture.
-    """
+    """A game, batched or not, or a mixture, and the steps of the bridge; each is compiled once per number of envs."""
 
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
         self.step = jax.jit(self._step)
-        self.draw = self.batched.groups[0].draw  # of the only game, or of the first
+        self.step_only = jax.jit(self._step_only)
+        self.draw_rows = tuple(jax.jit(partial(_draw_rows, group)) for group in self.batched.groups)
 
     def _step(self, batch: Batch, action: jax.Array) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack the numbers."""
         root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
-        columns = (outcome.reward, stepped.episode_reward, stepped.step_count, outcome.terminated, outcome.truncated)
-        numbers = jnp.stack([jnp.asarray(column, jnp.float32) for column in columns], axis=-1)
-        return Step(root, stepped.state, outcome, pixels, numbers)
+        return Step(root, stepped.state, pixels, _pack(stepped, outcome))
+
+    def _step_only(self, batch: Batch, action: jax.Array) -> tuple[Batch, jax.Array, jax.Array]:
+        """Step and draw, without any reset; returns the batch, the frames and the numbers."""
+        stepped, outcome, pixels = self.batched.step_render(batch, action)
+        return stepped, pixels, _pack(stepped, outcome)
+
+
+def _pack(stepped: Batch, outcome: Outcome) -> jax.Array:
+    columns = (outcome.reward, stepped.episode_reward, stepped.step_count, outcome.terminated, outcome.truncated)
+    return jnp.stack([jnp.asarray(column, jnp.float32) for column in columns], axis=-1)
+
+
+def _draw_rows(
+    group: BatchedGame[Any], states: list[Any], flags: jax.Array, step: jax.Array, row: jax.Array, first: jax.Array
+) -> jax.Array:
+    """Draw the envs ``row`` as they were after ``step`` (indices [n]); the states begin with the env ``first``."""
+    picked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[step, row - first], *states)
+    return jax.vmap(group.game.render)(picked, flags[row])
+
+
+class FinalObservations:
+    """The true last observations of ended episodes: keeps the states that steps led to, and draws many at once.
+
+    Keeping the states of up to ``max_steps`` steps costs nothing; neither the host nor the device waits.
+    """
+
+    def __init__(self, compiled: CompiledGame, num_envs: int, max_steps: int) -> None:
+        batched = compiled.batched
+        pairs = zip(compiled.draw_rows, batched.rows(num_envs), strict=True)
+        self._games = [_OneGame(draw_rows, rows, min(max_steps, _MAX_STEPS)) for draw_rows, rows in pairs]
+        self._split_states = batched.states
+        self._states: dict[int, tuple[Any, ...]] = {}
+        self._partial: jax.Array | None = None
+
+    def add(self, index: int, step: Step) -> None:
+        """Keep the state that a step led to, before the resets, under a number."""
+        self._states[index] = self._split_states(step.final_state)  # not the step, which would keep its frames alive
+        self._partial = step.root.partial
+
+    def draw(self, wanted: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, jax.Array]]:
+        """Draw the observations that are wanted, and forget all steps.
+
+        Args:
+            wanted: bool [N, L], by env and by the number of the step; those steps must have been added.
+
+        Returns:
+            Portions: int64 [n] rows, int64 [n] steps, and frames uint8 [m, S, S, 3] on the device, of which the first n
+            count. All at once, for on a GPU JAX would draw into memory that was given back and is still being read.
+        """
+        steps, rows = np.nonzero(wanted.T)
+        portions = []
+        for number, game in enumerate(self._games):
+            own = (rows >= game.first) & (rows < game.last)
+            for some_rows, some_steps in game.portions(rows[own], steps[own]):
+                indices = np.unique(some_steps)
+                states = [self._states[index][number] for index in indices.tolist()]
+                frames = game.draw(states, self._partial, np.searchsorted(indices, some_steps), some_rows)
+                portions.append((some_rows, some_steps, frames))
+        self._states.clear()
+        return portions
+
+
+class _OneGame:
+    """Draws rows of the states of the envs ``first`` to ``last``, which play one game."""
+
+    def __init__(self, draw_rows: Any, rows: slice, max_steps: int) -> None:
+        self.first, self.last, self._max_steps, self._draw_rows = rows.start, rows.stop, max_steps, draw_rows
+        size = rows.stop - rows.start
+        self._size = min(size, max(_MIN_FRAMES, size // _SHARE))
+
+    def portions(self, rows: np.ndarray, steps: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Cut rows and their steps (in ascending order) into what one call draws."""
+        while len(rows):
+            numbers = np.unique(steps[: self._size])
+            count = min(self._size, len(rows))
+            if len(numbers) > self._max_steps:
+                count = int(np.searchsorted(steps, numbers[self._max_steps]))
+            yield rows[:count], steps[:count]
+            rows, steps = rows[count:], steps[count:]
+
+    def draw(self, states: list[Any], flags: Any, step: np.ndarray, row: np.ndarray) -> jax.Array:
+        """One call; ``step`` counts in ``states``. What is short of the compiled shape is filled up."""
+        states = states + [states[-1]] * (self._max_steps - len(states))
+        fill = (0, self._size - len(row))
+        indices = (np.pad(index, fill, mode="edge").astype(np.int32) for index in (step, row))
+        frames: jax.Array = self._draw_rows(states, flags, *indices, np.int32(self.first))
+        return frames
 
 
 def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: dict[str, Any]) -> CompiledGame:
     """Make a game with its compiled functions; equal arguments share them, so a second env compiles nothing.
 
-    Args:
-        id: Id of the game, or ids of several: a mixture, in which an id that stands there k times gets k shares.
-        obs_size: Side of the frames.
-        rules: Rule set.
-        options: Options of the game; in a mixture, of every game.
-
-    Returns:
-        The game.
+    Several ids are a mixture, in which an id that stands there k times gets k shares, and every game gets the options.
 
     Raises:
         ValueError: Unknown id, size, rules or option value, or no id at all.
         TypeError: An option that one of the games does not have, or ids that are neither a string nor a list.
     """
-    ids = id if isinstance(id, str) else tuple(_checked(id))
+    ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))  # what a bare name means may change
+    key = tuple((name, type(value), value) for name, value in sorted(options.items()))  # 1 == True, but means another
     try:
-        return _cached(ids, obs_size, rules, tuple(sorted(options.items())))
+        return _cached(ids, obs_size, rules, key)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
@@ -85,9 +165,9 @@ def _checked(ids: Any) -> Sequence[str]:
     return [resolve_id(id) for id in ids]
 
 
-@functools.lru_cache(maxsize=64)
-def _cached(ids: _Ids, obs_size: int, rules: str, options: tuple[tuple[str, Any], ...]) -> CompiledGame:
-    return _compile(ids, obs_size, rules, dict(options))
+@lru_cache(maxsize=64)
+def _cached(ids: _Ids, obs_size: int, rules: str, options: tuple[tuple[str, type, Any], ...]) -> CompiledGame:
+    return _compile(ids, obs_size, rules, {name: value for name, _, value in options})
 
 
 def _compile(ids: _Ids, obs_size: int, rules: str, options: dict[str, Any]) -> CompiledGame:
@@ -96,3 +176,22 @@ def _compile(ids: _Ids, obs_size: int, rules: str, options: dict[str, Any]) -> C
     shares = Counter(ids)
     games = [make_game(id, obs_size=obs_size, rules=rules, **options) for id in shares]
     return CompiledGame(MixedGames(games, tuple(shares.values())))
+
+
+_started_in: int | None = None  # the process in which JAX computes
+
+
+def check_process() -> None:
+    """Refuse to go on in a process that was forked after JAX had started: its first computation would hang for ever.
+
+    Raises:
+        RuntimeError: This is such a process.
+    """
+    global _started_in
+    if _started_in not in (None, os.getpid()):
+        raise RuntimeError(
+            "this process was forked after JAX had started, where JAX hangs: start workers with 'spawn' (Gymnasium: "
+            "vector_kwargs={'context': 'spawn'}), or use the native vector env: gymnasium.make_vec without "
+            "vectorization_mode"
+        )
+    _started_in = os.getpid()

@@ -51,6 +51,12 @@ def _numpy_shares_read_only() -> bool:
 _NUMPY_SHARES_READ_ONLY = _numpy_shares_read_only()
 
 
+def is_host(value: jax.Array | jax.Device | torch.device) -> bool:
+    """Whether something is on the CPU, where the host reads memory without waiting for a transfer."""
+    kind = value.type if isinstance(value, torch.device) else value.platform
+    return (kind() if callable(kind) else kind) == "cpu"
+
+
 def to_torch(array: jax.Array, device: torch.device | None = None) -> torch.Tensor:
     """See a JAX array as a tensor. Waits until the array has been computed.
 
@@ -68,10 +74,8 @@ def to_torch(array: jax.Array, device: torch.device | None = None) -> torch.Tens
         >>> to_torch(x).data_ptr() == x.unsafe_buffer_pointer()
         True
     """
-    if _NUMPY_SHARES_READ_ONLY and array.platform() == "cpu":
-        tensor = from_dlpack(np.asarray(array))  # half the price of asking JAX
-    else:
-        tensor = from_dlpack(array)  # not the capsule form, which would not hand torch's stream to JAX
+    # Through numpy at half the price. Not the capsule form, which would not hand torch's stream to JAX.
+    tensor = from_dlpack(np.asarray(array) if _NUMPY_SHARES_READ_ONLY and is_host(array) else array)
     if device is None or tensor.device == device:
         return tensor
     if device.type == "cuda" and tensor.device.type == "cpu":
@@ -122,20 +126,21 @@ def _is_dense(tensor: torch.Tensor) -> bool:
     return tensor.permute(order).is_contiguous()
 
 
-def int32_argument(tensor: torch.Tensor) -> np.ndarray | jax.Array:
+def int32_argument(tensor: torch.Tensor, jax_device: jax.Device) -> np.ndarray | jax.Array:
     """Make integers ready for a compiled function: a private int32 copy.
 
-    The copy is deliberate. JAX reads its arguments after the call has returned, so memory that the caller may write to
-    must not be handed over.
-
-    Args:
-        tensor: Any integer type.
-
-    Returns:
-        On the CPU a numpy view (three times cheaper than DLPack), on CUDA a JAX array.
+    The copy is deliberate: JAX reads arguments after the call has returned, when the caller may write to them. Where
+    JAX computes on the CPU it is a numpy array, three times cheaper than DLPack.
     """
-    copied = tensor.to(torch.int32, copy=True)
-    return copied.numpy() if copied.device.type == "cpu" else to_jax(copied)
+    if is_host(jax_device):
+        return tensor.to("cpu", torch.int32, copy=True).numpy()
+    return to_jax(tensor.to(torch.int32, copy=True))
+
+
+def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """Copy an array to a device; the host does not wait."""
+    tensor = torch.from_numpy(array)
+    return tensor if is_host(device) else tensor.pin_memory().to(device, non_blocking=True)
 
 
 def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.Device]:

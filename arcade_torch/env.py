@@ -1,34 +1,42 @@
 """``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from arcade_torch import border, specs
-from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, CompiledGame, Step
-from arcade_torch.dlpack import int32_argument, pick_devices, to_torch
-from arcade_torch.endings import FinalStates
+from arcade_torch import validation
+from arcade_torch.compiled import (
+    EPISODE_REWARD,
+    REWARD,
+    STEP_COUNT,
+    TERMINATED,
+    CompiledGame,
+    FinalObservations,
+    Step,
+    check_process,
+)
+from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, upload
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
-from arcade_torch.envs_jax.batch import Batch, Outcome, choose_rows, env_keys
+from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.snapshot import Snapshots
+from arcade_torch.specs import make_specs
 
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
 
 
 class RawStep(NamedTuple):
-    """One fused step before any export: only the frames are a tensor, the rest is still as JAX made it."""
+    """One fused step, and the two tensors that are exported of it."""
 
     pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
-    step: Step  # everything else
-    any_done: bool  # whether some episode ended
+    numbers: torch.Tensor  # float32 [N, 5], see ``Step.numbers``
+    step: Step  # everything, as JAX made it
 
 
 class ArcadeEnv(EnvBase):
@@ -45,6 +53,9 @@ class ArcadeEnv(EnvBase):
 
     ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
     give equal bits, whatever N, and whichever path is taken.
+
+    Threads may each step envs of their own at the same time; one env belongs to one thread at a time. Other processes
+    have to be spawned: in one that was forked after JAX had started, an env refuses to be made.
 
     Args:
         game: A game, several as ``MixedGames``, or a compiled one (whose functions are then shared).
@@ -79,38 +90,33 @@ class ArcadeEnv(EnvBase):
         task_in_td: bool | None = None,
         debug: bool = False,
     ) -> None:
-        border.check_num_envs(num_envs)
+        check_process()
+        validation.check_num_envs(num_envs)
         flags_given = (categorical_actions, state_in_td, task_in_td, debug)
-        border.check_flags("categorical_actions state_in_td task_in_td debug", flags_given)
+        validation.check_flags("categorical_actions state_in_td task_in_td debug", flags_given)
         flags = partial_flags(observability, num_envs)
         torch_device, jax_device = pick_devices(device)
         super().__init__(device=torch_device, batch_size=[num_envs])
         self._compiled = game if isinstance(game, CompiledGame) else CompiledGame(game)
         self._batched = self._compiled.batched
         self._jax_device = jax_device
-        self._check_actions = debug or torch_device.type == "cpu"
+        self._check_actions = debug or is_host(torch_device)
         self.one_hot = not categorical_actions
         self._state_in_td = state_in_td
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         keys = jax.device_put(env_keys(0, num_envs), jax_device)
-        self._live = _Live(self._batched.init(keys, jax.device_put(flags.numpy(), jax_device)))
-        self._final_states = self.final_states()
+        self._live = _Live(self._batched.init(keys, jax.device_put(flags, jax_device)))
+        self._finals = self.final_observations(1)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
-        self._make_specs(categorical_actions)
-        self._set_seed(seed)
-
-    def _make_specs(self, categorical_actions: bool) -> None:
-        num_envs, actions = self.num_envs, self.game.num_actions
-        self.action_spec = specs.action_spec(num_envs, actions, categorical_actions, self.device)
         tasks = len(self.games) if self.task_in_td else 0
-        observation = specs.observation_spec(num_envs, self.game.obs_size, actions, tasks, self.device)
-        if self._state_in_td:
+        made = make_specs(num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device)
+        self.action_spec, observation, self.reward_spec, self.done_spec = made
+        if state_in_td:
             observation["state"] = self._snapshots.spec()
-            self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=self.device)
+            self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=torch_device)
         self.observation_spec = observation
-        self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=self.device)
-        self.done_spec = specs.done_spec(num_envs, self.device)
+        self._set_seed(seed)
 
     @property
     def game(self) -> Game[Any] | Mixture:
@@ -150,8 +156,9 @@ class ArcadeEnv(EnvBase):
             TypeError: Not a word and not a bool tensor.
         """
         flags = partial_flags(observability, self.num_envs)
-        partial = jax.device_put(flags.numpy(), self._jax_device)
-        self._live.replace(self._live.batch._replace(partial=partial))
+        partial = jax.device_put(flags, self._jax_device)
+        self._live.batch = self._live.batch._replace(partial=partial)
+        self._live.view += 1
 
     def get_state(self) -> TensorDict:
         """Copy everything that determines the future: game states, random keys, observability, counts.
@@ -186,9 +193,9 @@ class ArcadeEnv(EnvBase):
         return self._root(batch, to_torch(self._batched.render(batch), self.device))
 
     @property
-    def generation(self) -> int:
-        """Grows whenever the state changes by anything but ``step_raw``, whose caller has the frames that follow."""
-        return self._live.generation
+    def generation(self) -> tuple[int, int]:
+        """Changes of the state (steps, resets, loads) and of the observability, so that a collector notices others'."""
+        return self._live.generation, self._live.view
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``."""
@@ -201,12 +208,12 @@ class ArcadeEnv(EnvBase):
 
     # -- the fast path ----------------------------------------------------------------------------------------------
 
-    def step_raw(self, action: torch.Tensor, meanwhile: Callable[[], object] | None = None) -> RawStep:
+    def step_raw(self, action: torch.Tensor, while_computing: Callable[[], object] | None = None) -> RawStep:
         """Step, begin anew where an episode ended, and draw once: one compiled call and no tensordict.
 
         Args:
             action: Integers [N] in 0..4 (one-hot [N, 5] with ``categorical_actions=False``). Not read after the return.
-            meanwhile: Called while JAX computes, for work that needs no result of this step.
+            while_computing: Called while JAX computes, for work that needs no result of this step.
 
         Returns:
             The step; export from it what is needed.
@@ -215,22 +222,34 @@ class ArcadeEnv(EnvBase):
             TypeError: Actions that are not integers.
             ValueError: Actions of a wrong shape or out of range.
         """
-        argument = int32_argument(self._check_action(action))
+        argument = int32_argument(self._check_action(action), self._jax_device)
         step = self._compiled.step(self._live.batch, argument)
-        if meanwhile is not None:
-            meanwhile()
-        frames = to_torch(step.pixels, self.device)  # waits; the argument must live until here
-        any_done = bool(np.asarray(step.outcome.done).any())
-        self._live.batch = step.root
-        return RawStep(frames, step, any_done)
+        if while_computing is not None:
+            while_computing()
+        frames = to_torch(step.pixels, self.device)  # on the CPU it waits; the argument must live until here
+        self._live.replace(step.root)
+        return RawStep(frames, to_torch(step.numbers, self.device), step)
 
-    def final_states(self) -> FinalStates:
-        """Something to keep the final states of ended episodes in, which draws them when asked."""
-        return FinalStates(self._compiled, self.num_envs, self.device)
+    def root_numbers(self, raw: RawStep, keys: Collection[str]) -> dict[str, torch.Tensor]:
+        """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if asked for."""
+        numbers, out = raw.numbers, {}
+        done = numbers[:, TERMINATED:].any(-1, keepdim=True)
+        if "is_init" in keys:
+            out["is_init"] = done
+        if "step_count" in keys:
+            out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
+        if "episode_reward" in keys:
+            out["episode_reward"] = numbers[:, EPISODE_REWARD, None].masked_fill(done, 0)
+        return out
+
+    def final_observations(self, max_steps: int) -> FinalObservations:
+        """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
+        return FinalObservations(self._compiled, self.num_envs, max_steps)
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
-        border.check_tensor(action, "action")
+        if not isinstance(action, torch.Tensor) or action.layout is not torch.strided:
+            validation.check_tensor(action, "action")
         num_actions, shape = self.game.num_actions, (self.num_envs,)
         if self.one_hot:
             if action.shape != (*shape, num_actions):
@@ -250,7 +269,9 @@ class ArcadeEnv(EnvBase):
     # -- TorchRL's methods ------------------------------------------------------------------------------------------
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
-        border.check_tensordict(tensordict, self.num_envs)
+        plain = isinstance(tensordict, TensorDictBase) and tensordict.batch_size == self.batch_size
+        if not plain or "next" in tensordict or "_step" in tensordict:
+            validation.check_tensordict(tensordict, self.num_envs)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
@@ -260,24 +281,23 @@ class ArcadeEnv(EnvBase):
         # A mask that is true everywhere is no special case: other random numbers would be drawn than on the fused path.
         rows = np.ones(self.num_envs, np.bool_)
         if tensordict is not None and "_reset" in tensordict:
-            rows = border.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
+            rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         batch, pixels = self._batched.reset_render(self._live.batch, rows)
         root = self._root(batch, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
-            border.check_merge(tensordict, root)
+            validation.check_merge(tensordict, root)
         self._live.replace(batch)
         return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._load_state_of(tensordict)
-        action = self._check_action(border.tensor(tensordict, "action"))
-        argument, before = int32_argument(action), self._live.batch
-        stepped, outcome, pixels = self._batched.step_render(before, argument)
+        if self._state_in_td:  # go on from the state the caller handed over
+            self._live.replace(self._snapshots.load(tensordict.get("state", None)))
+        action = self._check_action(validation.tensor(tensordict, "action"))
+        argument, before = int32_argument(action, self._jax_device), self._live.batch
+        stepped, pixels, numbers = self._compiled.step_only(before, argument)
         frames = to_torch(pixels, self.device)
         self._live.replace(stepped)
-        step_count = to_torch(stepped.step_count, self.device).to(torch.int64)
-        episode_reward = to_torch(stepped.episode_reward, self.device).clone()
-        following = self._next(frames, action, step_count, episode_reward, outcome)
+        following = self._next(frames, action, to_torch(numbers, self.device))
         if self._state_in_td:
             following["state"] = self._snapshots.export(stepped)
         if "_step" in tensordict:
@@ -286,9 +306,9 @@ class ArcadeEnv(EnvBase):
 
     def _only_marked(self, tensordict: TensorDictBase, before: Batch, following: TensorDict) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
-        marked, stepped = border.mask(tensordict, "_step", self.num_envs), self._live.batch
+        marked, stepped = validation.mask(tensordict, "_step", self.num_envs), self._live.batch
         self._live.replace(before)  # where it stays if the next line refuses
-        border.check_merge(tensordict, following)
+        validation.check_merge(tensordict, following)
         rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before)))
         self._live.replace(self._batched.narrow(rows))
         left_alone = following.apply(torch.zeros_like)
@@ -302,25 +322,26 @@ class ArcadeEnv(EnvBase):
         if self._state_in_td or "_step" in tensordict or self._post_step_mdp_hooks is not None:
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
             return stock
-        action = border.tensor(tensordict, "action")
+        action = tensordict.get("action", None)
+        if not isinstance(action, torch.Tensor):
+            validation.tensor(tensordict, "action")
         raw = self.step_raw(action)
-        self._live.generation += 1
         last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
-        frames = raw.pixels
-        if raw.any_done:
-            self._final_states.add(0, np.flatnonzero(raw.step.outcome.done), raw.step)
+        frames, done = raw.pixels, (raw.numbers[:, TERMINATED:] > 0).any(1).cpu().numpy()
+        if done.any():
+            self._finals.add(0, raw.step)
             frames = raw.pixels.clone()
-            for _, rows, final in self._final_states.draw():
-                frames[rows] = final
-        numbers = to_torch(raw.step.numbers, self.device)
-        step_count, episode_reward = numbers[:, STEP_COUNT].to(torch.int64), numbers[:, EPISODE_REWARD]
-        following = self._next(frames, last_action, step_count, episode_reward, raw.step.outcome)
+            for rows, _, final in self._finals.draw(done[:, None]):
+                frames[upload(rows, self.device)] = to_torch(final, self.device)[: len(rows)]
+        following = self._next(frames, last_action, raw.numbers)
         preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
         if preset is not None:
             following.update(preset.exclude(*following.keys(True, True)))
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
-        for key, value in self._root(raw.step.root, raw.pixels).items():
+        counts = self.root_numbers(raw, ("is_init", "step_count", "episode_reward"))
+        ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+        for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
             root.set(key, value)  # not update(), which would write into the nested state that root and next share
         return tensordict, root
 
@@ -334,67 +355,45 @@ class ArcadeEnv(EnvBase):
 
     # -- exports ----------------------------------------------------------------------------------------------------
 
-    def _load_state_of(self, tensordict: TensorDictBase) -> None:
-        """With ``state_in_td``, go on from the state the caller handed over."""
-        if self._state_in_td:
-            self._live.replace(self._snapshots.load(tensordict.get("state", None)))
-
     def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""
-        num_envs = self.num_envs
         step_count = to_torch(batch.step_count, self.device).to(torch.int64).unsqueeze(-1)
-        flags = torch.zeros(3, num_envs, 1, dtype=torch.bool, device=self.device)
-        root = {
-            "pixels": frames,
-            "last_action": to_torch(batch.last_action, self.device).to(torch.int64),
-            "is_init": step_count == 0,
-            "step_count": step_count,
-            "episode_reward": to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1),
-            "done": flags[0],
-            "terminated": flags[1],
-            "truncated": flags[2],
-        }
-        if self.task_in_td:
-            root["task"] = self.task
+        episode_reward = to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1)
+        counts = {"is_init": step_count == 0, "step_count": step_count, "episode_reward": episode_reward}
+        ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+        root = self._entries(frames, to_torch(batch.last_action, self.device), counts, ends)
         if self._state_in_td:
             root["state"] = self._snapshots.export(batch)
         return TensorDict(root, batch_size=self.batch_size, device=self.device)
 
-    def _next(
-        self,
-        frames: torch.Tensor,
-        action: torch.Tensor,
-        step_count: torch.Tensor,
-        episode_reward: torch.Tensor,
-        outcome: Outcome,
-    ) -> TensorDict:
-        """The ``"next"`` tensordict. Frames, reward and flags are zero copy, since JAX never reads them again."""
-        following = {
-            "pixels": frames,
-            "last_action": action.to(torch.int64, copy=True),
-            "is_init": torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device),
-            "step_count": step_count.unsqueeze(-1),
-            "episode_reward": episode_reward.unsqueeze(-1),
-            "reward": to_torch(outcome.reward, self.device).unsqueeze(-1),
-            "done": to_torch(outcome.done, self.device).unsqueeze(-1),
-            "terminated": to_torch(outcome.terminated, self.device).unsqueeze(-1),
-            "truncated": to_torch(outcome.truncated, self.device).unsqueeze(-1),
-        }
-        if self.task_in_td:
-            following["task"] = self.task
+    def _next(self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor) -> TensorDict:
+        """The ``"next"`` tensordict. Frames and numbers are zero copy, since JAX never reads them again."""
+        is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        step_count, episode_reward = numbers[:, STEP_COUNT, None].to(torch.int64), numbers[:, EPISODE_REWARD, None]
+        counts = {"is_init": is_init, "step_count": step_count, "episode_reward": episode_reward}
+        following = self._entries(frames, action, counts, numbers[:, TERMINATED:] > 0)
+        following["reward"] = numbers[:, REWARD, None]
         return TensorDict(following, batch_size=self.batch_size, device=self.device)
+
+    def _entries(
+        self, frames: torch.Tensor, action: torch.Tensor, counts: dict[str, torch.Tensor], ends: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """The entries that root and ``"next"`` have in common; ``ends`` is bool [N, 2]: terminated, truncated."""
+        entries = {"pixels": frames, "last_action": action.to(torch.int64, copy=True), **counts}
+        entries |= {"done": ends.any(-1, keepdim=True), "terminated": ends[:, :1], "truncated": ends[:, 1:]}
+        return {**entries, "task": self.task} if self.task_in_td else entries
 
 
 class _Live:
     """The state of the env, outside of ``nn.Module``, whose attribute assignment is slow."""
 
-    __slots__ = ("batch", "generation")
+    __slots__ = ("batch", "generation", "view")
 
     def __init__(self, batch: Batch) -> None:
         self.batch = batch
-        self.generation = 0
+        self.generation = self.view = 0
 
     def replace(self, batch: Batch) -> None:
-        """Put another state in place, which the caller of ``step_raw`` has no frames of."""
+        """Put another state in place."""
         self.batch = batch
         self.generation += 1

@@ -5,10 +5,10 @@ from typing import Any
 
 import torch
 
-from arcade_torch.border import check_num_envs
 from arcade_torch.compiled import compiled_game
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.observability import Observability, resolve_observability
+from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.validation import check_num_envs
 
 
 def make(
@@ -65,7 +65,7 @@ def make(
         tensor([0, 0, 0, 1, 1])
     """
     check_num_envs(num_envs)
-    flags = resolve_observability(observability, partial_obs, num_envs)
+    flags = partial_flags(observability, num_envs, partial_obs)
     return ArcadeEnv(
         compiled_game(id, obs_size, rules, options),
         num_envs,

@@ -1,7 +1,7 @@
-"""What acts in a collector: our ``Actor`` protocol, TorchRL modules behind it, and a random player."""
+"""A TorchRL policy inside the collector: what it reads, the recurrent state it carries, what is stored of it."""
 
-from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -9,126 +9,51 @@ from torch import nn
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
-Extras = dict[NestedKey, torch.Tensor]
+Policy = Callable[[TensorDictBase], TensorDictBase]
 ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward", "task")  # task: if there are several
 
 
-@runtime_checkable
-class Actor(Protocol):
-    """Something that acts on a batch of envs and owns no state: the recurrent state goes in and comes out.
-
-    An actor may have an attribute ``obs_keys``, the root keys that it reads; the collector saves itself the others.
-    """
-
-    def initial_state(self, batch_size: int) -> TensorDict:
-        """The recurrent state before the first step: TensorDict [batch_size]."""
-        ...
-
-    def act(self, obs: TensorDict, state: TensorDict) -> tuple[torch.Tensor, Extras, TensorDict]:
-        """Choose actions.
-
-        Args:
-            obs: TensorDict [N], the root: pixels, last_action, is_init, step_count, episode_reward, and task where
-                several games are played. Where ``is_init`` is true the actor has to begin from a fresh state.
-            state: TensorDict [N], the state that the last call returned. Not to be changed in place.
-
-        Returns:
-            Actions int64 [N], further tensors [N, ...] worth storing, and the state after this step.
-        """
-        ...
-
-
-class RandomActor:
-    """Uniformly random actions, from a generator of its own.
+class PolicyRunner:
+    """Runs a policy, and carries what it writes under ``"next"`` to the root of the following step.
 
     Args:
-        num_actions: Number of actions.
-        generator: Where the random numbers come from.
-    """
-
-    obs_keys: tuple[str, ...] = ()
-
-    def __init__(self, num_actions: int, generator: torch.Generator) -> None:
-        self._num_actions = num_actions
-        self._generator = generator
-
-    def initial_state(self, batch_size: int) -> TensorDict:
-        """No state."""
-        return TensorDict({}, batch_size=[batch_size])
-
-    def act(self, obs: TensorDict, state: TensorDict) -> tuple[torch.Tensor, Extras, TensorDict]:
-        """Draw actions; see ``Actor``."""
-        return self.draw(obs.batch_size[0]), {}, state
-
-    def draw(self, num_envs: int) -> torch.Tensor:
-        """Actions int64 [num_envs]."""
-        return torch.randint(self._num_actions, (num_envs,), generator=self._generator, device=self._generator.device)
-
-
-class ModuleActor:
-    """A TorchRL policy as an ``Actor``.
-
-    What the policy writes under ``"next"`` is carried to the root of the following step; at the start of an episode it
-    is put back to the value of the policy's primer (zero, as a rule), as ``TensorDictPrimer`` does. Everything else
-    that the policy writes beside the action is stored, and so are the carried entries unless ``store_states`` is off.
-
-    Args:
-        policy: Reads root keys, writes ``action`` and, if it is recurrent, ``("next", <state key>)``.
-        store_states: Whether the carried entries are stored for every step, as TorchRL's losses and samplers expect.
+        policy: Reads root keys, writes ``action`` and, if recurrent, ``("next", <state key>)``; None writes nothing.
+        batch_size: N.
         device: Device of the state.
+        store: Keys to store (a prefix stands for all below it); None for everything the policy writes.
+        store_states: Whether the recurrent state of every step may be stored.
     """
 
     def __init__(
-        self, policy: Callable[[TensorDictBase], TensorDictBase], store_states: bool, device: torch.device | None
+        self,
+        policy: Policy | None,
+        batch_size: int,
+        device: torch.device,
+        store: Iterable[NestedKey] | None,
+        store_states: bool,
     ) -> None:
-        self._policy = policy
+        self._policy, self._size, self._device = policy, [batch_size], device
+        self._store = None if store is None else [_path(key) for key in store]
         self._store_states = store_states
-        self._device = device
-        self._first: TensorDict | None = None
-        reads = getattr(policy, "in_keys", ROOT_KEYS)
-        self.obs_keys = tuple(key for key in ROOT_KEYS if key in reads or key == "is_init")
+        reads = () if policy is None else getattr(policy, "in_keys", ROOT_KEYS)
+        self.reads = tuple(key for key in ROOT_KEYS if key in reads or key == "is_init")
+        # A module that reads is_init begins anew by itself. Stored states show what it begins with.
+        self._sets_initial = store_states or "is_init" not in reads
+        self._initial = TensorDict({}, batch_size=self._size, device=device)
 
-    def initial_state(self, batch_size: int) -> TensorDict:
-        """Values of the policy's primers, TensorDict [batch_size].
+    def initial_state(self) -> TensorDict:
+        """Values of the policy's primers, TensorDict [N].
 
         Raises:
             KeyError: The policy carries an entry from step to step for which it has no primer.
         """
-        state = TensorDict({}, batch_size=[batch_size], device=self._device)
+        state = TensorDict({}, batch_size=self._size, device=self._device)
         for primer in _primers(self._policy):
             for key, spec in primer.primers.items(True, True):
                 default = primer.default_value.get(key, 0.0) if hasattr(primer.default_value, "get") else 0.0
                 shape = spec.shape[len(primer.primers.shape) :]
-                zeros = torch.zeros((batch_size, *shape), dtype=spec.dtype, device=self._device)
+                zeros = torch.zeros((*self._size, *shape), dtype=spec.dtype, device=self._device)
                 state[key] = (zeros + (default() if callable(default) else default)).to(spec.dtype)
-        self._check_primed(state)
-        self._first = state
-        return state.clone()
-
-    def act(self, obs: TensorDict, state: TensorDict) -> tuple[torch.Tensor, Extras, TensorDict]:
-        """Run the policy; see ``Actor``."""
-        is_init = obs["is_init"].squeeze(-1)
-        if len(state.keys()) and bool(is_init.any()):
-            state = self._begin_anew(state, is_init)
-        td = TensorDict({**dict(obs.items()), **dict(state.items())}, batch_size=obs.batch_size, device=self._device)
-        td = self._policy(td)
-        following = td.get("next", None)
-        carried = TensorDict({}, batch_size=obs.batch_size, device=self._device)
-        extras: Extras = {}
-        for key in [] if following is None else list(following.keys(True, True)):
-            carried[key] = following[key]
-            if self._store_states:
-                extras["next", *(key if isinstance(key, tuple) else (key,))] = following[key]
-        for key in td.keys(True, True):
-            first = key[0] if isinstance(key, tuple) else key
-            if first not in ROOT_KEYS and first not in ("action", "next"):
-                is_state = key in state.keys(True, True)
-                if self._store_states or not is_state:
-                    extras[key] = td[key]
-        return td["action"], extras, carried
-
-    def _check_primed(self, state: TensorDict) -> None:
-        """Refuse a policy that carries what nobody can start."""
         written = [unravel_key(key) for key in getattr(self._policy, "out_keys", [])]
         for key in getattr(self._policy, "in_keys", []):
             if unravel_key(("next", key)) in written and key not in state.keys(True, True):
@@ -136,23 +61,61 @@ class ModuleActor:
                     f"the policy reads {key!r} and writes it for the next step, but has no primer that says how it "
                     f"begins: give the module a method make_tensordict_primer()"
                 )
+        self._initial = state
+        return state.clone()
 
-    def _begin_anew(self, state: TensorDict, is_init: torch.Tensor) -> TensorDict:
-        """Put the initial state where an episode begins."""
-        fresh = TensorDict({}, batch_size=state.batch_size, device=self._device)
-        for key in state.keys(True, True):
-            value = state[key]
-            first = self._first.get(key, None) if self._first is not None else None
-            mask = is_init.reshape(is_init.shape + (1,) * (value.ndim - 1))
-            fresh[key] = torch.where(mask, torch.zeros_like(value) if first is None else first, value)
-        return fresh
+    def begin_anew(self, state: TensorDict, is_init: torch.Tensor) -> TensorDict:
+        """The state with the primers' values where ``is_init`` (bool [N, 1]) is true; a new TensorDict."""
+        out = TensorDict({}, batch_size=self._size, device=self._device)
+        for key, value in state.items(True, True):
+            first = self._initial.get(key, None)
+            mask = is_init.reshape(-1, *(1,) * (value.ndim - 1))
+            out[key] = value if first is None else torch.where(mask, first, value)
+        return out
+
+    def __call__(
+        self, obs: dict[str, torch.Tensor], state: TensorDict
+    ) -> tuple[torch.Tensor | None, dict[NestedKey, torch.Tensor], TensorDict]:
+        """Run one step from root entries and the state that the last call returned.
+
+        Returns:
+            Actions int64 [N] (None without a policy), the entries to store [N, ...], the state after this step.
+        """
+        if self._policy is None:
+            return None, {}, state
+        if self._sets_initial and len(state.keys()):
+            state = self.begin_anew(state, obs["is_init"])
+        entries = {key: obs[key] for key in self.reads if key in obs}  # the same at every step: graphs hold one layout
+        td = TensorDict(entries | dict(state.items()), batch_size=self._size, device=self._device)
+        td = self._policy(td)
+        carried = TensorDict({}, batch_size=self._size, device=self._device)
+        stored: dict[NestedKey, torch.Tensor] = {}
+        states = set(map(_path, state.keys(True, True)))
+        for key, value in td.items(True, True):
+            path = _path(key)
+            if path[0] == "next":
+                carried[path[1:]] = value
+            is_state = path[0] == "next" or path in states
+            if path[0] not in (*ROOT_KEYS, "action") and self._keeps(path, is_state):
+                stored[key] = value
+        return td["action"], stored, carried
+
+    def _keeps(self, path: tuple[str, ...], is_state: bool) -> bool:
+        """Whether an entry is stored."""
+        if is_state and not self._store_states:
+            return False
+        return self._store is None or any(path[: len(prefix)] == prefix for prefix in self._store)
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    """A key as a tuple."""
+    return (key,) if isinstance(key, str) else key
 
 
 def _primers(policy: Any) -> list[TensorDictPrimer]:
-    """The primers of all modules inside a policy."""
-    if not isinstance(policy, nn.Module):
-        return []
-    found = get_primers_from_module(policy, warn=False)
+    """The primers of all modules inside a policy; ``CudaGraphModule`` is no module itself, but holds one."""
+    module = policy if isinstance(policy, nn.Module) else getattr(policy, "module", None)
+    found = get_primers_from_module(module, warn=False) if isinstance(module, nn.Module) else None
     if found is None:
         return []
     return [found] if isinstance(found, TensorDictPrimer) else list(found)

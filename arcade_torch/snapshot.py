@@ -13,11 +13,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
-from arcade_torch.border import check_tensor
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched
+from arcade_torch.validation import check_tensor
 
 _SIGNED = {np.dtype(np.uint32): torch.int32, np.dtype(np.uint16): torch.int16}
 
@@ -49,14 +49,7 @@ def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
 
 
 class Snapshots:
-    """Turns batches of one game, or of a mixture of games, into TensorDicts and back.
-
-    Args:
-        batched: What is played.
-        batch: Any batch of it; fixes names, shapes and types.
-        device: Device of the tensors.
-        jax_device: Device of the arrays.
-    """
+    """Turns batches of one game, or of a mixture of games, into TensorDicts and back; ``batch`` is any one of them."""
 
     def __init__(self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device) -> None:
         leaves, self._tree = jax.tree_util.tree_flatten_with_path(jax.eval_shape(batched.wide, batch))
@@ -73,9 +66,6 @@ class Snapshots:
     def export(self, batch: Batch) -> TensorDict:
         """Copy a batch out of JAX.
 
-        Args:
-            batch: The batch.
-
         Returns:
             TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own; in a mixture under the id of
             each game, and zero in the envs that play another), ``partial`` bool [N], ``last_action`` and
@@ -90,13 +80,7 @@ class Snapshots:
         return out
 
     def load(self, td: TensorDictBase) -> Batch:
-        """Copy a snapshot into JAX.
-
-        Args:
-            td: What ``export`` gave, here or for another env of the same game and number of envs.
-
-        Returns:
-            The batch.
+        """Copy into JAX what ``export`` gave, here or for another env of the same game and number of envs.
 
         Raises:
             ValueError: Another game, another number of envs, or leaves that are missing, or of another shape or type.

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-from arcade_torch.gym_ids import register_games
+from arcade_torch.gym import register_games
 
 ID = "arcade_torch/SignpostEasy-v0"
 register_games(["SignpostEasy-v0"])  # a probe; the games of the benchmark are registered by `import arcade_torch`

@@ -1,23 +1,26 @@
 """Laws of the collector: the same data as TorchRL's, every frame once, sequences that replay, resuming to the bit."""
 
-import copy
+import itertools
 import re
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import TransformedEnv
+from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import TensorDictPrimer, TransformedEnv
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.frames import FramePool, next_pixels, shift_next
-from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED
+from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, StubGame
 
 N, T = 6, 8
+HASTY = CompiledGame(StubGame(risk=0.15, max_steps=3))  # both kinds of end, several in a row
 
 
 def stub_env(game: CompiledGame = GAME, seed: int = 3, **options: Any) -> ArcadeEnv:
@@ -36,17 +39,22 @@ def scripted(td: TensorDictBase) -> TensorDictBase:
     return td
 
 
-class Recurrent:
-    """A deterministic actor with a memory: a leaky sum of what it saw, forgotten at the start of an episode."""
+class Recurrent(nn.Module):
+    """A deterministic policy with a memory: a leaky sum of what it saw, forgotten at the start of an episode."""
 
-    def initial_state(self, batch_size: int) -> TensorDict:
-        return TensorDict({"sum": torch.full((batch_size, 1), 0.5)}, [batch_size])
+    in_keys = ("pixels", "last_action", "is_init", ("memory", "sum"))
+    out_keys = ("action", "total", ("next", "memory", "sum"))
 
-    def act(self, obs: TensorDict, state: TensorDict) -> tuple[torch.Tensor, dict[str, torch.Tensor], TensorDict]:
-        seen = obs["pixels"].flatten(1).float().sum(-1, keepdim=True) / 1000 + obs["last_action"].unsqueeze(-1)
-        total = torch.where(obs["is_init"], 0.0, state["sum"]) / 2 + seen
-        action = (total.squeeze(-1) * 7).long() % 5
-        return action, {"total": total}, TensorDict({"sum": total}, state.batch_size)
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        spec = Composite({"memory": Composite({"sum": Unbounded((1,))})})
+        return TensorDictPrimer(spec, default_value={"memory": {"sum": 0.5}})
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        seen = td["pixels"].flatten(1).float().sum(-1, keepdim=True) / 1000 + td["last_action"].unsqueeze(-1)
+        total = torch.where(td["is_init"], 0.5, td["memory", "sum"]) / 2 + seen
+        td["action"] = (total.squeeze(-1) * 7).long() % 5
+        td["total"] = td["next", "memory", "sum"] = total
+        return td
 
 
 def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
@@ -57,11 +65,10 @@ def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
     assert not different, different
 
 
-def tensors(batch: TensorDictBase) -> TensorDictBase:
-    """A copy of a batch of sequences, with the true next frames in place of the pool."""
-    out = batch.exclude("next_pool", ("next", "frame_slot")).clone()
-    out["next", "pixels"] = next_pixels(batch)
-    return out
+def steps(batch: TensorDictBase) -> TensorDictBase:
+    """The entries of sequences that have an axis of time, as a batch [N, L]."""
+    keys = [key for key in batch.keys(True, True) if key[0] != "initial_state" and not str(key).startswith("final_")]
+    return batch.select(*keys).clone().auto_batch_size_(2)
 
 
 # -- the same data as TorchRL's ---------------------------------------------------------------------------------------
@@ -80,131 +87,147 @@ def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: Com
     assert_same(ours.exclude("collector"), rollout)
 
 
-def test_compact_batches_lack_only_the_next_frames_and_can_have_them_back() -> None:
-    full = list(stub_collector(scripted, total_frames=3 * N * T, return_same_td=False))
-    compact = list(stub_collector(scripted, total_frames=3 * N * T, return_same_td=False, compact_obs=True))
+def test_compact_batches_lack_only_the_next_frames() -> None:
+    full = list(stub_collector(scripted, total_frames=3 * N * T))
+    compact = list(stub_collector(scripted, total_frames=3 * N * T, compact_obs=True))
     for one, two in zip(full, compact, strict=True):
-        assert ("next", "pixels") not in two.keys(True)
-        assert torch.equal(next_pixels(two), one["next", "pixels"])
-        assert_same(one.exclude(("next", "pixels")), two.exclude("next_pool", ("next", "frame_slot")))
+        assert_same(one.exclude(("next", "pixels")), two)
 
 
+@pytest.mark.parametrize("overlap", [0, 4])
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
-def test_sequences_hold_the_data_of_a_rollout(game: CompiledGame) -> None:
-    rollout = stub_env(game).rollout(10 * T, scripted, break_when_any_done=False)
-    collector = stub_collector(scripted, game)
-    windows = torch.cat([tensors(collector.collect()).auto_batch_size_(2) for _ in range(10)], 1)
-    keys = [key for key in windows.keys(True, True) if key[0] != "initial_state"]
-    assert len(keys) > 12
-    assert_same(windows.select(*keys), rollout.select(*keys))
+def test_sequences_hold_the_data_of_a_rollout(game: CompiledGame, overlap: int) -> None:
+    rollout = stub_env(game).rollout(10 * T + overlap, scripted, break_when_any_done=False)
+    collector = stub_collector(scripted, game, overlap=overlap)
+    for window in range(10):
+        found = steps(collector.collect())
+        assert len(list(found.keys(True, True))) == 14 if game is not MIXED else 15
+        assert_same(found, rollout[:, window * T : (window + 1) * T + overlap].select(*found.keys(True, True)))
 
 
-# -- the next frames --------------------------------------------------------------------------------------------------
+# -- the observations that follow a step ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["all", "truncated", "none"])
-def test_final_frames_are_kept_as_asked(mode: str) -> None:
-    collector, reference = stub_collector(scripted, final_frames=mode), stub_collector(scripted)
-    slots_seen = 0
-    for _ in range(20):
-        batch, full = tensors_and_slots(collector), tensors(reference.collect())
-        terminated, truncated = (full["next", key].squeeze(-1) for key in ("terminated", "truncated"))
-        wanted = {"all": terminated | truncated, "truncated": truncated & ~terminated}.get(mode, truncated & False)
-        slots = batch["slot"].squeeze(-1)
-        assert torch.equal(slots[:, :-1] >= 0, wanted[:, :-1])
-        assert (slots[:, -1] >= 0).all()
-        true = wanted | ~(terminated | truncated)
-        assert torch.equal(batch["next", "pixels"][true], full["next", "pixels"][true])
-        replaced = ~true
-        replaced[:, -1] = False
-        follower = batch["pixels"].roll(-1, 1)
-        assert torch.equal(batch["next", "pixels"][replaced], follower[replaced])
-        slots_seen += int((slots[:, :-1] >= 0).sum())
-    assert (slots_seen > 0) == (mode != "none")
+def dense_next_pixels(batch: TensorDictBase) -> torch.Tensor:
+    """Dense next observations from a batch of sequences with final_pixels, as its description has it."""
+    dense = torch.cat([batch["pixels"][:, 1:], batch["pixels"][:, :1] * 0], 1)
+    for row, place in batch["final_mask"].nonzero().tolist():
+        dense[row, batch["final_index"][row, place]] = batch["final_pixels"][row, place]
+    return dense
 
 
-def tensors_and_slots(collector: ArcadeCollector) -> TensorDictBase:
-    batch = collector.collect()
-    return tensors(batch).set("slot", batch["next", "frame_slot"].clone())
+def small(pixels: torch.Tensor) -> torch.Tensor:
+    return pixels[..., ::2, ::4, :] + 1
 
 
-def test_selected_rows_keep_their_next_frames() -> None:
-    batch = stub_collector(scripted, LOCKSTEP).collect()
-    rows = torch.tensor([4, 0, 2])
-    assert torch.equal(next_pixels(batch[rows]), next_pixels(batch)[rows])
-    assert torch.equal(next_pixels(batch[1:3]), next_pixels(batch)[1:3])
+@pytest.mark.parametrize("compress", [None, small])
+@pytest.mark.parametrize("overlap", [0, 4, T + 3])
+@pytest.mark.parametrize("game", [GAME, LOCKSTEP, HASTY, MIXED])
+@pytest.mark.parametrize("mode", ["truncated", "none"])
+def test_next_observations_of_sequences_are_those_of_a_rollout(
+    game: CompiledGame, overlap: int, mode: Any, compress: Any
+) -> None:
+    """Terminations, truncations, several truncations a row (LOCKSTEP: every 5 steps, HASTY: every 3)."""
+    rollout = stub_env(game).rollout(8 * T + overlap, scripted_small, break_when_any_done=False)
+    collector = stub_collector(scripted_small, game, overlap=overlap, final_frames=mode, compress=compress)
+    limit, length = min(game.game.max_steps for game in game.batched.groups), T + overlap
+    places = 1 + -(-(length - 1) // limit) if mode == "truncated" else 1
+    used = 0
+    for window in range(8):
+        batch = collector.collect()
+        path = rollout[:, window * T : window * T + length]
+        terminated, truncated, done = (path["next", key].squeeze(-1) for key in ("terminated", "truncated", "done"))
+        index, mask = batch["final_index"], batch["final_mask"]
+        assert batch["final_pixels"].shape[:2] == index.shape == mask.shape == (N, places)
+        assert index.dtype is torch.int64 and mask.dtype is torch.bool
+        assert (index[~mask] == length - 1).all()
+        wanted = truncated & ~terminated if mode == "truncated" else torch.zeros_like(done)
+        wanted[:, -1] = ~terminated[:, -1] if mode == "truncated" else ~done[:, -1]
+        for row in range(N):
+            assert index[row][mask[row]].tolist() == wanted[row].nonzero().flatten().tolist()
+        expected = path["next", "pixels"] if compress is None else compress(path["next", "pixels"])
+        known = wanted | ~done
+        assert torch.equal(dense_next_pixels(batch)[known], expected[known])
+        used = max(used, int(mask.sum(1).max()))
+    assert used == places or game in (GAME, MIXED)
 
 
-def test_a_batch_without_successors_is_refused() -> None:
-    with pytest.raises(ValueError, match="the last step of the batch has no successor"):
-        shift_next(torch.zeros(1, 2), torch.zeros(1), torch.tensor([[[0], [-1]]]))
-    with pytest.raises(KeyError, match="the batch has no 'next_pool'"):
-        next_pixels(TensorDict({"pixels": torch.zeros(1, 2)}, [1]))
+def scripted_small(td: TensorDictBase) -> TensorDictBase:
+    """A deterministic policy that reads nothing that compression changes."""
+    return td.set("action", (3 * td["step_count"].squeeze(-1) + td["last_action"]) % 5)
 
 
-def test_gradients_reach_both_the_window_and_the_pool() -> None:
-    current, pool = torch.randn(2, 3, 4, requires_grad=True), torch.randn(3, 4, requires_grad=True)
-    slot = torch.tensor([[-1, 2, 0], [-1, -1, 1]]).unsqueeze(-1)
-    shift_next(current, pool, slot).sum().backward()
-    assert current.grad is not None and pool.grad is not None
-    assert current.grad[..., 0].tolist() == [[0, 1, 0], [0, 1, 1]]
-    assert pool.grad[:, 0].tolist() == [1, 1, 1]
+def test_a_game_that_truncates_before_its_time_limit_is_named() -> None:
+    class Impatient(StubGame):
+        def step(self, key: Any, state: Any, action: Any) -> Any:
+            following, reward, terminated, _ = super().step(key, state, action)
+            return following, reward, terminated, following.clock.count >= 2
+
+    compiled = CompiledGame(Impatient(risk=0.0))
+    with pytest.raises(RuntimeError, match="truncated an episode before its max_steps"):
+        stub_collector(scripted, compiled, final_frames="truncated").collect()
+    assert stub_collector(scripted, compiled).collect()["next", "truncated"].any()
 
 
-def test_a_pool_grows_and_keeps_what_it_holds() -> None:
-    pool = FramePool(torch.Size([2]), 1)
-    first = pool.append(torch.tensor([[1, 2]], dtype=torch.uint8))
-    second = pool.append(torch.tensor([[3, 4], [5, 6]], dtype=torch.uint8))
-    assert first.tolist() == [0] and second.tolist() == [1, 2]
-    assert pool.pixels.tolist() == [[1, 2], [3, 4], [5, 6]]
-    copied = copy.deepcopy(pool)
-    pool.resize(1)
-    assert len(pool) == 1 and len(copied) == 3
+@pytest.mark.parametrize("mode", ["all", "truncated"])
+def test_a_replay_buffer_of_torchrl_stores_sequences_and_gives_them_back(mode: Any) -> None:
+    collector = stub_collector(Recurrent(), LOCKSTEP, final_frames=mode, overlap=2)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2 * N), batch_size=N)
+    batches = [collector.collect() for _ in range(2)]
+    for batch in batches:
+        buffer.extend(batch)
+    assert len(buffer) == 2 * N
+    for number, batch in enumerate(batches):
+        found = buffer[number * N : (number + 1) * N]
+        assert ("initial_state", "memory", "sum") in found.keys(True)
+        assert_same(found.exclude("index"), batch)
+    assert buffer.sample()["pixels"].shape[:2] == (N, T + 2)
 
 
-# -- recurrent state and context --------------------------------------------------------------------------------------
+# -- recurrent state and overlap --------------------------------------------------------------------------------------
 
 
 def replay(batch: TensorDictBase) -> torch.Tensor:
     """Act again over a batch of sequences, from its initial state; returns the extras."""
-    actor, state = Recurrent(), batch["initial_state"]
+    policy, state = Recurrent(), batch["initial_state"]
     totals = []
     for time in range(batch["action"].shape[1]):
-        obs = TensorDict({key: batch[key][:, time] for key in ("pixels", "last_action", "is_init")}, batch.batch_size)
-        action, extras, state = actor.act(obs, state)
-        assert torch.equal(action, batch["action"][:, time])
-        totals.append(extras["total"])
+        root = {key: batch[key][:, time] for key in ("pixels", "last_action", "is_init")}
+        td = policy(TensorDict({**root, **dict(state.items())}, batch.batch_size))
+        assert torch.equal(td["action"], batch["action"][:, time])
+        totals.append(td["total"])
+        state = td["next"]
     return torch.stack(totals, 1)
 
 
-@pytest.mark.parametrize("context", [0, 3, T, T + 3, 3 * T])
+@pytest.mark.parametrize("overlap", [0, 3, T, T + 3, 3 * T])
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP])
-def test_sequences_replay_from_their_initial_state_and_begin_with_the_context(game: CompiledGame, context: int) -> None:
-    collector = stub_collector(Recurrent(), game, context=context)
+def test_sequences_replay_from_their_initial_state_and_begin_with_the_overlap(game: CompiledGame, overlap: int) -> None:
+    collector = stub_collector(Recurrent(), game, overlap=overlap)
     before = None
     for _ in range(6):
         batch = collector.collect()
-        assert batch["pixels"].shape[:2] == (N, context + T)
+        assert batch["pixels"].shape[:2] == (N, overlap + T)
         assert torch.equal(replay(batch), batch["total"])
-        now = tensors(batch).exclude("initial_state").auto_batch_size_(2)
-        if before is not None and context:
-            assert_same(now[:, :context], before[:, -context:])
+        now = steps(batch)
+        if before is not None and overlap:
+            assert_same(now[:, :overlap], before[:, -overlap:])
         before = now
 
 
-def test_the_context_holds_the_same_path_as_windows_without_context() -> None:
+def test_the_overlap_holds_the_same_path_as_windows_without_overlap() -> None:
     plain = stub_collector(Recurrent())
-    path = torch.cat([tensors(plain.collect()).exclude("initial_state").auto_batch_size_(2) for _ in range(6)], 1)
-    collector = stub_collector(Recurrent(), context=3)
+    path = torch.cat([steps(plain.collect()) for _ in range(6)], 1)
+    collector = stub_collector(Recurrent(), overlap=3)
     for window in range(4):
-        now = tensors(collector.collect()).exclude("initial_state").auto_batch_size_(2)
+        now = steps(collector.collect())
         assert_same(now, path[:, window * T : window * T + T + 3])
     assert collector.frames == 4 * N * T
 
 
-def test_iteration_with_a_context_gives_only_the_new_steps() -> None:
+def test_iteration_with_a_overlap_gives_only_the_new_steps() -> None:
     plain = torch.cat(list(stub_collector(scripted, total_frames=5 * N * T, return_same_td=False)), 1)
-    batches = stub_collector(scripted, context=3, total_frames=4 * N * T, return_same_td=False)
+    batches = stub_collector(scripted, overlap=3, total_frames=4 * N * T, return_same_td=False)
     ours = torch.cat(list(batches), 1).exclude("collector")
     assert_same(ours, plain[:, 3 : 3 + 4 * T].exclude("collector"))
 
@@ -212,24 +235,61 @@ def test_iteration_with_a_context_gives_only_the_new_steps() -> None:
 # -- storage ----------------------------------------------------------------------------------------------------------
 
 
-def test_storage_is_reused_unless_copies_are_asked_for() -> None:
+@pytest.mark.parametrize("overlap", [0, 3])
+def test_batches_are_the_callers_own_unless_storage_is_to_be_reused(overlap: int) -> None:
+    """TorchRL's default: ``list(collector)`` holds different batches."""
+    options: dict[str, Any] = {"overlap": overlap, "final_frames": "truncated"}
+    collector = stub_collector(Recurrent(), LOCKSTEP, **options)
+    batches = [collector.collect() for _ in range(3)]
+    reusing = stub_collector(Recurrent(), LOCKSTEP, return_same_td=True, **options)
+    pointers = set()
+    for batch in batches:
+        again = reusing.collect()
+        assert_same(batch.exclude("final_pixels"), again.exclude("final_pixels"))
+        assert torch.equal(batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]])
+        pointers.add(again["pixels"].data_ptr())
+    assert len(pointers) == 1
+    frames = [batch["pixels"].sum() for batch in stub_collector(scripted, total_frames=3 * N * T)]
+    assert [batch["pixels"].sum() for batch in list(stub_collector(scripted, total_frames=3 * N * T))] == frames
+
+
+def test_memory_that_nobody_holds_any_more_is_used_again() -> None:
     collector = stub_collector(scripted)
-    first, second = collector.collect(), collector.collect()
-    assert first["pixels"].data_ptr() == second["pixels"].data_ptr()
-    collector = stub_collector(scripted, return_same_td=False)
-    first = collector.collect()
-    kept = tensors(first)
+    pointers = [batch["pixels"].data_ptr() for batch in (collector.collect() for _ in range(6))]
+    assert len(set(pointers)) == 2  # the loop holds a batch while the next one is collected
+    held = [collector.collect()["pixels"][0, 0].numpy() for _ in range(4)]  # any view keeps the memory
+    frames = [frame.copy() for frame in held]
     collector.collect()
-    assert_same(tensors(first), kept)
+    assert all((one == two).all() for one, two in zip(held, frames, strict=True))
 
 
-def test_a_frame_is_stored_once_and_the_pool_stays_small() -> None:
-    collector = stub_collector(scripted, LOCKSTEP)
-    for _ in range(20):
-        batch = collector.collect()
-    ends_a_window = N * 2
+def test_a_frame_is_stored_once() -> None:
+    batch = stub_collector(scripted, LOCKSTEP, final_frames="truncated").collect()
     assert batch["pixels"].untyped_storage().nbytes() == N * T * 8 * 8 * 3
-    assert batch["next_pool"]._buffer.shape[0] <= 2 * (N + ends_a_window)
+    assert batch["final_pixels"].untyped_storage().nbytes() == N * 3 * 8 * 8 * 3
+    assert ("next", "pixels") not in batch.keys(True)
+
+
+def test_only_what_is_asked_for_is_stored() -> None:
+    standard = set(stub_collector(None).collect().keys(True, True))
+
+    def stored(**options: Any) -> set[Any]:
+        batch = stub_collector(Recurrent(), **options).collect()
+        return set(batch.keys(True, True)) - standard - {("initial_state", "memory", "sum")}
+
+    state = {("memory", "sum"), ("next", "memory", "sum")}
+    assert stored() == {"total"} | state
+    assert stored(store_states=False) == {"total"}
+    assert stored(store=[]) == set()
+    assert stored(store=["total"]) == {"total"}
+    assert stored(store=["memory", ("next", "memory")]) == state
+
+
+def test_the_stored_state_at_a_start_is_the_primers() -> None:
+    batch = stub_collector(Recurrent(), LOCKSTEP).collect()
+    starts = batch["is_init"].squeeze(-1)
+    assert (batch["memory", "sum"][starts] == 0.5).all() and not (batch["memory", "sum"][~starts] == 0.5).any()
+    assert (batch["initial_state", "memory", "sum"] == 0.5).all()
 
 
 def test_what_is_stored_of_a_frame_is_what_the_policy_saw() -> None:
@@ -239,15 +299,12 @@ def test_what_is_stored_of_a_frame_is_what_the_policy_saw() -> None:
         seen.append(td["pixels"].clone())
         return td.set("action", torch.arange(N) % 5)
 
-    def compress(pixels: torch.Tensor) -> torch.Tensor:
-        return pixels[..., ::2, ::4, :] + 1
-
-    batch = tensors(stub_collector(policy, compress=compress).collect())
-    full = tensors(stub_collector(policy).collect())
+    batch = stub_collector(policy, compress=small).collect()
+    full = stub_collector(policy).collect()
     assert batch["pixels"].shape == (N, T, 4, 2, 3)
     assert torch.equal(batch["pixels"], torch.stack(seen[:T], 1))
     for key in ("pixels", ("next", "pixels")):
-        assert torch.equal(batch[key], compress(full[key]))
+        assert torch.equal(batch[key], small(full[key]))
 
 
 # -- control ----------------------------------------------------------------------------------------------------------
@@ -258,24 +315,24 @@ def resumed(collector: ArcadeCollector, other: ArcadeCollector, path: Any) -> No
     other.load_state_dict(torch.load(path, weights_only=True))
 
 
-@pytest.mark.parametrize(("game", "context"), [(GAME, 0), (GAME, 3), (GAME, T + 3), (MIXED, 3)])
+@pytest.mark.parametrize(("game", "overlap"), [(GAME, 0), (GAME, 3), (GAME, T + 3), (MIXED, 3)])
 @pytest.mark.parametrize("policy", [Recurrent, lambda: None, lambda: scripted])
-def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, game: CompiledGame, context: int, tmp_path: Any) -> None:
-    collector = stub_collector(policy(), game, context=context, init_random_frames=N * T)
+def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, game: CompiledGame, overlap: int, tmp_path: Any) -> None:
+    collector = stub_collector(policy(), game, overlap=overlap, init_random_frames=N * T)
     for _ in range(3):
         collector.collect()
-    other = stub_collector(policy(), game, seed=77, context=context, init_random_frames=N * T)
+    other = stub_collector(policy(), game, seed=77, overlap=overlap, init_random_frames=N * T)
     other.collect()
     resumed(collector, other, tmp_path / "collector.pt")
     assert other.frames == collector.frames
     for _ in range(3):
-        assert_same(tensors(other.collect()), tensors(collector.collect()))
+        assert_same(other.collect(), collector.collect())
 
 
 def test_a_collector_that_has_not_begun_can_be_resumed(tmp_path: Any) -> None:
     collector, other = stub_collector(None, seed=1), stub_collector(None, seed=2)
     resumed(collector, other, tmp_path / "collector.pt")
-    assert_same(tensors(other.collect()), tensors(collector.collect()))
+    assert_same(other.collect(), collector.collect())
 
 
 def test_resumed_iteration_counts_trajectories_and_frames_on(tmp_path: Any) -> None:
@@ -293,12 +350,12 @@ def test_resumed_iteration_counts_trajectories_and_frames_on(tmp_path: Any) -> N
 def test_seeding_starts_over_and_repeats() -> None:
     collector = stub_collector(None)
     collector.set_seed(5)
-    first = tensors(collector.collect())
+    first = collector.collect()
     collector.collect()
     collector.set_seed(5)
-    assert_same(tensors(collector.collect()), first)
+    assert_same(collector.collect(), first)
     other = ArcadeCollector(stub_env(seed=8), None, N * T, seed=5)
-    assert_same(tensors(other.collect()), first)
+    assert_same(other.collect(), first)
 
 
 def test_iteration_ends_after_total_frames() -> None:
@@ -313,6 +370,18 @@ def test_random_frames_come_first_and_the_env_took_them() -> None:
     first, second, third = (collector.collect()["action"].clone() for _ in range(3))
     assert first.unique().numel() == second.unique().numel() == 5
     assert (third == 4).all()
+
+
+def test_a_random_window_is_random_and_the_policy_runs_for_its_state() -> None:
+    collector, again = stub_collector(Recurrent(), seed=3), stub_collector(Recurrent(), seed=3)
+    warm_up = collector.collect(random=True)
+    assert warm_up["action"].unique().numel() == 5
+    seen = warm_up["pixels"][:, 0].flatten(1).float().sum(-1, keepdim=True) / 1000
+    assert torch.equal(warm_up["total"][:, 0], 0.25 + seen)  # the first last_action is 0
+    acted = collector.collect()
+    assert torch.equal(replay(acted), acted["total"])
+    again._generator.set_state(torch.Generator().manual_seed(1).get_state())
+    assert not torch.equal(again.collect(random=True)["action"], warm_up["action"])
 
 
 def test_the_policy_explores_while_collecting() -> None:
@@ -335,14 +404,52 @@ def test_a_change_of_observability_between_windows_is_seen_at_once() -> None:
     assert (batch["pixels"][:, :, 1:4] == 0).all()  # the stub's partial frames hide the serial number
 
 
-def test_an_env_that_was_stepped_in_between_is_looked_at_again() -> None:
-    collector = stub_collector(scripted)
-    collector.collect()
-    collector.env.rollout(3)
-    expected = collector.env.observe()
+def rollout_of(env: ArcadeEnv) -> None:
+    env.rollout(3)
+
+
+def reset_some(env: ArcadeEnv) -> None:
+    env.reset(TensorDict({"_reset": torch.arange(N) % 2 == 0}, [N]))
+
+
+def step_raw(env: ArcadeEnv) -> None:
+    env.step_raw(torch.zeros(N, dtype=torch.int64))
+
+
+def load(env: ArcadeEnv) -> None:
+    env.set_state(stub_env(seed=12).get_state())
+
+
+def another_collector(env: ArcadeEnv) -> None:
+    ArcadeCollector(env, scripted, N * 2, seed=None).collect()
+
+
+@pytest.mark.parametrize("overlap", [0, 3])
+@pytest.mark.parametrize("interfere", [rollout_of, reset_some, step_raw, load, another_collector])
+def test_what_others_did_to_the_env_leaks_into_no_window(interfere: Callable[[ArcadeEnv], None], overlap: int) -> None:
+    """The overlap is dropped, the policy's state begins anew, episode numbers go on."""
+    collector = stub_collector(Recurrent(), overlap=overlap)
+    before = collector.collect()
+    interfere(collector.env)
+    state = collector.env.get_state()
     batch = collector.collect()
-    assert torch.equal(batch["pixels"][:, 0], expected["pixels"])
-    assert torch.equal(batch["step_count"][:, 0], expected["step_count"])
+    expected = stub_collector(Recurrent(), overlap=overlap)
+    expected.collect()
+    expected.env.set_state(state)
+    assert_same(batch, expected.collect())
+    assert torch.equal(replay(batch), batch["total"]) and not torch.equal(before["pixels"], batch["pixels"])
+    inside, done = batch["is_init"][:, 1:], batch["next", "done"][:, :-1]
+    assert torch.equal(inside, done)
+
+
+def test_two_collectors_that_take_turns_on_one_env_both_go_on_from_where_it_is() -> None:
+    env = stub_env()
+    collectors = [ArcadeCollector(env, scripted, N * T) for _ in range(2)]
+    path = [collectors[window % 2].collect() for window in range(6)]
+    for one, two in itertools.pairwise(path[1:]):  # the second collector began with a reset
+        going_on = ~one["next", "done"][:, -1, 0]
+        assert torch.equal(two["pixels"][:, 0][going_on], one["next", "pixels"][:, -1][going_on])
+        assert torch.equal(two["step_count"][:, 0][going_on], one["next", "step_count"][:, -1][going_on])
 
 
 def test_hooks_are_called_and_statistics_counted() -> None:
@@ -369,7 +476,7 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
     [
         ({"frames_per_batch": 7}, ValueError, "frames_per_batch is 7, expected a multiple of num_envs (6)"),
         ({"frames_per_batch": 0}, ValueError, "frames_per_batch is 0, expected a multiple"),
-        ({"context": -1}, ValueError, "context is -1, expected 0 or more"),
+        ({"overlap": -1}, ValueError, "overlap is -1, expected 0 or more"),
         ({"final_frames": "some"}, ValueError, "final_frames is 'some', allowed: 'all', 'truncated', 'none'"),
         ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
     ],
@@ -388,5 +495,5 @@ def test_wrong_envs_are_explained() -> None:
 
 def test_a_state_of_other_sizes_is_refused() -> None:
     state = stub_collector(scripted).state_dict()
-    with pytest.raises(ValueError, match=re.escape("(envs, steps, context) [6, 8, 0], this one has [6, 8, 2]")):
-        stub_collector(scripted, context=2).load_state_dict(state)
+    with pytest.raises(ValueError, match=re.escape("(envs, steps, overlap) [6, 8, 0], this one has [6, 8, 2]")):
+        stub_collector(scripted, overlap=2).load_state_dict(state)

@@ -56,7 +56,7 @@ def test_what_jax_would_copy_in_silence_is_refused(tensor: torch.Tensor, error: 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.int32])
 def test_the_argument_of_a_compiled_function_is_a_private_copy(dtype: torch.dtype) -> None:
     action = torch.arange(5, dtype=dtype)
-    argument = dlpack.int32_argument(action)
+    argument = dlpack.int32_argument(action, jax.devices("cpu")[0])
     action.zero_()
     assert argument.dtype == "int32"
     assert argument.tolist() == [0, 1, 2, 3, 4]

@@ -109,18 +109,26 @@ def test_last_action_is_the_action_that_led_here_also_over_an_end() -> None:
 
 
 @pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
-def test_frames_rewards_and_flags_are_the_memory_that_jax_wrote(
-    monkeypatch: pytest.MonkeyPatch, game: CompiledGame
-) -> None:
+def test_frames_and_rewards_are_the_memory_that_jax_wrote(monkeypatch: pytest.MonkeyPatch, game: CompiledGame) -> None:
     env = stub_env(game)
     written = []
     compiled = env._compiled.step
     monkeypatch.setattr(env._compiled, "step", lambda *args: written.append(compiled(*args)) or written[-1])
     td, following = env.step_and_maybe_reset(scripted(env.reset()))
-    pixels, outcome = written[0].pixels, written[0].outcome
+    pixels, numbers = written[0].pixels, written[0].numbers
     assert td["next", "pixels"].data_ptr() == following["pixels"].data_ptr() == pixels.unsafe_buffer_pointer()
-    for key in ("reward", "done", "terminated", "truncated"):
-        assert td["next", key].data_ptr() == getattr(outcome, key).unsafe_buffer_pointer(), key
+    assert td["next", "reward"].data_ptr() == numbers.unsafe_buffer_pointer()
+
+
+@pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
+def test_a_second_env_compiles_nothing_also_at_ends(game: CompiledGame) -> None:
+    def compiled() -> list[int]:
+        return [function._cache_size() for function in (game.step, *game.draw_rows)]
+
+    stub_env(game).rollout(20, scripted, break_when_any_done=False)
+    before = compiled()
+    stub_env(game).rollout(20, scripted, break_when_any_done=False)
+    assert compiled() == before and min(before) > 0
 
 
 @pytest.mark.parametrize("game", [GAME, MIXED])

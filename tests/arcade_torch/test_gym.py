@@ -12,9 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import arcade_torch
-from arcade_torch.gym_env import ArcadeGymEnv
-from arcade_torch.gym_ids import BENCHMARK_IDS
-from arcade_torch.gym_vector import ArcadeVectorEnv
+from arcade_torch.gym import BENCHMARK_IDS
+from arcade_torch.gym.env import ArcadeGymEnv
+from arcade_torch.gym.vector import ArcadeVectorEnv
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "arcade_torch/MineSweeperEasy-v0"  # both ways to end: a mine, and 32 steps

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
@@ -25,9 +25,11 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from torchrl.trainers.algorithms import PPOTrainer
 
+from arcade_torch.agents import PPOLoss, PQNLoss, make_actor, make_policy
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.models import MemoryModule, make_memory, memory_names
+from arcade_torch.models import ActorCriticNetwork, MemoryModule, MemoryNetwork, make_memory, memory_names
+from tests.agents.fakes import Stream, lambda_return, look_into, play
 from tests.arcade_torch.stub import GAME
 
 N, T, WINDOWS, SLICE = 6, 16, 2, 4
@@ -170,3 +172,93 @@ def test_gae_in_recurrent_mode_gives_the_values_that_were_acted(name: str) -> No
         torch.testing.assert_close(found["state_value"], acted, **CLOSE)
         torch.testing.assert_close(found["advantage"], expected, **CLOSE)
     collector.shutdown()
+
+
+# -- our networks and losses ------------------------------------------------------------------------------------------
+
+
+class Frames(nn.Module):
+    """An encoder of the stub's frames."""
+
+    obs_size, feature_size, amp = 8, 8, False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Flatten(-3), nn.Linear(192, 8), nn.Tanh())
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        out: torch.Tensor = self.layers(pixels.float() / 255)
+        return out
+
+
+OVERLAP, Q, LOGITS = 4, ("action_value", "memory"), ("logits", ("memory", "actor"))
+
+
+def make_memory_network(name: str, outputs: int, key: str, state: str | tuple[str, ...]) -> MemoryNetwork:
+    head = nn.Linear(8, outputs)
+    return MemoryNetwork(Frames(), make_memory(name, 13, 8), head, out_key=key, state_key=state)  # type: ignore[arg-type]
+
+
+def window(policy: TensorDictSequential, path: str) -> TensorDictBase:
+    """The last of some windows, in mid-episode; all four paths from the env to the loss."""
+    torch.manual_seed(2)
+    env = ArcadeEnv(GAME, N, seed=2)
+    if path == "Collector":
+        primer = get_primers_from_module(policy, warn=False)
+        primed = env if primer is None else TransformedEnv(env, primer)
+        *_, batch = Collector(primed, policy, frames_per_batch=N * T, total_frames=WINDOWS * N * T)
+        return batch
+    if path == "iterated":
+        *_, batch = ArcadeCollector(env, policy, N * T, WINDOWS * N * T)
+        return batch
+    collector = ArcadeCollector(env, policy, N * T, overlap=OVERLAP, final_frames=path)  # type: ignore[arg-type]
+    for _ in range(WINDOWS):
+        batch = collector.collect()
+    return batch
+
+
+paths = pytest.mark.parametrize("path", ["truncated", "all", "iterated", "Collector"])
+
+
+@paths
+def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_frames(name: str, path: str) -> None:
+    torch.manual_seed(1)
+    network = make_memory_network(name, 5, *Q)
+    policy = make_policy(network, epsilon=0.5)
+    batch = window(policy, path)
+    done = batch["next", "done"].squeeze(-1)
+    assert done[:, :-1].any() and not done[:, :-1].any(0).all() and batch["action_value"].std() > 1e-3
+    loss = PQNLoss(network)
+    q, target, after = look_into(loss, batch)
+    torch.testing.assert_close(q, batch["action_value"].detach(), **CLOSE)
+    dense = batch["next", "pixels"] if path != "truncated" else window(policy, "all")["next", "pixels"]
+    first = batch.get("initial_state", None)
+    if first is None:
+        stored = [(key, batch[key][:, 0]) for key in network.state_keys]
+    else:
+        stored = [(key, first[key]) for key in network.state_keys]
+    state = TensorDict({}, [N])
+    for key, value in stored:
+        state[key] = value
+    fields = {key: batch[key] for key in ("pixels", "action", "last_action")}
+    flags = {key: batch["next", key].squeeze(-1) for key in ("reward", "terminated", "truncated")}
+    s = Stream(**fields, **flags, is_init=batch["is_init"].squeeze(-1), final=dense, state=state)
+    wanted = play(network, s)[1].amax(-1)  # one step of one row at a time
+    kept = ~s.terminated
+    torch.testing.assert_close(after[kept], wanted[kept], **CLOSE)
+    expected = lambda_return(s.reward, wanted, s.terminated, s.truncated, 0.99, 0.95)
+    torch.testing.assert_close(target, expected, rtol=1e-5, atol=1e-4)
+
+
+@paths
+def test_the_loss_of_ppo_reads_the_policy_and_the_values_that_were_acted(name: str, path: str) -> None:
+    torch.manual_seed(1)
+    critic = make_memory_network(name, 1, "state_value", ("memory", "critic"))
+    network = ActorCriticNetwork(make_memory_network(name, 5, *LOGITS), critic)
+    batch = window(make_policy(network), path)
+    acted = batch["state_value"].detach().clone()
+    loss = PPOLoss(make_actor(network.actor), network.critic)
+    batch = loss.value_estimator(batch.exclude("state_value"))
+    out = loss(batch)
+    assert out["clip_fraction"] == 0 and float(out["kl_approx"]) < 1e-8 and acted.std() > 1e-3
+    torch.testing.assert_close(batch["state_value"], acted, **CLOSE)

@@ -56,7 +56,7 @@ def test_a_recurrent_policy_gives_the_data_of_torchrls_collector_with_a_primer()
     stock = Collector(
         primed, policy, frames_per_batch=N * T, total_frames=4 * N * T, auto_register_policy_transforms=False
     )
-    ours = ArcadeCollector(stub_env(seed=2), policy, N * T, 4 * N * T, return_same_td=False)
+    ours = ArcadeCollector(stub_env(seed=2), policy, N * T, 4 * N * T)
     one, two = torch.cat(list(stock), 1), torch.cat(list(ours), 1)
     assert one["next", "done"].sum() > 10
     assert_same(two, one)
@@ -88,13 +88,13 @@ def test_a_module_without_its_primer_is_explained() -> None:
 
 
 def test_a_resumed_recurrent_policy_goes_on_to_the_bit(tmp_path: Any) -> None:
-    one = ArcadeCollector(stub_env(seed=2), recurrent_policy(), N * T, 4 * N * T, return_same_td=False)
+    one = ArcadeCollector(stub_env(seed=2), recurrent_policy(), N * T, 4 * N * T)
     batches = iter(one)
     next(batches), next(batches)
     torch.save(one.state_dict(), tmp_path / "collector.pt")
     other_policy = recurrent_policy()
     nn.init.zeros_(other_policy[2].module.weight)
-    two = ArcadeCollector(stub_env(seed=5), other_policy, N * T, 4 * N * T, return_same_td=False)
+    two = ArcadeCollector(stub_env(seed=5), other_policy, N * T, 4 * N * T)
     two.load_state_dict(torch.load(tmp_path / "collector.pt", weights_only=True))
     for ours, theirs in zip(two, batches, strict=True):
         assert_same(ours, theirs)

@@ -7,14 +7,7 @@ import numpy.typing as npt
 
 
 class Window:
-    """One window of pygame; opened by the first frame.
-
-    Args:
-        scale: Width and height of a frame's pixel on the screen.
-
-    Raises:
-        ImportError: pygame is not installed; says how to get it.
-    """
+    """One window of pygame, opened by the first frame; ``scale`` is the side of a frame's pixel on the screen."""
 
     def __init__(self, scale: int = 1) -> None:
         try:
@@ -27,12 +20,7 @@ class Window:
         self._clock: Any = None
 
     def show(self, frame: npt.NDArray[np.uint8], title: str) -> None:
-        """Show a frame.
-
-        Args:
-            frame: uint8 [H, W, 3].
-            title: Text in the window's title bar.
-        """
+        """Show a frame, uint8 [H, W, 3], under a title."""
         pygame = self.pygame
         height, width = (side * self._scale for side in frame.shape[:2])
         if self._screen is None:

@@ -5,23 +5,20 @@ Loads no torch. Every array that is handed out is the caller's own.
 
 import functools
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.compiled import CompiledGame
+from arcade_torch.compiled import CompiledGame, FinalObservations, check_process
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
 
 Bools = npt.NDArray[np.bool_]
 Frames = npt.NDArray[np.uint8]
-Observability = Literal["full", "partial"] | npt.ArrayLike
 Info = dict[str, Any]
-
-_ALLOWED = "allowed: 'full', 'partial', or for a vector environment one bool an env (True = partial)"
 
 
 class Stepped(NamedTuple):
@@ -31,43 +28,6 @@ class Stepped(NamedTuple):
     terminated: Bools  # [N]
     truncated: Bools  # [N]
     info: Info  # episode_reward float64 [N], step_count int64 [N]
-
-
-def partial_flags(observability: Observability | None, partial_obs: bool | None, num_envs: int) -> Bools:
-    """Turn what a user may write into one flag an env.
-
-    Args:
-        observability: ``"full"``, ``"partial"``, or bool [num_envs], true = partial; None if not given.
-        partial_obs: The alias: true means ``"partial"``; None if not given.
-        num_envs: Number of envs.
-
-    Returns:
-        bool [num_envs], true where the env shows its POMDP twin. False everywhere if neither is given.
-
-    Raises:
-        ValueError: Both are given, or another word, type or shape.
-        TypeError: ``partial_obs`` is no bool.
-
-    Example:
-        >>> partial_flags("partial", None, 2)
-        array([ True,  True])
-    """
-    if partial_obs is not None:
-        if observability is not None:
-            raise ValueError(
-                "both observability and partial_obs are given: keep observability, partial_obs is its alias"
-            )
-        if not isinstance(partial_obs, bool):
-            raise TypeError(f"partial_obs is {partial_obs!r}, allowed: True, False")
-        return np.full(num_envs, partial_obs)
-    if observability is None or isinstance(observability, str):
-        if observability not in (None, "full", "partial"):
-            raise ValueError(f"observability is {observability!r}, {_ALLOWED}")
-        return np.full(num_envs, observability == "partial")
-    flags = np.array(observability)
-    if flags.dtype != np.bool_ or flags.shape != (num_envs,):
-        raise ValueError(f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}")
-    return flags
 
 
 def seed_keys(seed: int | Sequence[int], num_envs: int) -> jax.Array:
@@ -102,8 +62,9 @@ class NumpyBatch:
     """
 
     def __init__(self, compiled: CompiledGame, flags: Bools) -> None:
-        self._compiled = compiled
-        self._batched = compiled.batched
+        check_process()
+        self._compiled, self._batched = compiled, compiled.batched
+        self._finals = FinalObservations(compiled, len(flags), max_steps=1)
         self.num_envs = len(flags)
         # Nothing runs before the first reset, so its shape is all that is needed of a batch, and nothing is compiled.
         shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
@@ -178,20 +139,10 @@ class NumpyBatch:
         _, episode_reward, step_count, terminated, truncated = numbers.T
         info = {"episode_reward": episode_reward.astype(np.float64), "step_count": step_count.astype(np.int64)}
         stepped = Stepped(numbers[:, 0].astype(np.float64), terminated > 0, truncated > 0, info)
-        rows = np.flatnonzero(stepped.terminated | stepped.truncated)
-        return stepped, frames, rows, self._final_frames(step.final_state, rows)
-
-    def _final_frames(self, states: Any, rows: npt.NDArray[np.int64]) -> Frames:
-        """Draw some rows of the states before a reset, in portions of one size, so that one compiled shape serves."""
-        size = self.game.obs_size
-        out = np.empty((len(rows), size, size, 3), np.uint8)
-        portion = min(self.num_envs, max(4, self.num_envs // 8))
-        for first in range(0, len(rows), portion):
-            some = rows[first : first + portion]
-            index = np.pad(some, (0, portion - len(some)), mode="edge")
-            picked = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], (states, self._batch.partial))
-            out[first : first + len(some)] = np.asarray(self._compiled.draw(*picked))[: len(some)]
-        return out
+        ended = stepped.terminated | stepped.truncated
+        self._finals.add(0, step)
+        drawn = [np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])]
+        return stepped, frames, np.flatnonzero(ended), np.concatenate([frames[:0], *drawn])
 
 
 @functools.lru_cache(maxsize=64)

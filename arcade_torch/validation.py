@@ -1,4 +1,4 @@
-"""What ``ArcadeEnv`` refuses at its border: tensordicts and entries that it could not use, in one clear line each."""
+"""What ``ArcadeEnv`` refuses: arguments, tensordicts and entries that it could not use, in one clear line each."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,15 +13,7 @@ MOST_ENVS = 2**20
 
 
 def check_num_envs(num_envs: int) -> None:
-    """Refuse anything but a positive int that memory can hold.
-
-    Args:
-        num_envs: What arrived.
-
-    Raises:
-        TypeError: Not an int.
-        ValueError: Not positive, or above `MOST_ENVS`.
-    """
+    """Raise unless ``num_envs`` is an int from 1 to ``MOST_ENVS``."""
     if isinstance(num_envs, bool) or not isinstance(num_envs, int):
         raise TypeError(f"num_envs is {shown(num_envs)}, expected an int of 1 or more")
     if num_envs < 1:
@@ -31,31 +23,14 @@ def check_num_envs(num_envs: int) -> None:
 
 
 def check_flags(names: str, values: Sequence[bool | None]) -> None:
-    """Refuse options that are neither true nor false; None passes for ``task_in_td``, where it means "as is usual".
-
-    Args:
-        names: Of the options, separated by spaces.
-        values: What arrived, in the same order.
-
-    Raises:
-        TypeError: Something else.
-    """
+    """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also be None."""
     for name, value in zip(names.split(), values, strict=True):
         if not isinstance(value, bool) and not (value is None and name == "task_in_td"):
             raise TypeError(f"{name} is {shown(value)}, allowed: True, False")
 
 
 def check_tensordict(td: Any, num_envs: int) -> None:
-    """Refuse what ``step`` and ``reset`` cannot use.
-
-    Args:
-        td: What arrived.
-        num_envs: Number of envs.
-
-    Raises:
-        TypeError: Not a TensorDict, or its ``next`` or ``_step`` is of the wrong kind.
-        ValueError: Another batch size, or a ``_step`` of another shape or with nothing to do.
-    """
+    """Raise if ``step`` and ``reset`` cannot use a tensordict: its kind, batch size, ``next`` or ``_step``."""
     if not isinstance(td, TensorDictBase):
         raise TypeError(f"got a {type(td).__name__}, expected a TensorDict of batch size [{num_envs}]")
     if td.batch_size != (num_envs,):
@@ -70,16 +45,7 @@ def check_tensordict(td: Any, num_envs: int) -> None:
 
 
 def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
-    """An entry that has to be a plain tensor.
-
-    Args:
-        td: Where it stands.
-        key: Its name.
-
-    Raises:
-        ValueError: There is no such entry.
-        TypeError: It is no tensor, or a sparse one.
-    """
+    """The entry ``key``; raises if there is none, or it is no dense tensor."""
     value = td.get(key, None)
     if value is None:
         raise ValueError(f"the tensordict has no entry {key!r}; it has {', '.join(map(str, td.keys())) or 'none'}")
@@ -89,15 +55,7 @@ def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
 
 
 def check_tensor(value: Any, what: str) -> None:
-    """Refuse anything but a dense tensor.
-
-    Args:
-        value: What arrived.
-        what: Its name, for the message.
-
-    Raises:
-        TypeError: It is no tensor, or a sparse one.
-    """
+    """Raise TypeError unless ``value``, called ``what``, is a dense tensor."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
     if value.layout is not torch.strided:
@@ -105,16 +63,7 @@ def check_tensor(value: Any, what: str) -> None:
 
 
 def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
-    """Refuse entries that cannot stay where they are while other envs are reset or stepped.
-
-    Args:
-        td: What arrived, with the envs that are left alone.
-        root: What ``reset`` or ``step`` gives.
-
-    Raises:
-        ValueError: An entry is of another kind or shape than that of ``root``.
-        TypeError: A tensor is a sparse one.
-    """
+    """Raise if entries of ``td`` cannot stay where they are while other envs are reset or stepped, giving ``root``."""
     for key, kept in td.items(True, True):  # TorchRL merges all of them, also those that reset does not know
         if isinstance(kept, torch.Tensor):
             check_tensor(kept, f"entry {key!r}")
@@ -128,20 +77,7 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
 
 
 def mask(td: TensorDictBase, key: str, num_envs: int) -> torch.Tensor:
-    """An entry that marks envs.
-
-    Args:
-        td: Where it stands.
-        key: Its name, ``"_reset"`` or ``"_step"``.
-        num_envs: Number of envs.
-
-    Returns:
-        bool [num_envs].
-
-    Raises:
-        ValueError: There is none, or it has another shape.
-        TypeError: It is no bool tensor.
-    """
+    """The entry ``"_reset"`` or ``"_step"`` as bool [num_envs]; raises if it is something else."""
     value = tensor(td, key)
     if value.dtype is not torch.bool:
         raise TypeError(f"entry {key!r} has dtype {value.dtype}, expected torch.bool")

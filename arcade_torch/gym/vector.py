@@ -11,8 +11,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.gym_batch import Bools, Frames, Info, NumpyBatch, Observability, Stepped, partial_flags, seed_keys
-from arcade_torch.gym_env import RENDER_FPS, action_space, check_reset_options, observation_space
+from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, Stepped, seed_keys
+from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
+from arcade_torch.observability import Observability, partial_flags
 
 Rewards = npt.NDArray[np.float64]
 StepResult = tuple[Frames, Rewards, Bools, Bools, Info]
@@ -20,6 +21,8 @@ StepResult = tuple[Frames, Rewards, Bools, Bools, Info]
 
 class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
     """N envs of one game. Made by ``gymnasium.make_vec("arcade_torch/<id>", num_envs=N, ...)``.
+
+    ``vectorization_mode="async"`` would start a process an env; it needs ``vector_kwargs={"context": "spawn"}``.
 
     Observations are uint8 [N, S, S, 3]. Infos, and what happens at an end, follow ``gymnasium.vector.SyncVectorEnv``
     in all three auto-reset modes, to the bit; ``metadata["autoreset_mode"]`` says which one is in force:
@@ -82,7 +85,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         }
         self._mode = _mode(autoreset_mode)
         self._copy = copy
-        flags = partial_flags(observability, partial_obs, num_envs)
+        flags = partial_flags(observability, num_envs, partial_obs)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.single_action_space = action_space(self._batch.game.num_actions)
         self.single_observation_space = observation_space(obs_size)
@@ -93,7 +96,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
 
     def set_observability(self, observability: Observability) -> None:
         """Change which twins are shown, also in mid-episode; only the frames drawn from now on change."""
-        self._batch.set_partial(partial_flags(observability, None, self.num_envs))
+        self._batch.set_partial(partial_flags(observability, self.num_envs))
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None

@@ -8,8 +8,9 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.gym_batch import Frames, Info, NumpyBatch, Observability, partial_flags, seed_keys
-from arcade_torch.gym_window import Window
+from arcade_torch.gym.batch import Frames, Info, NumpyBatch, seed_keys
+from arcade_torch.gym.window import Window
+from arcade_torch.observability import Observability, partial_flags
 
 RENDER_FPS = 30
 _WINDOW_SIDE_PIXELS = 512
@@ -26,11 +27,7 @@ def observation_space(obs_size: int) -> Any:
 
 
 def check_reset_options(options: dict[str, Any] | None, allowed: tuple[str, ...]) -> dict[str, Any]:
-    """Refuse options of ``reset`` that nobody reads.
-
-    Raises:
-        ValueError: An unknown option; names those that are known.
-    """
+    """The options of ``reset``; raises ValueError if nobody reads one of them."""
     unknown = sorted(set(options or ()) - set(allowed))
     if unknown:
         raise ValueError(f"reset has no option {unknown[0]!r}, allowed: {', '.join(allowed)}")
@@ -82,7 +79,7 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}, allowed: None, 'human', 'rgb_array'")
-        flags = partial_flags(observability, partial_obs, 1)
+        flags = partial_flags(observability, 1, partial_obs)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.action_space = action_space(self._batch.game.num_actions)
         self.observation_space = observation_space(obs_size)
@@ -93,7 +90,7 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
 
     def set_observability(self, observability: Observability) -> None:
         """Change which twin is shown, also in mid-episode; only the frames drawn from now on change."""
-        self._batch.set_partial(partial_flags(observability, None, 1))
+        self._batch.set_partial(partial_flags(observability, 1))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frames, Info]:
         """Begin an episode.

@@ -1,0 +1,307 @@
+"""The storage of a collector: one window of L = overlap + T steps, every frame written once."""
+
+import weakref
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import NestedKey, TensorDict
+
+from arcade_torch.compiled import EPISODE_REWARD, NUM_NUMBERS, REWARD, STEP_COUNT, TERMINATED, TRUNCATED
+from arcade_torch.dlpack import is_host, upload
+
+FinalFrames = Literal["all", "truncated", "none"]
+
+_ROOT_COLUMNS: dict[str, torch.dtype] = {
+    "last_action": torch.int64,
+    "is_init": torch.bool,
+    "step_count": torch.int64,
+    "episode_reward": torch.float32,
+}
+
+
+class _Frames:
+    """Gives memory for frames, and gives it again once no tensor lies over it: new memory costs page faults."""
+
+    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
+        self._shape, self._device = shape, device
+        self._blocks: list[tuple[torch.Tensor, weakref.ref[Any]]] = []  # two at most: a batch, and the one before it
+
+    def take(self) -> torch.Tensor:
+        """uint8 of the shape, with any content."""
+        free = (block for block, user in self._blocks if user() is None)
+        block = next(free, None)
+        if block is None:
+            block = torch.empty(self._shape, dtype=torch.uint8, device=self._device)
+        if not is_host(self._device):
+            return block  # torch's allocator for GPUs keeps memory by itself
+        array = block.numpy()  # lives as long as the tensors made of it
+        self._blocks = [*[pair for pair in self._blocks if pair[0] is not block][-1:], (block, weakref.ref(array))]
+        return torch.from_numpy(array)
+
+
+class RolloutBuffer:
+    """The last L steps of N envs, and the observations that follow a step but do not stand at the next index.
+
+    With ``final_frames="all"`` the next observations are dense. Otherwise each env has K places for them: the last one
+    is for the observation after step L - 1, the others are for the truncations before it, in order of time.
+
+    Args:
+        num_envs: N.
+        overlap: Steps of the previous window that stand in front.
+        steps: T, new steps a window.
+        frame_shape: Of a stored frame.
+        device: Of the storage.
+        final_frames: See ``ArcadeCollector``.
+        max_steps: The shortest time limit of the games.
+        task: int64 [N], the game that each env plays, where there are several.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        overlap: int,
+        steps: int,
+        frame_shape: torch.Size,
+        device: torch.device,
+        final_frames: FinalFrames = "all",
+        max_steps: int = 1,
+        task: torch.Tensor | None = None,
+    ) -> None:
+        self.num_envs, self.overlap, self.steps, self.length = num_envs, overlap, steps, overlap + steps
+        self.device, self.final_frames, self._frame_shape = device, final_frames, frame_shape
+        self._new_pixels, self._new_dense = (_Frames((num_envs, self.length, *frame_shape), device) for _ in range(2))
+        # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step has its own place.
+        inside = -(-(self.length - 1) // max_steps) if final_frames == "truncated" else 0
+        self._places = 1 + inside
+        self._extra_shapes: dict[NestedKey, tuple[tuple[int, ...], torch.dtype]] = {}
+        self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
+        self._wanted = np.zeros((num_envs, self.length), np.bool_)  # whose final observation is kept
+        self._allocate()
+
+    def _allocate(self) -> None:
+        size, device = (self.num_envs, self.length), self.device
+        self.pixels = self._new_pixels.take()
+        self._action = torch.zeros(size, dtype=torch.int64, device=device)
+        self._numbers = torch.zeros((*size, NUM_NUMBERS), device=device)
+        self._root = {key: torch.zeros(size, dtype=dtype, device=device) for key, dtype in _ROOT_COLUMNS.items()}
+        self._extras = {
+            key: torch.zeros((*size, *shape), dtype=dtype, device=device)
+            for key, (shape, dtype) in self._extra_shapes.items()
+        }
+        self._dense: torch.Tensor | None = None  # the observation after every step, made when it is asked for
+        self._final = torch.zeros((self.num_envs, self._places, *self._frame_shape), dtype=torch.uint8, device=device)
+
+    @property
+    def done(self) -> torch.Tensor:
+        """bool [N, L], where an episode ended."""
+        return self._numbers[..., [TERMINATED, TRUNCATED]].any(-1)
+
+    # -- writing ----------------------------------------------------------------------------------------------------
+
+    def begin(self, carry: bool, reuse: bool) -> None:
+        """Make ready for new steps: move the overlap to the front (``carry``), take new storage unless ``reuse``."""
+        carry = carry and self.overlap > 0
+        before, final, wanted = self._buffers(), self._final, self._wanted
+        if not reuse:
+            self._allocate()
+        self._wanted = np.zeros_like(wanted)
+        if not carry:
+            return
+        if "dense" in before and self._dense is None:
+            self._dense = self._new_dense.take()
+        for key, target in self._buffers().items():
+            # Step by step when source and target overlap; upwards, so that nothing is overwritten before it is read.
+            portion = self.overlap if self.overlap <= self.steps else 1
+            for first in range(0, self.overlap, portion):
+                start = first + self.steps
+                target[:, first : first + portion] = before[key][:, start : start + portion]
+        self._wanted[:, : self.overlap] = wanted[:, self.steps :]
+        if self._places > 1:
+            rows, steps = np.nonzero(self._wanted)
+            now, then = self._place_of(self._wanted, rows, steps), self._place_of(wanted, rows, steps + self.steps)
+            row, to, source = (upload(index, self.device) for index in (rows, now, then))
+            self._final[row, to] = final[row, source]
+
+    def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
+        """Write what was seen and done: the only copy of the frames."""
+        self.pixels[:, step].copy_(frames)
+        _write(self._action, step, action)
+
+    def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
+        """Write what came of it, ``Step.numbers``."""
+        _write(self._numbers, step, numbers)
+
+    def write_extras(self, step: int, extras: Mapping[NestedKey, torch.Tensor]) -> None:
+        """Write what the policy wants stored; space is made at the first step."""
+        for key, value in extras.items():
+            if key not in self._extras:
+                self._add_extra(key, value.shape[1:], value.dtype)
+            self._extras[key][:, step] = value
+
+    def _add_extra(self, key: NestedKey, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+        self._extra_shapes[key] = tuple(shape), dtype
+        self._extras[key] = torch.zeros((self.num_envs, self.length, *shape), dtype=dtype, device=self.device)
+
+    def finish(self, first: int, root: Mapping[str, torch.Tensor], last: torch.Tensor, dense: bool) -> np.ndarray:
+        """Work out what each step began with, and lay out the next observations. The host waits here, once a window.
+
+        Args:
+            first: First new step.
+            root: What that step began with: last_action [N], is_init, step_count, episode_reward [N, 1].
+            last: What follows the last step, uint8 [N, ...].
+            dense: Whether the next observations of all steps are wanted.
+
+        Returns:
+            bool [N, L], the new steps whose final observations are to be drawn; see ``write_final``.
+
+        Raises:
+            RuntimeError: A game truncated earlier than at its time limit.
+        """
+        for key, column in self._root.items():
+            column[:, first] = root[key].reshape(self.num_envs)
+        before, after = slice(first, self.length - 1), slice(first + 1, self.length)
+        done, numbers = self.done[:, before], self._numbers[:, before]
+        self._root["last_action"][:, after] = self._action[:, before]
+        self._root["is_init"][:, after] = done
+        self._root["step_count"][:, after] = numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
+        self._root["episode_reward"][:, after] = numbers[..., EPISODE_REWARD].masked_fill(done, 0)
+        self._final[:, -1] = last
+        dense = dense or bool(self.overlap and self.final_frames == "all")  # the next window may begin with them
+        if dense:
+            if self._dense is None:
+                self._dense = self._new_dense.take()
+            self._dense[:, before] = self.pixels[:, after]
+            self._dense[:, -1] = last
+        if self.final_frames == "none" or (self.final_frames == "all" and not dense):
+            return np.zeros_like(self._wanted)
+        flags = (self._numbers[:, first:, [TERMINATED, TRUNCATED]] > 0).cpu().numpy()
+        terminated, truncated = flags[..., 0], flags[..., 1]
+        self._wanted[:, first:] = terminated | truncated if self.final_frames == "all" else truncated & ~terminated
+        if self._places > 1 and self._wanted[:, :-1].sum(1).max() >= self._places:
+            raise RuntimeError("a game truncated an episode before its max_steps: collect with final_frames='all'")
+        new = self._wanted.copy()
+        new[:, :first] = False
+        return new
+
+    def write_final(self, rows: np.ndarray, steps: np.ndarray, frames: torch.Tensor) -> None:
+        """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n, ...]."""
+        places = self._place_of(self._wanted, rows, steps)
+        row, step, place = (upload(index, self.device) for index in (rows, steps, places))
+        if self._dense is not None:
+            self._dense[row, step] = frames
+        if self.final_frames == "truncated":
+            self._final[row, place] = frames
+
+    def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        """The places of the final observations of some envs and steps."""
+        earlier = (np.cumsum(wanted, 1) - wanted)[rows, steps]
+        return np.where(steps == self.length - 1, self._places - 1, earlier)
+
+    # -- reading ----------------------------------------------------------------------------------------------------
+
+    def sequences(self, initial_state: TensorDict) -> TensorDict:
+        """Everything as TensorDict [N] of entries [N, L, ...]; frames and extras are views of the storage."""
+        out = self._entries(0, [self.num_envs])
+        out["initial_state"] = initial_state
+        if self.final_frames == "all":
+            out["next", "pixels"] = self._dense
+            return out
+        index = np.full((self.num_envs, self._places), self.length - 1)
+        mask = np.zeros((self.num_envs, self._places), np.bool_)
+        rows, steps = np.nonzero(self._wanted[:, :-1])
+        places = self._place_of(self._wanted, rows, steps)
+        index[rows, places], mask[rows, places] = steps, True
+        used = upload(mask, self.device)
+        ended = self._numbers[:, -1, TERMINATED] > 0 if self.final_frames == "truncated" else self.done[:, -1]
+        used[:, -1] = ~ended
+        out["final_pixels"], out["final_mask"] = self._final, used
+        out["final_index"] = upload(index, self.device)
+        return out
+
+    def transitions(self, compact: bool) -> TensorDict:
+        """The T new steps as TensorDict [N, T] in TorchRL's layout; without ``("next", "pixels")`` if ``compact``."""
+        size = [self.num_envs, self.steps]
+        out = self._entries(self.overlap, size)
+        flags = torch.zeros((4, *size, 1), dtype=torch.bool, device=self.device)
+        out["done"], out["terminated"], out["truncated"], out["next", "is_init"] = flags
+        out["next", "last_action"] = out["action"]
+        if self._task is not None:
+            out["next", "task"] = out["task"]
+        if not compact and self._dense is not None:
+            out["next", "pixels"] = self._dense[:, self.overlap :]
+        out.names = [None, "time"]
+        return out
+
+    def _entries(self, first: int, batch_size: list[int]) -> TensorDict:
+        """Everything but what follows a step's frame, from step ``first`` on."""
+        numbers = self._numbers[:, first:]
+        out = TensorDict({}, batch_size=batch_size, device=self.device)
+        entries: dict[NestedKey, torch.Tensor] = {
+            "pixels": self.pixels[:, first:],
+            "action": self._action[:, first:],
+            "last_action": self._root["last_action"][:, first:],
+            "is_init": self._root["is_init"][:, first:, None],
+            "step_count": self._root["step_count"][:, first:, None],
+            "episode_reward": self._root["episode_reward"][:, first:, None],
+            ("next", "reward"): numbers[..., REWARD, None],
+            ("next", "episode_reward"): numbers[..., EPISODE_REWARD, None],
+            ("next", "step_count"): numbers[..., STEP_COUNT, None].to(torch.int64),
+            ("next", "terminated"): numbers[..., TERMINATED, None] > 0,
+            ("next", "truncated"): numbers[..., TRUNCATED, None] > 0,
+            ("next", "done"): self.done[:, first:, None],
+            **{key: buffer[:, first:] for key, buffer in self._extras.items()},
+        }
+        if self._task is not None:
+            entries["task"] = self._task[:, first:]
+        for key, value in entries.items():
+            out[key] = value
+        return out
+
+    # -- resuming ---------------------------------------------------------------------------------------------------
+
+    def _buffers(self) -> dict[NestedKey, torch.Tensor]:
+        """All buffers with axes [N, L, ...]."""
+        dense = {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
+        fixed = {"pixels": self.pixels, "action": self._action, "numbers": self._numbers, **self._root, **dense}
+        return {**fixed, **{("extras", *_parts(key)): buffer for key, buffer in self._extras.items()}}
+
+    def overlap_state(self) -> dict[str, Any]:
+        """What the next window needs of this one, as plain tensors: nothing without an overlap."""
+        if not self.overlap:
+            return {}
+        buffers = {"/".join(_parts(key)): buffer[:, self.steps :].clone() for key, buffer in self._buffers().items()}
+        return {"buffers": buffers, "final": self._final.clone(), "wanted": torch.from_numpy(self._wanted).clone()}
+
+    def load_overlap_state(self, state: dict[str, Any]) -> None:
+        """Load what ``overlap_state`` gave; raises ValueError if that was a collector with other sizes."""
+        if not state:
+            return
+        for name, saved in state["buffers"].items():
+            parts = tuple(name.split("/"))
+            if parts[0] == "extras" and parts[1:] not in map(_parts, self._extras):
+                self._add_extra(parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype)
+            if parts[0] == "dense" and self._dense is None:
+                self._dense = self._new_dense.take()
+        buffers = {"/".join(_parts(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
+        pairs = [(name, buffers.get(name), saved) for name, saved in state["buffers"].items()]
+        for name, target, saved in [*pairs, ("final", self._final, state["final"])]:
+            if target is None or target.shape != saved.shape:
+                here = None if target is None else tuple(target.shape)
+                raise ValueError(f"saved overlap {name!r} is {tuple(saved.shape)}, this collector's {here}")
+            target.copy_(saved)
+        self._wanted = state["wanted"].cpu().numpy().copy()
+
+
+def _write(buffer: torch.Tensor, step: int, value: torch.Tensor) -> None:
+    """Write one step of all envs; on the CPU through numpy, which costs a sixth of a tensor copy."""
+    if is_host(buffer.device):
+        buffer.numpy()[:, step] = value.numpy()
+    else:
+        buffer[:, step] = value
+
+
+def _parts(key: NestedKey) -> tuple[str, ...]:
+    """A key as a tuple."""
+    return (key,) if isinstance(key, str) else key

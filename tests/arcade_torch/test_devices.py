@@ -1,0 +1,275 @@
+"""What holds across devices, processes and threads, shown without a GPU as far as that goes."""
+
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import arcade_torch
+from arcade_torch import collector as collector_module
+from arcade_torch import compiled, dlpack, rollout_buffer
+from arcade_torch import env as env_module
+from arcade_torch.collector import ArcadeCollector
+from arcade_torch.compiled import compiled_game
+from arcade_torch.env import ArcadeEnv
+from arcade_torch.envs_jax import registry
+from tests.arcade_torch.stub import GAME, MIXED, StubGame
+from tests.arcade_torch.test_collector import Recurrent, assert_same, scripted
+
+ROOT = Path(__file__).resolve().parents[2]
+N = 6
+
+
+class CudaStandIn(torch.Tensor):
+    """A tensor that says it is on a GPU, and can only be copied from there."""
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cuda", 0)
+
+    def to(self, *args: Any, **options: Any) -> torch.Tensor:
+        moved = self.as_subclass(torch.Tensor).to(*args, **options)
+        return moved if "cpu" in args else moved.as_subclass(CudaStandIn)
+
+    def numpy(self, *, force: bool = False) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return 2, 0
+
+
+def test_actions_on_a_gpu_reach_jax_on_the_cpu() -> None:
+    """JAX without its CUDA plugin: the first step failed with "Unknown backend cuda"."""
+    action = torch.arange(5).as_subclass(CudaStandIn)
+    argument = dlpack.int32_argument(action, jax.devices("cpu")[0])
+    assert isinstance(argument, np.ndarray) and argument.dtype == np.int32
+    assert argument.tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("path", ["collector", "env"])
+def test_a_step_exports_frames_and_one_array_of_numbers(monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    """Each export is a transfer where JAX is on the CPU and torch on a GPU; there were nine."""
+    env = ArcadeEnv(GAME, N)
+    root = env.reset()
+    exported = []
+
+    def to_torch(array: jax.Array, device: torch.device | None = None) -> torch.Tensor:
+        exported.append(array.shape)
+        return dlpack.to_torch(array, device)
+
+    monkeypatch.setattr(env_module, "to_torch", to_torch)
+    if path == "env":
+        env.step(scripted(root))
+    else:
+        ArcadeCollector(env, scripted, N, final_frames="none").collect()
+        exported = exported[4:]  # the reset's: frames, counts, last action
+    assert exported == [(N, 8, 8, 3), (N, 5)]
+
+
+def test_final_observations_are_drawn_on_the_device_of_the_env() -> None:
+    """Two host devices: they were drawn on JAX's default device."""
+    code = """
+import jax, torch
+from arcade_torch.compiled import _OneGame
+from arcade_torch.env import ArcadeEnv
+from tests.arcade_torch.stub import LOCKSTEP
+used, draw = set(), _OneGame.draw
+def drawn(*args):
+    frames = draw(*args)
+    used.update(frames.devices())
+    return frames
+_OneGame.draw = drawn
+with jax.default_device(jax.devices()[1]):
+    env = ArcadeEnv(LOCKSTEP, 6)
+    env.rollout(12, break_when_any_done=False)
+print(used == {jax.devices()[0]})
+"""
+    options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    assert output_of(code, options) == "True"
+
+
+def output_of(code: str, environment: dict[str, str] | None = None) -> str:
+    import os
+
+    variables = {**os.environ, **(environment or {})}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=variables, timeout=300, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+# -- waits of the host ------------------------------------------------------------------------------------------------
+
+
+class Waits(TorchDispatchMode):
+    """Counts what makes the host wait for a GPU: values that Python reads, and shapes that depend on values."""
+
+    READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        if name in self.READS or (name == "index" and any(i is not None and i.dtype is torch.bool for i in args[1])):
+            self.counts[name] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Counter[str]]:
+    """Take the paths that a GPU takes, and count waits: reads by torch, copies to the host, reads of JAX arrays."""
+    waits, array = Waits(), type(jnp.zeros(1))
+
+    def counted(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(self: Any, *args: Any, **options: Any) -> Any:
+            waits.counts[name] += 1
+            return original(self, *args, **options)
+
+        return call
+
+    def read_by_numpy(original: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda x, *rest, **options: (
+            counted("numpy", original) if isinstance(x, array) else original  # numpy does not ask for __array__
+        )(x, *rest, **options)
+
+    for module in (dlpack, rollout_buffer, env_module, collector_module):
+        monkeypatch.setattr(module, "is_host", lambda value: False)
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
+    monkeypatch.setattr(env, "_check_actions", False)
+    monkeypatch.setattr(torch.Tensor, "cpu", counted("cpu", torch.Tensor.cpu))
+    for name in ("array", "asarray"):
+        monkeypatch.setattr(np, name, read_by_numpy(getattr(np, name)))
+    for name in ("block_until_ready", "__bool__", "__int__", "__float__", "item", "tolist"):
+        monkeypatch.setattr(array, name, counted(name, getattr(array, name)))
+    with waits:
+        yield waits.counts
+
+
+@pytest.mark.parametrize("mode", ["truncated", "all"])
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_the_host_waits_once_a_window(monkeypatch: pytest.MonkeyPatch, game: Any, mode: Any) -> None:
+    """128 steps, a recurrent policy whose states are stored, ends of both kinds."""
+    env = ArcadeEnv(game, N)
+    collector = ArcadeCollector(env, Recurrent(), N * 128, final_frames=mode)
+    expected = ArcadeCollector(ArcadeEnv(game, N), Recurrent(), N * 128, final_frames=mode)
+    for _ in range(2):  # the first call traces, and reads
+        collector.collect(), expected.collect()
+    with as_on_cuda(monkeypatch, env) as counts:
+        batch = collector.collect()
+    monkeypatch.undo()
+    assert counts == {"cpu": 1}
+    assert batch["next", "truncated"].any() and batch["next", "terminated"].any()
+    again = expected.collect()
+    if mode == "truncated":
+        assert torch.equal(batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]])
+    assert_same(batch.exclude("final_pixels"), again.exclude("final_pixels"))
+
+
+def test_the_counter_of_waits_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ArcadeEnv(GAME, N)
+    root, ones = env.reset(), jnp.ones(2)
+    with as_on_cuda(monkeypatch, env) as counts:
+        bool(root["is_init"].any())
+        root["is_init"].cpu()
+        np.asarray(ones)
+        root["step_count"][root["is_init"]]
+    assert counts == {"_local_scalar_dense": 1, "cpu": 1, "numpy": 1, "index": 1}
+
+
+# -- one process, many ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def games_of_this_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget afterwards what a test registers."""
+    for table in ("_FACTORIES", "_NEWEST", "_ALIASES"):
+        monkeypatch.setattr(registry, table, dict(getattr(registry, table)))
+
+
+class Large(StubGame):
+    """The stub with pictures of a size that can be made by id."""
+
+    obs_size = 128
+
+    def render(self, state: Any, partial: Any) -> jax.Array:
+        return jnp.tile(super().render(state, partial), (16, 16, 1))
+
+
+def register_large(id: str) -> None:
+    registry.register(id, lambda id, obs_size, rules: Large(id=id))
+
+
+@pytest.mark.usefixtures("games_of_this_test")
+def test_a_bare_name_means_the_newest_version_also_after_it_was_made() -> None:
+    register_large("CachedEasy-v0")
+    assert compiled_game("CachedEasy", 128, "default", {}).batched.game.id == "CachedEasy-v0"
+    register_large("CachedEasy-v1")
+    assert compiled_game("CachedEasy", 128, "default", {}).batched.game.id == "CachedEasy-v1"
+    assert compiled_game("CachedEasy-v0", 128, "default", {}).batched.game.id == "CachedEasy-v0"
+
+
+def test_an_option_is_refused_whatever_was_made_before() -> None:
+    arcade_torch.make("BreakoutEasy", 2, random_start=True)
+    with pytest.raises((TypeError, ValueError), match="random_start is 1"):
+        arcade_torch.make("BreakoutEasy", 2, random_start=1)
+
+
+def test_a_forked_process_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    ArcadeEnv(GAME, N)
+    monkeypatch.setattr(compiled.os, "getpid", lambda: -1)
+    for make in (lambda: ArcadeEnv(GAME, N), lambda: gymnasium.make("arcade_torch/CartPoleEasy-v0")):
+        with pytest.raises(RuntimeError, match="forked after JAX had started, where JAX hangs: start workers"):
+            make()
+
+
+FORKED = """
+import arcade_torch, gymnasium, jax
+if __name__ == "__main__":
+    try:
+        envs = gymnasium.make_vec("arcade_torch/CartPoleEasy-v0", 2, vectorization_mode="async", vector_kwargs=KW)
+        print(envs.reset(seed=0)[0].shape)
+        envs.close()
+    except Exception as error:
+        print(type(error).__name__)
+"""
+
+
+def test_gymnasiums_async_vector_env_ends_at_once_and_names_spawn(tmp_path: Path) -> None:
+    """It hung for ever: Gymnasium makes one env in the parent, forks, and makes the others in the workers."""
+    for options, clear in (("{'context': 'fork'}", True), ("{'context': 'spawn'}", False)):
+        script = tmp_path / "script.py"
+        script.write_text(FORKED.replace("KW", options))
+        command = [sys.executable, str(script)]
+        result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False)
+        assert ("start workers with 'spawn'" in result.stderr) == clear, result.stderr
+        assert ("(2, 128, 128, 3)" in result.stdout) != clear, result.stdout
+
+
+def test_each_thread_may_have_envs_and_collectors_of_its_own() -> None:
+    """What is promised: envs share compiled functions, not state; one env belongs to one thread at a time."""
+
+    def path(seed: int) -> TensorDictBase:
+        env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=seed)
+        collector = ArcadeCollector(env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8)
+        return torch.stack([collector.collect() for _ in range(4)])
+
+    alone = [path(seed) for seed in range(4)]
+    compiled._cached.cache_clear()  # so that threads also compile at the same time
+    with ThreadPoolExecutor(4) as pool:
+        for one, two in zip(alone, pool.map(path, range(4)), strict=True):
+            assert_same(one, two)
