@@ -11,82 +11,74 @@ Example:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-_PUBLIC = {
-    "Agent": "agent",
-    "CategoricalActor": "actor",
-    "CheckpointError": "checkpoint",
-    "DQNConfig": "dqn",
-    "DQNLoss": "dqn",
-    "EpsilonGreedyActor": "actor",
-    "EvalResult": "evaluation",
-    "NonFiniteError": "learner",
-    "PPOConfig": "ppo",
-    "PPOLoss": "ppo",
-    "PQNConfig": "pqn",
-    "PQNLoss": "pqn",
-    "RunFolderError": "run_folder",
-    "SequenceReplay": "replay",
-    "TrainConfig": "config",
-    "TrainResult": "loop",
-    "evaluate": "evaluation",
-    "gae": "targets",
-    "held_out_seed": "evaluation",
-    "load": "loading",
-    "paper_score": "metrics",
-    "preset": "presets",
-    "preset_names": "presets",
-    "q_lambda_return": "targets",
-    "train": "loop",
-    "train_seeds": "seeds",
+_MODULES = {
+    "config": ("TrainConfig",),
+    "dqn": ("DQN", "DQNConfig", "DQNLoss"),
+    "evaluation": ("EvalResult", "evaluate", "held_out_seed"),
+    "learner": ("NonFiniteError",),
+    "metrics": ("paper_score",),
+    "policy": ("Agent", "build_network", "load", "make_policy"),
+    "ppo": ("PPO", "PPOConfig", "PPOLoss", "SequenceGAE", "make_actor"),
+    "pqn": ("PQN", "PQNConfig", "PQNLoss"),
+    "presets": ("preset", "preset_names"),
+    "replay": ("SequenceReplay",),
+    "returns": ("QLambdaEstimator", "gae", "q_lambda_return"),
+    "runs.files": ("CheckpointError",),
+    "runs.folder": ("RunFolderError",),
+    "training": ("TrainResult", "Trainer", "train"),
 }
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
 
 if TYPE_CHECKING:
-    from arcade_torch.agents.actor import CategoricalActor, EpsilonGreedyActor
-    from arcade_torch.agents.agent import Agent
-    from arcade_torch.agents.checkpoint import CheckpointError
     from arcade_torch.agents.config import TrainConfig
-    from arcade_torch.agents.dqn import DQNConfig, DQNLoss
+    from arcade_torch.agents.dqn import DQN, DQNConfig, DQNLoss
     from arcade_torch.agents.evaluation import EvalResult, evaluate, held_out_seed
     from arcade_torch.agents.learner import NonFiniteError
-    from arcade_torch.agents.loading import load
-    from arcade_torch.agents.loop import TrainResult, train
     from arcade_torch.agents.metrics import paper_score
-    from arcade_torch.agents.ppo import PPOConfig, PPOLoss
-    from arcade_torch.agents.pqn import PQNConfig, PQNLoss
+    from arcade_torch.agents.policy import Agent, build_network, load, make_policy
+    from arcade_torch.agents.ppo import PPO, PPOConfig, PPOLoss, SequenceGAE, make_actor
+    from arcade_torch.agents.pqn import PQN, PQNConfig, PQNLoss
     from arcade_torch.agents.presets import preset, preset_names
     from arcade_torch.agents.replay import SequenceReplay
-    from arcade_torch.agents.run_folder import RunFolderError
-    from arcade_torch.agents.seeds import train_seeds
-    from arcade_torch.agents.targets import gae, q_lambda_return
+    from arcade_torch.agents.returns import QLambdaEstimator, gae, q_lambda_return
+    from arcade_torch.agents.runs.files import CheckpointError
+    from arcade_torch.agents.runs.folder import RunFolderError
+    from arcade_torch.agents.training import Trainer, TrainResult, train
 
 __all__ = [
+    "DQN",
+    "PPO",
+    "PQN",
     "Agent",
-    "CategoricalActor",
     "CheckpointError",
     "DQNConfig",
     "DQNLoss",
-    "EpsilonGreedyActor",
     "EvalResult",
     "NonFiniteError",
     "PPOConfig",
     "PPOLoss",
     "PQNConfig",
     "PQNLoss",
+    "QLambdaEstimator",
     "RunFolderError",
+    "SequenceGAE",
     "SequenceReplay",
     "TrainConfig",
     "TrainResult",
+    "Trainer",
+    "build_network",
     "evaluate",
     "gae",
     "held_out_seed",
     "load",
+    "make_actor",
+    "make_policy",
     "paper_score",
     "preset",
     "preset_names",
     "q_lambda_return",
     "train",
-    "train_seeds",
-]
+]  # fmt: skip
 
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names
@@ -95,9 +87,7 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
-        value = getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
-        globals()[name] = value
-        return value
+        return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
 
 
 def __dir__() -> list[str]:

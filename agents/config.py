@@ -1,14 +1,13 @@
 """What a run is: one frozen dataclass, and its JSON form."""
 
 import dataclasses
-import typing
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from arcade_torch.agents.checks import require
 from arcade_torch.agents.dqn import DQNConfig
-from arcade_torch.agents.learner_config import LearnerConfig
+from arcade_torch.agents.learner import Checked, LearnerConfig, require
 from arcade_torch.agents.ppo import PPOConfig
 from arcade_torch.agents.pqn import PQNConfig
 
@@ -16,10 +15,18 @@ SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see eval
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
 """The algorithms, and the class of the field with their numbers."""
+RENAMED = {
+    "learning_rate_share": "lr_decay_fraction",
+    "epsilon_share": "exploration_fraction",
+    "entropy_weight": "entropy_coeff",
+    "value_weight": "critic_coeff",
+    "context": "overlap",
+}
+"""Fields of version 0.1 and their names since 0.2; the old ones go in 0.3."""
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Checked):
     """Everything that decides a training run.
 
     Counts of frames are environment steps summed over the environments: one environment, one action, one frame.
@@ -56,7 +63,8 @@ class TrainConfig:
     """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and rounding of its own.
     Meant for GPUs: two cores are no faster with it. What is saved is the same; a loaded agent is not compiled."""
     cuda_graphs: bool = False
-    """Replay the network's step while acting as one CUDA graph, which saves launches; needs a CUDA device."""
+    """Replay acting, and every whole gradient step (loss, backward pass, clipping, optimiser), as one CUDA graph each,
+    which saves launches; needs a CUDA device."""
     threads: int = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
     eval_every: int = 1_000_000
@@ -77,34 +85,24 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work, one line each; names of games and models are checked when they are made."""
-        for name in ("env", "memory", "network", "device", "observability", "rules", "algorithm", "logger"):
-            value = getattr(self, name)
-            require(isinstance(value, str) and value != "", name, value, "a non-empty string")
-        for name in ("env_options", "network_options"):
-            value = getattr(self, name)
-            require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
-        twins = ("full", "partial", "mixed")
-        require(self.observability in twins, "observability", self.observability, "'full', 'partial' or 'mixed'")
-        require(self.rules in ("default", "reference"), "rules", self.rules, "'default' or 'reference'")
-        require(self.algorithm in GROUPS, "algorithm", self.algorithm, "'pqn', 'ppo' or 'dqn'")
-        loggers = ("none", "tensorboard", "wandb")
-        require(self.logger in loggers, "logger", self.logger, "'none', 'tensorboard' or 'wandb'")
+        super().__post_init__()
+        for name in ("env", "memory", "network", "device"):
+            self._require(getattr(self, name) != "", name, "a non-empty string")
+        kind = self.device.partition(":")[0]
+        self._require(kind in ("cpu", "cuda", "mps", "xpu"), "device", "a torch device such as 'cpu' or 'cuda:0'")
         on_cuda = self.device.startswith("cuda") or not self.cuda_graphs
-        require(on_cuda, "cuda_graphs", self.cuda_graphs, f"false on device {self.device!r}; it needs a CUDA device")
-        require(self.obs_size >= 1, "obs_size", self.obs_size, "a number of pixels >= 1")
-        require(0 <= self.seed < SEED_LIMIT, "seed", self.seed, f"in [0, {SEED_LIMIT})")
-        for name in ("threads", "eval_every", "checkpoint_every"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "a whole number >= 0")
-        require(self.eval_episodes >= 1, "eval_episodes", self.eval_episodes, "a whole number >= 1")
-        for name, kind in GROUPS.items():
-            require(isinstance(getattr(self, name), kind), name, getattr(self, name), f"a {kind.__name__}")
+        self._require(on_cuda, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device")
+        self._require(self.obs_size >= 1, "obs_size", "a number of pixels >= 1")
+        self._require(0 <= self.seed < SEED_LIMIT, "seed", f"in [0, {SEED_LIMIT})")
+        self._each(("threads", "eval_every", "checkpoint_every"), lambda x: x >= 0, "a whole number >= 0")
+        self._require(self.eval_episodes >= 1, "eval_episodes", "a whole number >= 1")
         self._check_sizes()
 
     def _check_sizes(self) -> None:
         """Refuse numbers that do not fit those of the learner."""
         envs, steps, per_update = self.learner.num_envs, self.learner.num_steps, self.learner.frames_per_update
         allowed = f"at least one update of {envs} envs x {steps} steps = {per_update} frames"
-        require(self.total_frames >= per_update, "total_frames", self.total_frames, allowed)
+        self._require(self.total_frames >= per_update, "total_frames", allowed)
         if self.observability == "mixed":
             require(envs % 2 == 0, f"{self.algorithm}.num_envs", envs, "even with observability='mixed'")
 
@@ -154,34 +152,17 @@ def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
 
 
 def _checked(cls: type, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Values for the fields of a dataclass: unknown names and wrong types are refused, whole floats become ints."""
-    hints = typing.get_type_hints(cls)
+    """Values for the fields of a dataclass, by today's names; unknown ones are refused."""
     known = {f.name for f in dataclasses.fields(cls)}
+    for old in (set(values) - known) & set(RENAMED):
+        warnings.warn(
+            f"{prefix}{old} is called {RENAMED[old]} since 0.2; 0.3 drops the old name", FutureWarning, stacklevel=2
+        )
+    values = {name if name in known else RENAMED.get(name, name): value for name, value in values.items()}
     unknown = sorted(set(values) - known)
     if unknown:
         raise ValueError(f"unknown field {prefix + unknown[0]!r}; fields: {', '.join(sorted(known))}")
-    return {name: coerce(prefix + name, value, hints[name]) for name, value in values.items()}
-
-
-def coerce(name: str, value: Any, kind: Any) -> Any:
-    """The value of a field of a type; whole floats become ints.
-
-    Raises:
-        ValueError: the value is of another type.
-    """
-    if kind is int:
-        whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-        require(whole and not isinstance(value, bool), name, value, "a whole number")
-        return int(value)
-    if kind is float:
-        is_number = isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**1000)
-        require(is_number and not isinstance(value, bool), name, value, "a number")
-        return float(value)
-    if kind is str:
-        require(isinstance(value, str), name, value, "a string")
-    if kind is bool:
-        require(isinstance(value, bool), name, value, "true or false")
-    return value
+    return values
 
 
 def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

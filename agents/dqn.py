@@ -1,27 +1,27 @@
 """DQN with a replay of sequences; with memory or without."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.objectives import HardUpdate
 
-from arcade_torch.agents.learner_config import QConfig
-from arcade_torch.agents.protocols import QNetwork
-from arcade_torch.agents.q_loss import QLoss
-from arcade_torch.agents.targets import TimeLimit
-from arcade_torch.agents.window import Window, outputs_along
-
-Targets = Literal["recompute", "stored"]
+from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training
+from arcade_torch.agents.pqn import PQNLoss
+from arcade_torch.agents.replay import SequenceReplay
+from arcade_torch.agents.sequences import unroll
 
 
 @dataclass(frozen=True)
 class DQNConfig(QConfig):
-    """Numbers of the DQN learner, schedules in shares of the run's frames.
+    """Numbers of DQN, schedules in fractions of the run's frames.
 
     The paper gives none; these are those of its published code, except for ``targets`` and ``time_limit``. An item of
-    the replay is one environment's window: ``context + num_steps`` frames with their actions, rewards and flags, the
-    recurrent state before the first of them, and the few final frames that targets need.
+    the replay is one environment's window: ``overlap + num_steps`` frames with their actions, rewards and flags, the
+    recurrent state before the first of them, and the final frames that targets need.
 
     Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski et al., "Recurrent
     experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
@@ -34,15 +34,13 @@ class DQNConfig(QConfig):
     replay_frames: int = 132_000
     """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
     of all environments."""
-    replay_ram: int = 2_000_000_000
-    """Bytes; a replay that may grow beyond is kept in memory-mapped files in the run folder."""
     batch_sequences: int = 32
     """Sequences drawn in an update, without repetition; all epochs go over the same."""
     learning_starts: int = 32
     """Sequences that must be stored before learning starts."""
     burn_in: int = 0
-    """First steps of a sequence that only bring the memory up to date: read, but no part of the loss."""
-    targets: Targets = "recompute"
+    """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
+    targets: Literal["recompute", "stored"] = "recompute"
     """``"recompute"``: from present Q-values, whenever a sequence is used; ``"stored"`` (the published form): once,
     when it was collected."""
     target_every: int = 0
@@ -52,11 +50,10 @@ class DQNConfig(QConfig):
         """Refuse values that cannot work, one clear line each."""
         super().__post_init__()
         self._each(("batch_sequences", "learning_starts"), lambda x: x >= 1, "a whole number >= 1")
-        self._each(("replay_ram", "burn_in", "target_every"), lambda x: x >= 0, "a whole number >= 0")
+        self._each(("burn_in", "target_every"), lambda x: x >= 0, "a whole number >= 0")
         self._split_evenly("batch_sequences", self.batch_sequences)
-        length = self.context + self.num_steps
-        self._require(self.burn_in < length, "burn_in", f"less than context + num_steps = {length}")
-        self._each(("targets",), lambda x: x in ("recompute", "stored"), "'recompute' or 'stored'")
+        length = self.overlap + self.num_steps
+        self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
         stored = self.targets == "stored"
         self._require(not (stored and self.target_every), "target_every", "0 with targets='stored'")
         held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
@@ -66,59 +63,141 @@ class DQNConfig(QConfig):
     @property
     def replay_sequences(self) -> int:
         """Capacity in sequences: whole windows of all environments."""
-        length = self.context + self.num_steps
+        length = self.overlap + self.num_steps
         return self.replay_frames // (self.num_envs * length) * self.num_envs
 
 
-class DQNLoss(QLoss):
-    """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences.
+class DQNLoss(PQNLoss):
+    """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without a target network.
 
-    Keys as in ``QLoss``. Sequences start from the recurrent state that was stored when they were acted.
+    Keys as in :class:`PQNLoss`; where a batch holds ``stored_target`` [N, L], these are the targets. Sequences start
+    from the recurrent state that was stored when they were acted; :meth:`make_value_estimator` takes ``lmbda`` 0 by
+    default.
 
     Args:
-        network: a ``MemoryNetwork``, or any module with its ``encode``, ``remember`` and ``initial_state``.
-        gamma: discount.
-        lam: lambda of the return.
-        time_limit: see :class:`DQNConfig`.
-        targets: see :class:`DQNConfig`; ``"stored"`` reads them from ``window.extras["target"]``, float [B, L].
+        value_network: writes ``action_value``.
+        time_limit: see :class:`PQNLoss`.
+        delay_value: keep target parameters.
         burn_in: see :class:`DQNConfig`.
-        target_network: gives the next values; None for the trained network itself.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        functional: see :class:`PQNLoss`.
     """
 
     def __init__(
         self,
-        network: QNetwork,
-        gamma: float = 0.99,
-        lam: float = 0.0,
+        value_network: TensorDictModuleBase,
+        *,
         time_limit: TimeLimit = "bootstrap",
-        targets: Targets = "recompute",
+        delay_value: bool = False,
         burn_in: int = 0,
-        target_network: QNetwork | None = None,
+        reduction: str = "mean",
+        functional: bool = True,
     ) -> None:
-        super().__init__(network, gamma, lam, time_limit)
-        self.stored, self.burn_in = targets == "stored", burn_in
-        self.target_network = target_network
+        options = {"delay_value": delay_value, "burn_in": burn_in, "reduction": reduction, "functional": functional}
+        super().__init__(value_network, time_limit=time_limit, **options)  # type: ignore[arg-type]
 
-    @classmethod
-    def from_config(cls, network: QNetwork, config: DQNConfig, target_network: QNetwork | None = None) -> "DQNLoss":
-        """The loss that ``config`` describes."""
-        numbers = config.gamma, config.lam, config.time_limit
-        return cls(network, *numbers, config.targets, config.burn_in, target_network)
+    def _default_value_estimator(self) -> None:
+        self.make_value_estimator(lmbda=0.0)
 
-    @property
-    def first_trained(self) -> int:
-        """Index of the first step that takes part in the loss."""
-        return self.burn_in
+    def prepare(self, batch: TensorDictBase) -> Any:
+        """See :meth:`PQNLoss.prepare`; keeps ``stored_target``."""
+        data = super().prepare(batch)
+        stored = batch.get("stored_target", None)
+        return data if stored is None else data.set("stored_target", stored[:, self.burn_in :])
 
     @torch.no_grad()
-    def bootstrap_values(self, window: Window, q: Tensor) -> Tensor:
-        """Best Q-value of every observation of the extended sequence, of the target network if there is one."""
-        return (q if self.target_network is None else outputs_along(self.target_network, window)).amax(-1)
+    def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
+        """Stored targets, if the batch brings them, else see :meth:`PQNLoss.targets`."""
+        stored = data.get("stored_target", None)
+        return super().targets(data, q, steps) if stored is None else stored[:, :steps]
+
+
+class DQN(Learner):
+    """Puts every window into the replay and learns from sequences drawn from it.
+
+    Args:
+        network: writes ``action_value``.
+        config: numbers of DQN.
+        training: of the run.
+    """
+
+    config: DQNConfig
+    loss: DQNLoss
+
+    def __init__(self, network: TensorDictModuleBase, config: DQNConfig, training: Training) -> None:
+        has_target = config.target_every > 0
+        options = {"time_limit": config.time_limit, "delay_value": has_target, "functional": has_target}
+        loss = DQNLoss(network, burn_in=config.burn_in, **options)  # type: ignore[arg-type]
+        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
+        super().__init__(loss, config, training, optimizer="radam")
+        if has_target:
+            HardUpdate(
+                loss
+            )  # says that the target parameters are taken care of; it leaves out buffers, so see update()
+        self.labels = DQNLoss(network, time_limit=config.time_limit, functional=False)
+        self.labels.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
+        self.replay = SequenceReplay(config.replay_sequences, training.folder)
+        self.updates = 0
+
+    def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
+        """Store one window and learn from sequences drawn from the replay, once it holds enough.
+
+        Args:
+            batch: sequences [num_envs] of ``ArcadeCollector.collect()``.
+            frames: frames counted before this window.
+
+        Returns:
+            Means over the gradient steps, by column of ``metrics.csv``.
+
+        Raises:
+            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
+        """
+        self.check_rewards(batch)
+        config = self.config
+        if config.targets == "stored":
+            batch = batch.copy().set("stored_target", self._present_targets(batch))
+        self.replay.add(batch)
+        if len(self.replay) >= max(config.learning_starts, config.batch_sequences):
+            if config.target_every and self.updates % config.target_every == 0:
+                self.loss.target_value_network_params.data.update_(self.loss.value_network_params.data)
+            self.updates += 1
+            drawn = self.replay.sample(config.batch_sequences, self.training.generator, self.training.device)
+            data = self.loss.prepare(drawn)
+            frames_per_step = config.frames_per_update / config.grad_steps_per_update
+            for _ in range(config.epochs):
+                for rows in self.minibatches(len(data)):
+                    self.gradient_step(data[rows], frames)
+                    frames += frames_per_step
+        return self.take_metrics() | {"replay_frames": self.replay.frames}
 
     @torch.no_grad()
-    def targets(self, window: Window, q: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        """Targets of the steps: stored ones, if the window brings them, else see ``QLoss``."""
-        if self.stored and "target" in window.extras:
-            target = window.extras["target"][:, :steps]
-            return target, torch.zeros_like(target)
-        return super().targets(window, q, steps)
+    def _present_targets(self, batch: TensorDictBase) -> Tensor:
+        """Targets float [N, L] by the present network, row by row to bound memory."""
+        data, targets = self.labels.prepare(batch), []
+        for row in data.split(1):
+            q = unroll(self.labels.value_network, self.labels.inputs, row, "action_value")
+            targets.append(self.labels.targets(row, q, row["reward"].shape[1]))
+        return torch.cat(targets)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the trained weights and the generator that the coming updates depend on."""
+        more: dict[str, Any] = {"replay": self.replay.state_dict(), "learner_updates": self.updates}
+        if self.config.target_every:
+            more["target"] = {
+                key: value.clone() for key, value in self.loss.target_value_network_params.flatten_keys(".").items()
+            }
+        return super().state_dict() | more
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go back to a saved moment.
+
+        Raises:
+            CheckpointError: a file of the replay is missing or damaged.
+        """
+        self.replay.load_state_dict(state["replay"])
+        super().load_state_dict(state)
+        self.updates = state["learner_updates"]
+        if self.config.target_every:
+            target = self.loss.target_value_network_params.flatten_keys(".")
+            for key, value in state["target"].items():
+                target[key].data.copy_(value)

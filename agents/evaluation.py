@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import arcade_torch
-from arcade_torch.agents.checks import require
 from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
+from arcade_torch.agents.learner import require
 from arcade_torch.agents.metrics import confidence_95
-from arcade_torch.agents.protocols import Player
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def evaluate(
         env.set_observability(before)
 
 
-def _play(agent: Player, env: Any) -> EvalResult:
+def _play(agent: Any, env: Any) -> EvalResult:
     """One episode in each environment."""
     obs = env.reset()
     num_envs = env.batch_size[0]

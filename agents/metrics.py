@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -73,66 +74,46 @@ class EpisodeStats:
     """Returns of training episodes, followed from window to window.
 
     Attributes:
-        running: float64 [N], return so far of the episode each environment is in.
         last: float64 [N], return of the last finished episode of each environment; 0 before the first.
         episodes: episodes finished so far.
         smooth: running average of the finished episodes' returns (span 100 windows); None before the first.
+        finished: float64 [E], returns of the episodes that ended in the last window.
     """
 
-    running: NDArray[np.float64]
     last: NDArray[np.float64]
     episodes: int = 0
     smooth: float | None = None
-    finished: list[float] = field(default_factory=list)
+    finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
-    @classmethod
-    def start(cls, num_envs: int) -> "EpisodeStats":
-        """Nothing seen yet."""
-        return cls(np.zeros(num_envs), np.zeros(num_envs))
-
-    def update(self, reward: Tensor, done: Tensor) -> float:
+    def update(self, episode_reward: Tensor, done: Tensor) -> float:
         """Read one window of new steps.
 
         Args:
-            reward: float32 [N, T].
+            episode_reward: float32 [N, T], return so far of the episode, after each step.
             done: bool [N, T].
 
         Returns:
             The last finished return of each environment, averaged over the steps and environments of this window: one
-            point of the history :func:`paper_score` reads. ``finished`` holds the returns of this window's episodes.
+            point of the history :func:`paper_score` reads.
         """
-        rewards, ends = reward.cpu().numpy(), done.cpu().numpy()
-        self.finished = []
-        total = 0.0
-        for t in range(rewards.shape[1]):
-            self.running += rewards[:, t]
-            end = ends[:, t]
-            if end.any():
-                self.finished.extend(self.running[end].tolist())
-                self.last = np.where(end, self.running, self.last)
-                self.running = np.where(end, 0.0, self.running)
-            total += float(self.last.mean())
+        returns, ends = episode_reward.cpu().double().numpy(), done.cpu().numpy()
+        self.finished = returns[ends]
+        latest = np.maximum.accumulate(np.where(ends, np.arange(ends.shape[1]), -1), axis=1)  # step of the last end
+        known = np.where(latest >= 0, np.take_along_axis(returns, latest.clip(0), axis=1), self.last[:, None])
+        self.last = known[:, -1].copy()
         self.episodes += len(self.finished)
-        if self.finished:
-            self.smooth = _blend(self.smooth, float(np.mean(self.finished)))
-        return total / len(rewards.T)
+        if len(self.finished):
+            mean = float(self.finished.mean())
+            self.smooth = mean if self.smooth is None else self.smooth + 2 / (EWM_SPAN + 1) * (mean - self.smooth)
+        return float(known.mean())
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""
-        return {
-            "running": torch.from_numpy(self.running.copy()),
-            "last": torch.from_numpy(self.last.copy()),
-            "episodes": self.episodes,
-            "smooth": self.smooth,
-        }
+        return {"last": torch.from_numpy(self.last.copy()), "episodes": self.episodes, "smooth": self.smooth}
 
-    @classmethod
-    def from_state_dict(cls, state: dict[str, object]) -> "EpisodeStats":
-        """The inverse of :meth:`state_dict`."""
-        running, last, episodes, smooth = (state[k] for k in ("running", "last", "episodes", "smooth"))
-        assert isinstance(running, Tensor) and isinstance(last, Tensor) and isinstance(episodes, int)
-        assert smooth is None or isinstance(smooth, float)
-        return cls(running.numpy().copy(), last.numpy().copy(), episodes, smooth)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go back to a saved moment."""
+        self.last, self.episodes, self.smooth = state["last"].numpy().copy(), state["episodes"], state["smooth"]
 
 
 def confidence_95(values: Sequence[float]) -> float:
@@ -140,7 +121,3 @@ def confidence_95(values: Sequence[float]) -> float:
     if len(values) < 2:
         return 0.0
     return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values))
-
-
-def _blend(smooth: float | None, value: float) -> float:
-    return value if smooth is None else smooth + 2.0 / (EWM_SPAN + 1.0) * (value - smooth)

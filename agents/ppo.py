@@ -1,22 +1,25 @@
 """PPO with a memory in actor and critic, or in neither."""
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.objectives import LossModule
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torch.distributions import Categorical
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
 
-from arcade_torch.agents.learner_config import LearnerConfig
-from arcade_torch.agents.protocols import ActorCritic
-from arcade_torch.agents.targets import TimeLimit, gae
-from arcade_torch.agents.window import Key, Window, WindowKeys, outputs_along, read_window
+from arcade_torch.agents.learner import Learner, LearnerConfig, TimeLimit, Training
+from arcade_torch.agents.returns import gae
+from arcade_torch.agents.sequences import NetworkInputs, as_steps, insert_final_observations, standard_names, unroll
 
 
 @dataclass(frozen=True)
 class PPOConfig(LearnerConfig):
-    """Numbers of the PPO learner; the defaults are the paper's, the step size falls over the whole run.
+    """Numbers of PPO; the defaults are the paper's, the step size falls over the whole run.
 
     Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
     """
@@ -27,16 +30,16 @@ class PPOConfig(LearnerConfig):
     """Step size at the start."""
     learning_rate_end: float = 1e-10
     """Step size after the decay."""
-    learning_rate_share: float = 1.0
-    """Share of the run's frames over which the step size falls linearly; 0 starts at the end value."""
+    lr_decay_fraction: float = 1.0
+    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate, in [0, 1]."""
     clip: float = 0.2
     """How far the probability ratio, and the value, may move in an update before the gradient stops."""
-    entropy_weight: float = 0.01
+    entropy_coeff: float = 0.01
     """Weight of the entropy bonus."""
-    value_weight: float = 0.5
-    """Weight of the value loss."""
+    critic_coeff: float = 0.5
+    """Weight of the value loss (half the mean squared error)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work, one clear line each."""
@@ -44,190 +47,169 @@ class PPOConfig(LearnerConfig):
         self._split_evenly("num_envs", self.num_envs)
         self._each(("lam",), lambda x: 0.0 <= x <= 1.0, "a number in [0, 1]")
         self._each(("clip",), lambda x: x > 0.0, "a number > 0")
-        self._each(("entropy_weight", "value_weight"), lambda x: x >= 0.0, "a number >= 0")
+        self._each(("entropy_coeff", "critic_coeff"), lambda x: x >= 0.0, "a number >= 0")
 
 
-@dataclass
-class PPOKeys(WindowKeys):
-    """Names of the entries a window is read from, and of the log-probabilities of the actions taken."""
+class SequenceGAE(nn.Module):
+    """Advantages by one pass of the critic over each sequence, final observations read where they belong.
 
-    action_log_prob: Key = "action_log_prob"
-
-    def required(self) -> list[object]:
-        """Entries that every batch must hold."""
-        return [*super().required(), self.action_log_prob]
-
-
-class PPOOutput(NamedTuple):
-    """Parts of the loss, scalars with gradient, and what was found on the way, detached.
-
-    ``policy``, ``value`` and ``entropy`` are the three parts without their weights, ``loss`` is their weighted sum;
-    ``log_prob`` and ``state_value`` float [B, L] are those of the present network.
-    """
-
-    loss: Tensor
-    policy: Tensor
-    value: Tensor
-    entropy: Tensor
-    log_prob: Tensor
-    state_value: Tensor
-    kl: Tensor
-    clip_share: Tensor
-
-
-class PPOLoss(LossModule):
-    """Clipped policy loss, clipped value loss, entropy bonus, over whole sequences.
-
-    Advantages come from one pass of the critic over the whole window before the first gradient step, in which final
-    observations are read with the recurrent state that led to them. They are normalised in each minibatch (population
-    deviation plus 1e-8). In keys: those of ``QLoss``, and ``action_log_prob`` of the actions taken. Out keys:
-    ``loss_objective``, ``loss_critic``, ``loss_entropy`` (weighted, scalars with gradient, as TorchRL's ``ClipPPOLoss``
-    names them), ``entropy``, ``kl_approx``, ``clip_fraction``, detached.
+    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target`` and ``state_value`` [N, L, 1].
 
     Args:
-        network: an ``ActorCriticNetwork``, or any module with its ``encode``, ``remember``, ``initial_state`` and
-            ``critic``.
-        gamma: discount.
-        lam: lambda of the advantage estimate.
-        time_limit: see :class:`PPOConfig`.
-        clip: see :class:`PPOConfig`.
-        entropy_weight: see :class:`PPOConfig`.
-        value_weight: see :class:`PPOConfig`.
+        critic: any TensorDict module that writes ``state_value`` [*, 1].
+        gamma: discount per step, in [0, 1].
+        lmbda: lambda of the estimate, in [0, 1].
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a
+            termination.
+        chunks: parts that the rows are read in, which bounds memory.
+    """
+
+    def __init__(
+        self,
+        critic: TensorDictModuleBase,
+        gamma: float = 0.99,
+        lmbda: float = 0.95,
+        time_limit: TimeLimit = "bootstrap",
+        chunks: int = 1,
+    ) -> None:
+        super().__init__()
+        self.__dict__["critic"] = critic  # its parameters belong to the loss
+        self.inputs = NetworkInputs(critic)
+        self.gamma, self.lmbda, self.time_limit, self.chunks = gamma, lmbda, time_limit, chunks
+        self.reads = {"reward": "reward", "terminated": "terminated"}
+        self.writes = {"advantage": "advantage", "value_target": "value_target", "value": "state_value"}
+
+    def set_keys(self, **names: Any) -> None:
+        """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``; the rest is unused."""
+        for table in (self.reads, self.writes):
+            table.update({name: names[name] for name in table.keys() & names.keys()})
+
+    @torch.no_grad()
+    def forward(self, batch: TensorDictBase, params: Any = None, target_params: Any = None) -> TensorDictBase:
+        """Estimate advantages.
+
+        Args:
+            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [B, T] with dense next observations.
+            params: parameters of the critic; default those it has.
+            target_params: not looked at.
+
+        Returns:
+            The same object, with the three entries.
+        """
+        data = insert_final_observations(standard_names(batch, **self.reads), self.inputs, self.time_limit)
+        value_key = self.writes["value"]
+        values = []
+        for rows in data.chunk(self.chunks):
+            if params is None:
+                values.append(unroll(self.critic, self.inputs, rows, value_key).squeeze(-1))
+                continue
+            with params.to_module(self.critic, preserve_module_state=False):
+                values.append(unroll(self.critic, self.inputs, rows, value_key).squeeze(-1))
+        value, position = torch.cat(values), data["position"]
+        here, following = value.gather(1, position), value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
+        ends = data["terminated"]
+        advantage = gae(data["reward"], here, following, ends, data["cut"] & ~ends, gamma=self.gamma, lam=self.lmbda)
+        entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
+        shape = batch.get("is_init").shape[: here.ndim]
+        for key, entry in entries.items():
+            batch[self.writes[key]] = entry.reshape(shape).unsqueeze(-1)
+        return batch
+
+
+class PPOLoss(ClipPPOLoss):
+    """TorchRL's ``ClipPPOLoss`` over whole sequences of a recurrent actor and critic.
+
+    Differences: advantages come from :class:`SequenceGAE` before the first gradient step and are normalised in each
+        minibatch
+    by the population deviation plus 1e-8; the value loss is half the squared error, clipped like the ratio; the entropy
+    is not checked for NaN in every call, which would wait for the device. In keys and out keys are those of
+    ``ClipPPOLoss``.
+
+    Args:
+        actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
+        critic_network: any TensorDict module that writes ``state_value`` [*, 1].
+        time_limit: see :class:`SequenceGAE`.
+        clip_epsilon: see :class:`PPOConfig`, ``clip``.
+        entropy_coeff: see :class:`PPOConfig`.
+        critic_coeff: see :class:`PPOConfig`.
+        **kwargs: see ``ClipPPOLoss``.
 
     Source: Schulman et al., arXiv 1707.06347, equations 7 and 9; value clipping as in the published implementation.
     """
 
-    _AcceptedKeys = PPOKeys
-    default_keys = PPOKeys
-    out_keys = ("loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction")
-
-    network: ActorCritic
+    actor_network: ProbabilisticTensorDictSequential
+    critic_network: TensorDictModuleBase
+    actor_network_params: TensorDictParams
+    critic_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    target_critic_network_params: TensorDictParams
 
     def __init__(
         self,
-        network: ActorCritic,
-        gamma: float = 0.99,
-        lam: float = 0.95,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModuleBase,
+        *,
         time_limit: TimeLimit = "bootstrap",
-        clip: float = 0.2,
-        entropy_weight: float = 0.01,
-        value_weight: float = 0.5,
+        clip_epsilon: float = 0.2,
+        entropy_coeff: float = 0.01,
+        critic_coeff: float = 0.5,
+        **kwargs: Any,
     ) -> None:
-        super().__init__()
-        self.network = network
-        self.gamma, self.lam, self.time_limit = gamma, lam, time_limit
-        self.clip, self.entropy_weight, self.value_weight = clip, entropy_weight, value_weight
-
-    @classmethod
-    def from_config(cls, network: ActorCritic, config: PPOConfig) -> "PPOLoss":
-        """The loss that ``config`` describes."""
-        weights = config.entropy_weight, config.value_weight
-        return cls(network, config.gamma, config.lam, config.time_limit, config.clip, *weights)
-
-    @property
-    def functional(self) -> bool:
-        """False: the network's parameters are used where they are."""
-        return False
-
-    @property
-    def in_keys(self) -> list[object]:
-        """Entries that every batch must hold."""
-        return cast(PPOKeys, self.tensor_keys).required()
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """There is no separate value estimator."""
+        options = {"loss_critic_type": "l2", "clip_value": True, "log_explained_variance": False} | kwargs
+        super().__init__(
+            actor_network,
+            critic_network,
+            clip_epsilon=clip_epsilon,
+            entropy_coeff=entropy_coeff,
+            critic_coeff=0.5 * critic_coeff,
+            **options,
+        )
+        self.time_limit = time_limit
+        self.normalize_advantage = True
+        self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Loss and metrics of a batch taken as one minibatch, as a TensorDict of scalars.
+        """The parts of the loss.
 
         Args:
-            tensordict: sequences [B] or a stock batch [B, T].
+            tensordict: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock batch [B, T]; with
+                ``advantage``, ``value_target``, ``state_value`` (else they are estimated with the present critic).
 
         Returns:
-            The out keys.
-
-        Raises:
-            ValueError: a needed next observation or recurrent state is not in the batch.
+            The out keys of ``ClipPPOLoss``.
         """
-        out = self.compute(self.prepare(self.read(tensordict)))
-        parts = {
-            "loss_objective": out.policy,
-            "loss_critic": self.value_weight * out.value,
-            "loss_entropy": -self.entropy_weight * out.entropy,
-            "entropy": out.entropy.detach(),
-            "kl_approx": out.kl,
-            "clip_fraction": out.clip_share,
-        }
-        return TensorDict(parts, batch_size=[])
+        keys = self.tensor_keys
+        if tensordict.get(keys.advantage, None) is None:
+            tensordict = self.value_estimator(tensordict.copy())
+        read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
+        return super().forward(as_steps(tensordict, self.inputs, *read))
 
-    def read(self, tensordict: TensorDictBase) -> Window:
-        """Read a batch into plain tensors, with the log-probabilities of the actions taken."""
-        keys = cast(PPOKeys, self.tensor_keys)
-        window = read_window(tensordict, keys, self.time_limit, "next", self.network.initial_state)
-        log_prob: Tensor = tensordict.get(keys.action_log_prob)
-        return window.with_extras(log_prob=log_prob.reshape(window.action.shape))
-
-    @torch.no_grad()
-    def prepare(self, window: Window, rows_at_once: int | None = None) -> Window:
-        """Advantages and value targets with the present critic.
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """Choose how advantages are made.
 
         Args:
-            window: from :meth:`read`.
-            rows_at_once: rows in one pass, which bounds memory; default all.
-
-        Returns:
-            The window without final observations, with ``extras`` ``advantage``, ``value_target`` and ``state_value``
-            [B, L]; its rows are what :meth:`compute` takes.
+            value_type: an estimator of TorchRL; None for :class:`SequenceGAE`.
+            **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``.
         """
-        every, step = list(range(window.action.shape[0])), rows_at_once or window.action.shape[0]
-        parts = [self._values(window.rows(every[i : i + step])) for i in range(0, len(every), step)]
-        value, next_value = (torch.cat(column) for column in zip(*parts, strict=True))
-        advantage = gae(
-            window.reward,
-            value,
-            next_value,
-            window.terminated,
-            window.truncated,
-            self.gamma,
-            self.lam,
-            self.time_limit,
-        )
-        return window.roots().with_extras(advantage=advantage, value_target=advantage + value, state_value=value)
+        if value_type is not None:
+            super().make_value_estimator(value_type, **hyperparams)
+            return
+        self._value_estimator = SequenceGAE(self.critic_network, time_limit=self.time_limit, **hyperparams)
 
-    def _values(self, window: Window) -> tuple[Tensor, Tensor]:
-        """Values of the observations and of the true next observations, [B, L] each."""
-        value = outputs_along(self.network.critic, window, window.state["critic"]).squeeze(-1)
-        following = (window.position + 1).clamp_max(value.shape[1] - 1)
-        return value.gather(1, window.position), value.gather(1, following)
+    def _default_value_estimator(self) -> None:
+        self.make_value_estimator()
 
-    def compute(self, window: Window) -> PPOOutput:
-        """The loss of a minibatch.
+    def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
+        return normalise(advantage)
 
-        Args:
-            window: from :meth:`prepare`, or rows of it.
+    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
+        log_weight, dist, _, correction = super()._log_weight(tensordict, adv_shape)
+        kl = log_weight.exp() - 1 - log_weight  # never negative, unlike the plain difference
+        return log_weight, dist, kl, correction
 
-        Returns:
-            Loss and its parts.
-        """
-        logits, value = self.network.split(outputs_along(self.network, window))
-        log_probs = logits.log_softmax(-1)
-        log_prob = log_probs.gather(-1, window.action.unsqueeze(-1)).squeeze(-1)
-        entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
-        log_ratio = log_prob - window.extras["log_prob"]
-        ratio, advantage = log_ratio.exp(), normalise(window.extras["advantage"])
-        clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
-        policy = -torch.minimum(ratio * advantage, clipped * advantage).mean()
-        value_loss = self._value_loss(value, window.extras["state_value"], window.extras["value_target"])
-        loss = policy + self.value_weight * value_loss - self.entropy_weight * entropy
-        with torch.no_grad():
-            kl = (ratio - 1 - log_ratio).mean()
-            clip_share = ((ratio - 1).abs() > self.clip).to(ratio.dtype).mean()
-        return PPOOutput(loss, policy, value_loss, entropy, log_prob.detach(), value.detach(), kl, clip_share)
-
-    def _value_loss(self, value: Tensor, old: Tensor, target: Tensor) -> Tensor:
-        """Half the mean of the larger squared error, of the value or of the value held close to the old one."""
-        held = old + (value - old).clamp(-self.clip, self.clip)
-        return 0.5 * torch.maximum((value - target).square(), (held - target).square()).mean()
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
+        entropy: Tensor = dist.entropy()
+        return entropy.unsqueeze(-1)
 
 
 def normalise(advantage: Tensor) -> Tensor:
@@ -239,3 +221,97 @@ def normalise(advantage: Tensor) -> Tensor:
     """
     centred = advantage - advantage.mean()
     return centred / (centred.square().mean().sqrt() + 1e-8)
+
+
+class Choice(Categorical):
+    """A categorical distribution that samples something even where logits are NaN.
+
+    ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name the update.
+    """
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draw by the largest of ``logits + Gumbel noise``, int64 [*sample_shape, *batch]."""
+        logits = self.logits.expand(*sample_shape, *self.logits.shape)
+        return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The most likely outcome, int64 [*batch]."""
+        mode: Tensor = self.logits.argmax(-1)
+        return mode
+
+
+def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> ProbabilisticActor:
+    """A policy that samples from the softmax of ``logits``.
+
+    Args:
+        network: any TensorDict module that writes ``logits`` [*, A].
+        deterministic: take the most likely action unless told otherwise (``set_exploration_type``).
+
+    Returns:
+        TorchRL's ``ProbabilisticActor``; writes ``action`` int64 [*] and ``action_log_prob``.
+    """
+    default = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    return ProbabilisticActor(
+        network,
+        in_keys=["logits"],
+        distribution_class=Choice,
+        distribution_kwargs={"validate_args": False},
+        return_log_prob=True,
+        default_interaction_type=default,
+    )
+
+
+class PPO(Learner):
+    """Estimates advantages once a window, then goes over it for some epochs.
+
+    Args:
+        network: with ``actor`` (writes ``logits``) and ``critic`` (writes ``state_value``).
+        config: numbers of PPO.
+        training: of the run.
+    """
+
+    config: PPOConfig
+    loss: PPOLoss
+
+    def __init__(self, network: Any, config: PPOConfig, training: Training) -> None:
+        loss = PPOLoss(
+            make_actor(network.actor),
+            network.critic,
+            time_limit=config.time_limit,
+            clip_epsilon=config.clip,
+            entropy_coeff=config.entropy_coeff,
+            critic_coeff=config.critic_coeff,
+        )
+        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches)
+        super().__init__(loss, config, training, optimizer="adam")
+
+    def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
+        """Learn from one window.
+
+        Args:
+            batch: sequences [num_envs] of ``ArcadeCollector.collect()``, with ``action_log_prob``.
+            frames: frames counted before this window.
+
+        Returns:
+            Means over the gradient steps, by column of ``metrics.csv``.
+
+        Raises:
+            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
+        """
+        self.check_rewards(batch)
+        config = self.config
+        data = self.loss.value_estimator(batch)
+        frames_per_step = config.frames_per_update / config.grad_steps_per_update
+        for _ in range(config.epochs):
+            for rows in self.minibatches(len(data)):
+                self.gradient_step(data[rows], frames)
+                frames += frames_per_step
+        metrics = self.take_metrics()
+        return metrics | {
+            "policy_loss": metrics["loss_objective"],
+            "value_loss": metrics["loss_critic"] / config.critic_coeff if config.critic_coeff else None,
+            "kl": metrics["kl_approx"],
+            "q_mean": float(data["state_value"].mean()),
+            "td_error": float(data["advantage"].abs().mean()),
+        }

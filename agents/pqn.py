@@ -1,17 +1,29 @@
 """PQN: Q-learning with lambda-returns, no replay buffer, no target network; with memory or without."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
-from arcade_torch.agents.learner_config import QConfig
-from arcade_torch.agents.protocols import QNetwork
-from arcade_torch.agents.q_loss import QLoss
-from arcade_torch.agents.window import Bootstrap
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator
+from torchrl.objectives.value import ValueEstimatorBase
+
+from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training, require
+from arcade_torch.agents.returns import QLambdaEstimator
+from arcade_torch.agents.sequences import NetworkInputs, insert_final_observations, standard_names, unroll
+
+Key = str | tuple[str, ...]
+Bootstrap = Literal["next", "last"]
 
 
 @dataclass(frozen=True)
 class PQNConfig(QConfig):
-    """Numbers of the PQN learner; the defaults are the paper's, schedules in shares of the run's frames.
+    """Numbers of PQN; the defaults are the paper's, schedules in fractions of the run's frames.
 
     Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
     """
@@ -20,27 +32,254 @@ class PQNConfig(QConfig):
 
     bootstrap: Bootstrap = "next"
     """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
-    last step of a window only lends its value, and is trained in the next window, as context (needs context >= 1)."""
+    last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work, one clear line each."""
         super().__post_init__()
         self._split_evenly("num_envs", self.num_envs)
-        self._each(("bootstrap",), lambda x: x in ("next", "last"), "'next' or 'last'")
         self._require(
-            self.bootstrap == "next" or self.context >= 1,
-            "context",
-            ">= 1 with bootstrap='last': the last step of a window is only trained as context of the next",
+            self.bootstrap == "next" or self.overlap >= 1,
+            "overlap",
+            ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap of the next",
         )
 
 
-class PQNLoss(QLoss):
-    """The loss of PQN: targets from the very pass whose Q-values are trained.
+class PQNLoss(LossModule):
+    """Half the squared distance of Q(s, a) to its Q(lambda) return, whose values come from the very same pass.
+
+    In keys: what the network reads, ``action`` (categorical or one-hot), ``is_init``, ``("next", "reward" |
+    "terminated" | "truncated")``, and the true next observations: as ``final_pixels``, ``final_index``, ``final_mask``
+    with ``initial_state`` (batches [N] of ``ArcadeCollector.collect()``), or dense under "next" (stock TorchRL batches
+    [B, T]). Rows are whole sequences; never shuffle or flatten time. Half of TorchRL's ``DQNLoss(delay_value=False)``
+    with TD(lambda), on the same batch.
+
+    Out keys: ``loss`` (with gradient), ``q_mean``, ``target_mean``, ``td_error`` (mean absolute), detached.
+
+    Args:
+        value_network: any TensorDict module that writes ``action_value`` [*, A]: a ``MemoryNetwork``, a ``QValueActor``
+            ...
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a
+            termination.
+        bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its value.
+        delay_value: keep target parameters, which then give the next values (``SoftUpdate``, ``HardUpdate``).
+        burn_in: first steps of a sequence that only bring the memory up to date, without gradient.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        functional: hold the parameters apart from the network, as TorchRL's losses do; False uses the network as it is,
+            which saves a few hundred microseconds a call.
 
     Source: Gallici et al., arXiv 2407.04811; POPGym Arcade (ICML 2026).
     """
 
-    @classmethod
-    def from_config(cls, network: QNetwork, config: PQNConfig) -> "PQNLoss":
-        """The loss that ``config`` describes."""
-        return cls(network, config.gamma, config.lam, config.time_limit, config.bootstrap)
+    @dataclass
+    class _AcceptedKeys:
+        """Names of the entries, see ``LossModule.set_keys``."""
+
+        action_value: Key = "action_value"
+        action: Key = "action"
+        reward: Key = "reward"
+        done: Key = "done"
+        terminated: Key = "terminated"
+        truncated: Key = "truncated"
+        is_init: Key = "is_init"
+        value_target: Key = "value_target"
+        priority: Key = "td_error"
+        priority_weight: Key = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TDLambda
+    out_keys = ["loss", "q_mean", "target_mean", "td_error"]  # noqa: RUF012 (TorchRL's convention)
+
+    value_network: TensorDictModuleBase
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        value_network: TensorDictModuleBase,
+        *,
+        time_limit: TimeLimit = "bootstrap",
+        bootstrap: Bootstrap = "next",
+        delay_value: bool = False,
+        burn_in: int = 0,
+        reduction: str = "mean",
+        functional: bool = True,
+    ) -> None:
+        super().__init__()
+        self._functional = functional
+        if functional:
+            self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+        else:
+            require(not delay_value, "functional", functional, "True with delay_value")
+            self.value_network = value_network
+        self.inputs = NetworkInputs(value_network)
+        self.time_limit, self.bootstrap, self.delay_value = time_limit, bootstrap, delay_value
+        self.burn_in, self.reduction = burn_in, reduction
+        self._in_keys: list[Key] | None = None
+
+    @property
+    def functional(self) -> bool:
+        """Whether the parameters are held apart from the network."""
+        return self._functional
+
+    @property
+    def in_keys(self) -> list[Key]:
+        """Entries that every batch holds; assign others to call the loss with plain tensors in another order."""
+        if self._in_keys is not None:
+            return self._in_keys
+        keys = self.tensor_keys
+        roots = dict.fromkeys([*self.inputs.observation_keys, *self.inputs.state_keys, keys.action, keys.is_init])
+        outcome = [("next", key) for key in (keys.reward, keys.terminated, keys.truncated)]
+        nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
+        return [*roots, *outcome, *nexts]
+
+    @in_keys.setter
+    def in_keys(self, keys: list[Key]) -> None:
+        self._in_keys = keys
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            names = ("reward", "done", "terminated", "value_target")
+            self._value_estimator.set_keys(**{name: getattr(self.tensor_keys, name) for name in names})
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | ValueEstimatorBase | None = None, **hyperparams: Any
+    ) -> None:
+        """Choose how targets are made.
+
+        Args:
+            value_type: an estimator of TorchRL (TD0, TD1, TDLambda) or an instance; None for :class:`QLambdaEstimator`.
+            **hyperparams: ``gamma`` (0.99) and ``lmbda`` (0.95).
+        """
+        if value_type is None:
+            self._value_estimator = QLambdaEstimator(**hyperparams)
+            self._forward_value_estimator_keys()
+        elif isinstance(value_type, ValueEstimatorBase):
+            LossModule.make_value_estimator(self, value_type, **hyperparams)
+        else:
+            supported = (ValueEstimators.TD0, ValueEstimators.TD1, ValueEstimators.TDLambda)
+            dispatch_value_estimator(self, value_type, supported=supported, **hyperparams)
+
+    def _default_value_estimator(self) -> None:
+        self.make_value_estimator()
+
+    def prepare(self, batch: TensorDictBase) -> TensorDict:
+        """Insert the final observations, once for all minibatches; rows of the result are what :meth:`forward` takes.
+
+        Args:
+            batch: sequences [N], or a stock batch [B, T].
+
+        Returns:
+            TensorDict [N], see :func:`insert_final_observations`.
+        """
+        names = ("action", "is_init", "reward", "terminated", "truncated")
+        batch = standard_names(batch, **{name: getattr(self.tensor_keys, name) for name in names})
+        return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in)
+
+    @dispatch  # type: ignore[untyped-decorator]
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss and metrics of a batch.
+
+        Args:
+            tensordict: sequences [N], a stock batch [B, T], or rows of what :meth:`prepare` gave.
+
+        Returns:
+            The out keys.
+
+        Raises:
+            KeyError: an entry is missing.
+            ValueError: a needed next observation or recurrent state is not in the batch.
+        """
+        data = tensordict if "position" in tensordict else self.prepare(tensordict)
+        with self._online():
+            q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
+        steps = data["reward"].shape[1] - (self.bootstrap == "last")
+        position, action = data["position"][:, :steps], data["action"][:, :steps]
+        q_here = q.gather(1, position.unsqueeze(-1).expand(-1, -1, q.shape[-1]))
+        if action.shape == q_here.shape:
+            chosen = (q_here * action).sum(-1)
+        else:
+            chosen = q_here.gather(-1, action.reshape(*position.shape, 1)).squeeze(-1)
+        target = self.targets(data, q.detach(), steps)
+        error = chosen - target
+        loss = self._reduce_loss(0.5 * error.square(), tensordict, weights=self._maybe_get_priority_weight(tensordict))
+        error, chosen = error.detach(), chosen.detach()
+        means = {"q_mean": chosen.mean(), "target_mean": target.mean(), "td_error": error.abs().mean()}
+        return TensorDict(loss=loss, **means, batch_size=[])
+
+    def _online(self) -> AbstractContextManager[Any]:
+        if not self._functional:
+            return nullcontext()
+        return self.value_network_params.to_module(self.value_network, preserve_module_state=False)  # type: ignore[no-any-return]
+
+    @torch.no_grad()
+    def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
+        """Returns of the first ``steps`` steps.
+
+        Args:
+            data: from :meth:`prepare`.
+            q: float [B, L + K, A], Q-values along the extended sequence.
+            steps: S.
+
+        Returns:
+            float [B, S].
+        """
+        next_value = self.next_values(data, q, steps)
+        keys = self.tensor_keys
+        outcome = TensorDict(batch_size=next_value.shape)
+        outcome["next", keys.reward] = data["reward"][:, :steps, None]
+        outcome["next", keys.terminated] = data["terminated"][:, :steps, None]
+        outcome["next", keys.done] = (data["cut"] | data["terminated"])[:, :steps, None]
+        estimate: Callable[..., Tensor] = self.value_estimator.value_estimate
+        return estimate(outcome, next_value=next_value.unsqueeze(-1)).squeeze(-1)
+
+    @torch.no_grad()
+    def next_values(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
+        """Best Q-values of the true next observations, float [B, S]; of the target network if there is one."""
+        if self.delay_value:
+            with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
+                q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
+        value = q.amax(-1)
+        following = (data["position"][:, :steps] + 1).clamp_max(value.shape[1] - 1)
+        return value.gather(1, following)
+
+
+class PQN(Learner):
+    """Learns from every window for some epochs, then forgets it.
+
+    Args:
+        network: writes ``action_value``.
+        config: numbers of PQN.
+        training: of the run.
+    """
+
+    config: PQNConfig
+    loss: PQNLoss
+
+    def __init__(self, network: TensorDictModuleBase, config: PQNConfig, training: Training) -> None:
+        loss = PQNLoss(network, time_limit=config.time_limit, bootstrap=config.bootstrap, functional=False)
+        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
+        super().__init__(loss, config, training, optimizer="radam")
+
+    def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
+        """Learn from one window.
+
+        Args:
+            batch: sequences [num_envs] of ``ArcadeCollector.collect()``.
+            frames: frames counted before this window.
+
+        Returns:
+            Means over the gradient steps, by column of ``metrics.csv``.
+
+        Raises:
+            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
+        """
+        self.check_rewards(batch)
+        data, config = self.loss.prepare(batch), self.config
+        frames_per_step = config.frames_per_update / config.grad_steps_per_update
+        for _ in range(config.epochs):
+            for rows in self.minibatches(len(data)):
+                self.gradient_step(data[rows], frames)
+                frames += frames_per_step
+        return self.take_metrics()

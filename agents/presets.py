@@ -4,9 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from arcade_torch.agents.checks import require
-from arcade_torch.agents.config import GROUPS, TrainConfig, coerce
+from arcade_torch.agents.config import GROUPS, TrainConfig
 from arcade_torch.agents.dqn import DQNConfig
+from arcade_torch.agents.learner import coerce, require
 from arcade_torch.agents.ppo import PPOConfig
 from arcade_torch.agents.pqn import PQNConfig
 
@@ -81,7 +81,7 @@ def _for_algorithm(name: str, base: TrainConfig, algorithm: Any) -> TrainConfig:
 def _paper_budget(base: TrainConfig, env: str) -> TrainConfig:
     """The published number of frames of a game; AutoEncode explores for twice the usual share of it."""
     if env.startswith("AutoEncode"):
-        shares: dict[str, Any] = {"epsilon_share": 0.8, "learning_rate_share": 0.2}
+        shares: dict[str, Any] = {"exploration_fraction": 0.8, "lr_decay_fraction": 0.2}
         pqn, dqn = dataclasses.replace(base.pqn, **shares), dataclasses.replace(base.dqn, **shares)
         return dataclasses.replace(base, total_frames=10_000_000, pqn=pqn, dqn=dqn)
     if env.startswith(("CartPole", "NoisyCartPole", "NoisyPole")):
@@ -92,15 +92,15 @@ def _paper_budget(base: TrainConfig, env: str) -> TrainConfig:
 _SMALL_PQN = PQNConfig(
     num_envs=64,
     num_steps=32,
-    context=0,
+    overlap=0,
     epochs=2,
     minibatches=16,
     lam=0.8,
     learning_rate=5e-4,
     learning_rate_end=5e-6,
-    learning_rate_share=1.0,
+    lr_decay_fraction=1.0,
     max_grad_norm=1.0,
-    epsilon_share=0.4,
+    exploration_fraction=0.4,
     warmup_steps=150,
     time_limit="terminal",
 )
@@ -118,15 +118,15 @@ _SMALL_PPO = PPOConfig(
 _SMALL_DQN = DQNConfig(
     num_envs=64,
     num_steps=32,
-    context=0,
+    overlap=0,
     epochs=1,
     minibatches=16,
     lam=0.8,
     learning_rate=1e-3,
     learning_rate_end=5e-5,
-    learning_rate_share=1.0,
+    lr_decay_fraction=1.0,
     max_grad_norm=1.0,
-    epsilon_share=0.4,
+    exploration_fraction=0.4,
     warmup_steps=150,
     time_limit="terminal",
     replay_frames=100_000,

@@ -1,27 +1,31 @@
-"""Toy recurrent networks and a random stream of experience with known final frames."""
+"""What tests of losses share: toy recurrent networks, fabricated experience whose true next frames are known, and slow
+oracles that know nothing of windows.
+"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from tensordict import NonTensorData, TensorDict
+from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.models.actor_critic import ActorCriticNetwork
+from arcade_torch.agents.sequences import unroll
+from arcade_torch.models import ActorCriticNetwork, MemoryNetwork
 
-ACTIONS = 5
+ACTIONS, WIDTH = 5, 6
+GAMMA, LAM = 0.9, 0.7
 
 
-class ToyNetwork(nn.Module):
-    """The interface of MemoryNetwork over a tiny gated recurrence, stepped by a plain loop."""
+class ToyEncoder(nn.Module):
+    """One linear layer."""
 
-    def __init__(self, seed: int = 0, width: int = 6, pixels: int = 12, outputs: int = ACTIONS) -> None:
+    obs_size, feature_size, amp = 2, WIDTH, False
+
+    def __init__(self) -> None:
         super().__init__()
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            self.eye = nn.Linear(pixels, width)
-            self.inner = nn.Linear(width + ACTIONS + width, width)
-            self.head = nn.Linear(width, outputs)
-        self.width = width
+        self.eye = nn.Linear(12, WIDTH)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return torch.tanh(self.eye(pixels.flatten(-3).to(self.eye.weight.dtype) / 255))
 
     def compress(self, pixels: Tensor) -> Tensor:
         return pixels
@@ -29,40 +33,42 @@ class ToyNetwork(nn.Module):
     def calibrate(self, pixels: Tensor) -> None:
         pass
 
-    def encode(self, pixels: Tensor) -> Tensor:
-        return torch.tanh(self.eye(pixels.flatten(-3).to(self.eye.weight.dtype) / 255))
 
-    def remember(self, features, last_action, is_init, state):
+class ToyMemory(nn.Module):
+    """A tiny gated recurrence, stepped by a plain loop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = nn.Linear(WIDTH + ACTIONS + WIDTH, WIDTH)
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         h, out = state["h"], []
-        action = nn.functional.one_hot(last_action, ACTIONS).to(features.dtype)
-        for t in range(features.shape[1]):
+        for t in range(x.shape[1]):
             h = torch.where(is_init[:, t, None], 0.0, h)
-            h = h + 0.5 * torch.tanh(self.inner(torch.cat((features[:, t], action[:, t], h), -1)))
-            out.append(self.head(h))
+            h = h + 0.5 * torch.tanh(self.inner(torch.cat((x[:, t], h), -1)))
+            out.append(h)
         return torch.stack(out, 1), TensorDict({"h": h}, [h.shape[0]])
 
-    def forward(self, pixels, last_action, is_init, state):
-        return self.remember(self.encode(pixels), last_action, is_init, state)
-
     def initial_state(self, batch_size: int) -> TensorDict:
-        return TensorDict({"h": self.head.weight.new_zeros(batch_size, self.width)}, [batch_size])
+        return TensorDict({"h": self.inner.weight.new_zeros(batch_size, WIDTH)}, [batch_size])
+
+
+def toy_network(seed: int = 0, outputs: int = ACTIONS, **keys) -> MemoryNetwork:
+    """The package's network around toy parts."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return MemoryNetwork(ToyEncoder(), ToyMemory(), nn.Linear(WIDTH, outputs), **keys)  # type: ignore[arg-type]
 
 
 def toy_actor_critic(seed: int = 0) -> ActorCriticNetwork:
     """Two toys behind the interface of an actor-critic."""
-    return ActorCriticNetwork(ToyNetwork(seed), ToyNetwork(seed + 1, outputs=1))  # type: ignore[arg-type]
-
-
-class Pool:
-    """What a batch's ``next_pool`` must offer."""
-
-    def __init__(self, pixels: Tensor) -> None:
-        self.pixels = pixels
+    actor = toy_network(seed, out_key="logits", state_key=("memory", "actor"))
+    return ActorCriticNetwork(actor, toy_network(seed + 1, 1, out_key="state_value", state_key=("memory", "critic")))
 
 
 @dataclass
 class Stream:
-    """Random experience; ``final`` is the true next frame of every step."""
+    """Random experience; ``final`` is the true next frame of every step. A seam is a start without an end before it."""
 
     pixels: Tensor
     final: Tensor
@@ -74,88 +80,145 @@ class Stream:
     truncated: Tensor
     state: TensorDict
 
-    def sequences(self, final_frames: str = "all") -> TensorDict:
-        """As ArcadeCollector.collect() gives it: each frame stored once, a pool for the others, in shuffled places."""
-        done = self.terminated | self.truncated
-        wanted = {"all": done, "truncated": self.truncated, "none": torch.zeros_like(done)}[final_frames].clone()
-        wanted[:, -1] = True
-        row, step = wanted.nonzero(as_tuple=True)
-        place = torch.randperm(len(row), generator=torch.Generator().manual_seed(1))
-        pool = torch.empty((len(row), *self.pixels.shape[2:]), dtype=torch.uint8)
-        pool[place] = self.final[row, step]
-        slot = torch.full(done.shape, -1)
-        slot[row, step] = place
-        return TensorDict(
-            {
-                **self._roots(),
-                "next": {**self._ends(), "frame_slot": slot.unsqueeze(-1)},
-                "next_pool": NonTensorData(Pool(pool), batch_size=[done.shape[0]]),
-                "initial_state": self.state,
-            },
-            batch_size=[done.shape[0]],
-        )
+    @property
+    def cut(self) -> Tensor:
+        """bool [B, T]: the record ends behind this step though nothing terminated."""
+        seam = torch.cat((self.is_init[:, 1:], torch.zeros_like(self.is_init[:, :1])), 1)
+        return (self.truncated | seam) & ~self.terminated
+
+    def sequences(self, final_frames: str = "truncated") -> TensorDict:
+        """As ``ArcadeCollector.collect()`` gives it, one place more than needed: unused ones hold white frames."""
+        rows, steps = self.action.shape
+        batch = TensorDict(self._entries(), [rows])
+        batch["initial_state"] = self.state
+        if final_frames == "all":
+            return batch.set(("next", "pixels"), self.final)
+        wanted = self.cut.clone() if final_frames == "truncated" else torch.zeros_like(self.cut)
+        wanted[:, -1] = ~self.terminated[:, -1] & ((final_frames == "truncated") | ~self.truncated[:, -1])
+        places = int(wanted.sum(1).max()) + 1
+        frames = torch.full((rows, places, *self.final.shape[2:]), 255, dtype=torch.uint8)
+        index, mask = torch.full((rows, places), steps - 1), torch.zeros(rows, places, dtype=torch.bool)
+        for row in range(rows):
+            at = wanted[row].nonzero().flatten()
+            frames[row, : len(at)], index[row, : len(at)], mask[row, : len(at)] = self.final[row, at], at, True
+        return batch.update({"final_pixels": frames, "final_index": index, "final_mask": mask})
 
     def stock(self) -> TensorDict:
-        """As a TorchRL collector gives it: dense next frames; the state of a step where its policy wrote it."""
-        rows, steps = self.action.shape
-        state = torch.full((rows, steps, self.state["h"].shape[-1]), torch.nan, dtype=self.state["h"].dtype)
-        state[:, 0] = self.state["h"]
-        return TensorDict(
-            {**self._roots(), "memory": {"h": state}, "next": {**self._ends(), "pixels": self.final}},
-            batch_size=[rows, steps],
-        )
+        """As a TorchRL collector gives it: dense next frames; the state of a step, of which only the first counts."""
+        batch = TensorDict(self._entries(), self.action.shape)
+        batch["next"].update({"pixels": self.final, "last_action": self.action})
+        for key, first in self.state.items(True, True):
+            unknown = torch.nan if first.is_floating_point() else -1
+            value = torch.full((*self.action.shape, *first.shape[1:]), unknown, dtype=first.dtype)
+            value[:, 0] = first
+            batch[key] = value
+        return batch
 
-    def _roots(self):
-        return {
-            "pixels": self.pixels,
-            "action": self.action,
-            "last_action": self.last_action,
-            "is_init": self.is_init.unsqueeze(-1),
-        }
-
-    def _ends(self):
-        done = self.terminated | self.truncated
-        flags = {"terminated": self.terminated, "truncated": self.truncated, "done": done}
-        return {"reward": self.reward.unsqueeze(-1), **{k: v.unsqueeze(-1) for k, v in flags.items()}}
+    def _entries(self) -> dict:
+        flags = {"terminated": self.terminated, "truncated": self.truncated, "done": self.terminated | self.truncated}
+        after = {key: value.unsqueeze(-1) for key, value in (flags | {"reward": self.reward}).items()}
+        roots = {"pixels": self.pixels, "action": self.action, "last_action": self.last_action}
+        return roots | {"is_init": self.is_init.unsqueeze(-1), "next": after}
 
 
-def stream(rows: int, steps: int, seed: int, end_share: float = 0.3, width: int = 6, size: int = 2) -> Stream:
+def stream(rows: int, steps: int, seed: int, ends: float = 0.3, seams: float = 0.0) -> Stream:
     """A random stream that starts in mid-episode in some rows."""
     g = torch.Generator().manual_seed(seed)
-    frames = torch.randint(256, (rows, steps, size, size, 3), generator=g, dtype=torch.uint8)
-    final = torch.randint(256, (rows, steps, size, size, 3), generator=g, dtype=torch.uint8)
+    frames, final = (torch.randint(256, (rows, steps, 2, 2, 3), generator=g, dtype=torch.uint8) for _ in range(2))
     action = torch.randint(ACTIONS, (rows, steps), generator=g)
-    terminated, truncated = (torch.rand(rows, steps, generator=g) < end_share / 2 for _ in range(2))
-    done = terminated | truncated
-    final[:, :-1] = torch.where(done[:, :-1, None, None, None], final[:, :-1], frames[:, 1:])
+    terminated, truncated = (torch.rand(rows, steps, generator=g) < ends / 2 for _ in range(2))
+    over = terminated | truncated | (torch.rand(rows, steps, generator=g) < seams)
+    final[:, :-1] = torch.where(over[:, :-1, None, None, None], final[:, :-1], frames[:, 1:])
     first = torch.rand(rows, 1, generator=g) < 0.3
     return Stream(
         pixels=frames,
         final=final,
         action=action,
         last_action=torch.cat((torch.randint(ACTIONS, (rows, 1), generator=g), action[:, :-1]), 1),
-        is_init=torch.cat((first, done[:, :-1]), 1),
+        is_init=torch.cat((first, over[:, :-1]), 1),
         reward=torch.randn(rows, steps, generator=g),
         terminated=terminated,
         truncated=truncated,
-        state=TensorDict({"h": torch.randn(rows, width, generator=g)}, [rows]),
+        state=TensorDict({"memory": {"h": torch.randn(rows, WIDTH, generator=g)}}, [rows]),
     )
 
 
+def with_two_states(s: Stream) -> Stream:
+    """The stream as an actor-critic would have acted it: a state for each tower."""
+    h = s.state["memory", "h"]
+    other = torch.randn(h.shape, generator=torch.Generator().manual_seed(0))
+    towers = {"memory": {"actor": {"h": h}, "critic": {"h": other}}}
+    return replace(s, state=TensorDict(towers, s.state.batch_size))
+
+
 @torch.no_grad()
-def replay(network: nn.Module, s: Stream) -> tuple[Tensor, Tensor]:
-    """One step of one row at a time: Q of every observation [B, T, A], best Q of every true next observation [B, T]."""
-    q_all, next_all = [], []
+def play(network: MemoryNetwork, s: Stream) -> tuple[Tensor, Tensor]:
+    """One step of one row at a time: outputs for every observation and for every true next one, both [B, T, A]."""
+    here, after = [], []
     for b in range(s.action.shape[0]):
-        state = s.state[b : b + 1]
-        q_row, next_row = [], []
+        row = s.state[b : b + 1]
+        state = row[network.state_keys[0][:-1]] if network.state_keys else network.initial_state(1)
         for t in range(s.action.shape[1]):
-            root = s.pixels[b, None, t, None], s.last_action[b, None, t, None], s.is_init[b, None, t, None]
-            q, state = network(*root, state)
-            no = torch.zeros(1, 1, dtype=torch.bool)
-            after, _ = network(s.final[b, None, t, None], s.action[b, None, t, None], no, state)
-            q_row.append(q[0, 0])
-            next_row.append(after.max())
-        q_all.append(torch.stack(q_row))
-        next_all.append(torch.stack(next_row))
-    return torch.stack(q_all), torch.stack(next_all)
+
+            def step(frames, last, start, state, b=b, t=t):
+                at = (slice(b, b + 1), slice(t, t + 1))
+                return network.remember(network.encode(frames[at]), last[at], start[at], state)
+
+            out, state = step(s.pixels, s.last_action, s.is_init, state)
+            following, _ = step(s.final, s.action, torch.zeros_like(s.is_init), state)
+            here.append(out[0, 0])
+            after.append(following[0, 0])
+    shape = (*s.action.shape, -1)
+    return torch.stack(here).view(shape), torch.stack(after).view(shape)
+
+
+def chosen(out: Tensor, action: Tensor) -> Tensor:
+    """Entries [B, T] of [B, T, A]."""
+    return out.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
+def lambda_return(reward: Tensor, after: Tensor, terminated: Tensor, cut: Tensor, gamma: float, lam: float) -> Tensor:
+    """G[t] as a mixture of n-step returns, (1 - lam) lam^(n - 1), the last with what is left: no recursion."""
+    out = torch.zeros_like(reward)
+    for b in range(reward.shape[0]):
+        r, v, ends, cuts = (x[b].tolist() for x in (reward, after, terminated, cut))
+        for t in range(len(r)):
+            total, weight, discounted = 0.0, 1.0, 0.0
+            for n, k in enumerate(range(t, len(r))):
+                discounted += gamma**n * r[k]
+                tail = 0.0 if ends[k] else gamma ** (n + 1) * v[k]
+                if ends[k] or cuts[k] or k == len(r) - 1:
+                    total += weight * (discounted + tail)
+                    break
+                total += weight * (1 - lam) * (discounted + tail)
+                weight *= lam
+            out[b, t] = total
+    return out
+
+
+def summed_errors(
+    reward: Tensor, value: Tensor, after: Tensor, terminated: Tensor, cut: Tensor, gamma: float, lam: float
+) -> Tensor:
+    """The generalised advantage estimate as the sum over future errors, written out for every step."""
+    out = torch.zeros_like(reward)
+    for b in range(reward.shape[0]):
+        r, v, w, ends, cuts = (x[b].tolist() for x in (reward, value, after, terminated, cut))
+        for t in range(len(r)):
+            weight, total = 1.0, 0.0
+            for k in range(t, len(r)):
+                total += weight * (r[k] + (0.0 if ends[k] else gamma * w[k]) - v[k])
+                if ends[k] or cuts[k]:
+                    break
+                weight *= gamma * lam
+            out[b, t] = total
+    return out
+
+
+@torch.no_grad()
+def look_into(loss, batch: TensorDict) -> tuple[Tensor, Tensor, Tensor]:
+    """Q-values [B, L, A], targets [B, S] and next values [B, S] of a loss of Q-values."""
+    data = loss.prepare(batch)
+    steps = data["reward"].shape[1] - (loss.bootstrap == "last")
+    q = unroll(loss.value_network, loss.inputs, data, "action_value")
+    here = q.gather(1, data["position"].unsqueeze(-1).expand(-1, -1, q.shape[-1]))
+    return here, loss.targets(data, q, steps), loss.next_values(data, q, steps)

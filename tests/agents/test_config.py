@@ -13,12 +13,12 @@ from arcade_torch.agents.presets import preset, preset_names
 
 def test_the_defaults_are_the_papers_numbers():
     c, p = TrainConfig(), PQNConfig()
-    assert (p.num_envs, p.num_steps, p.context, p.epochs, p.minibatches) == (16, 128, 4, 4, 16)
+    assert (p.num_envs, p.num_steps, p.overlap, p.epochs, p.minibatches) == (16, 128, 4, 4, 16)
     assert (p.gamma, p.lam, p.max_grad_norm, p.warmup_steps) == (0.99, 0.95, 0.5, 132)
     assert (p.learning_rate, p.learning_rate_end, p.epsilon_start, p.epsilon_end) == (5e-5, 5e-7, 1.0, 0.05)
-    assert (p.learning_rate_share * c.total_frames, p.epsilon_share * c.total_frames) == (2e6, 8e6)
+    assert (p.lr_decay_fraction * c.total_frames, p.exploration_fraction * c.total_frames) == (2e6, 8e6)
     assert c.num_updates == 9_765
-    assert c.num_updates * p.grad_steps_per_update == 624_960
+    assert c.num_updates * p.epochs * p.minibatches == 624_960
 
 
 @pytest.mark.parametrize(
@@ -33,8 +33,8 @@ def test_the_defaults_are_the_papers_numbers():
 def test_the_paper_preset_knows_the_budget_of_each_game(env, frames, epsilon_frames, learning_rate_frames):
     c = preset("paper", env=env)
     assert c.total_frames == frames
-    assert c.pqn.epsilon_share * c.total_frames == pytest.approx(epsilon_frames)
-    assert c.pqn.learning_rate_share * c.total_frames == pytest.approx(learning_rate_frames)
+    assert c.pqn.exploration_fraction * c.total_frames == pytest.approx(epsilon_frames)
+    assert c.pqn.lr_decay_fraction * c.total_frames == pytest.approx(learning_rate_frames)
 
 
 def test_the_reference_preset_is_the_paper_with_the_published_quirks():
@@ -50,7 +50,7 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
 
 def test_the_small_preset_takes_3104_gradient_steps_in_200k_frames():
     c = preset("small")
-    assert c.num_updates * c.pqn.grad_steps_per_update == 3104
+    assert c.num_updates * c.pqn.epochs * c.pqn.minibatches == 3104
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -113,21 +113,20 @@ BAD = [
         for v in (0, -1)
     ],
     *[(a, "warmup_steps", -1) for a in ("pqn", "ppo", "dqn")],
-    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("gamma", "lam", "learning_rate_share") for v in (-0.1, 1.1)],
+    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("gamma", "lam", "lr_decay_fraction") for v in (-0.1, 1.1)],
     *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("learning_rate", "max_grad_norm") for v in (0.0, -1.0)],
     *[(a, "gamma", float("nan")) for a in ("pqn", "ppo", "dqn")],
     *[(a, "learning_rate_end", -1e-9) for a in ("pqn", "ppo", "dqn")],
     *[(a, "time_limit", "never") for a in ("pqn", "ppo", "dqn")],
     *[(a, "minibatches", 7) for a in ("pqn", "ppo", "dqn")],
-    *[(a, f, 1.5) for a in ("pqn", "dqn") for f in ("epsilon_start", "epsilon_end", "epsilon_share")],
-    *[(a, "context", v) for a in ("pqn", "dqn") for v in (-1, 129)],
+    *[(a, f, 1.5) for a in ("pqn", "dqn") for f in ("epsilon_start", "epsilon_end", "exploration_fraction")],
+    *[(a, "overlap", v) for a in ("pqn", "dqn") for v in (-1, 129)],
     ("pqn", "bootstrap", "first"),
     ("ppo", "clip", 0.0),
-    ("ppo", "entropy_weight", -0.1),
-    ("ppo", "value_weight", -0.1),
+    ("ppo", "entropy_coeff", -0.1),
+    ("ppo", "critic_coeff", -0.1),
     ("dqn", "batch_sequences", 0),
     ("dqn", "learning_starts", 0),
-    ("dqn", "replay_ram", -1),
     ("dqn", "burn_in", -1),
     ("dqn", "burn_in", 132),
     ("dqn", "target_every", -1),
@@ -169,3 +168,55 @@ def test_every_preset_has_numbers_for_every_algorithm():
         for algorithm in GROUPS:
             config = preset(name, algorithm=algorithm)
             assert config.learner is getattr(config, algorithm) and config.num_updates >= 1
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "old", "new"),
+    [
+        ("pqn", "learning_rate_share", "lr_decay_fraction"),
+        ("dqn", "epsilon_share", "exploration_fraction"),
+        ("ppo", "entropy_weight", "entropy_coeff"),
+        ("ppo", "value_weight", "critic_coeff"),
+    ],
+)
+def test_names_of_version_01_are_taken_with_a_warning(algorithm, old, new):
+    with pytest.warns(FutureWarning, match=rf"{algorithm}\.{old} is called {new} since 0\.2; 0\.3 drops the old name"):
+        c = preset("small", algorithm=algorithm, **{algorithm: {old: 0.25}})
+    assert getattr(c.learner, new) == 0.25 and TrainConfig.from_dict(c.to_dict()) == c
+    with pytest.warns(FutureWarning, match="context is called overlap"):
+        assert preset("small", pqn={"context": 3}).pqn.overlap == 3
+
+
+@pytest.mark.parametrize("algorithm", GROUPS)
+def test_a_schedule_is_counted_in_frames(algorithm):
+    numbers, total = GROUPS[algorithm](), 20_000_000
+    fall = {"ppo": total}.get(algorithm, 2_000_000)
+    start, end = numbers.learning_rate, numbers.learning_rate_end
+    for frames in (0, fall // 2, fall, total):
+        expected = end if frames >= fall else start + (end - start) * frames / fall
+        assert numbers.learning_rate_at(frames, total) == pytest.approx(expected)
+    if algorithm != "ppo":
+        found = [numbers.epsilon_at(frames, total) for frames in (0, 4_000_000, 8_000_000, total)]
+        assert found == pytest.approx([1.0, 0.525, 0.05, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"cuda_graphs": True}, "cuda_graphs must be false on device 'cpu'; it needs a CUDA device; got True"),
+        ({"amp": 1}, "amp must be true or false; got 1"),
+        ({"logger": "paper"}, "logger must be 'none', 'tensorboard' or 'wandb'"),
+    ],
+)
+def test_what_a_machine_cannot_do_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        preset("smoke", **change)
+    for field in ("amp", "compile"):  # they change numbers, so they make another run
+        assert differing_fields(preset("smoke"), preset("smoke", **{field: True})) == [f"{field} (False != True)"]
+    config = preset("smoke", device="cuda", cuda_graphs=True)
+    assert TrainConfig.from_dict(config.to_dict()) == config
+
+
+def test_a_device_that_torch_does_not_know_gets_one_line():
+    with pytest.raises(ValueError, match=r"^device must be a torch device such as 'cpu' or 'cuda:0'; got 'foo'$"):
+        preset("small", device="foo")

@@ -1,72 +1,79 @@
-"""The DQN loss: targets, burn-in, target network."""
+"""What DQN adds to the loss of PQN: one-step targets, stored targets, burn-in."""
 
 import pytest
 import torch
 
-from arcade_torch.agents.dqn import DQNConfig, DQNLoss
-from tests.agents.fakes import ToyNetwork, replay, stream
-
-GAMMA = 0.9
+from arcade_torch.agents import DQNConfig, DQNLoss
+from tests.agents.fakes import GAMMA, chosen, look_into, play, stream, toy_network
 
 
-def test_one_step_targets_equal_those_of_a_step_by_step_replay():
-    network, s = ToyNetwork(), stream(4, 8, seed=1)
-    q, after = replay(network, s)
-    loss = DQNLoss(network, GAMMA)
-    out = loss.compute(loss.read(s.sequences("truncated")))
-    expected = s.reward + GAMMA * after * ~s.terminated
-    torch.testing.assert_close(out.target, expected, atol=1e-5, rtol=1e-5)
-    chosen = q.gather(-1, s.action.unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(out.loss.detach(), 0.5 * (chosen - expected).square().mean(), atol=1e-5, rtol=1e-5)
+def make_loss(network, **options):
+    loss = DQNLoss(network, **options)
+    loss.make_value_estimator(gamma=GAMMA, lmbda=0.0)
+    return loss
 
 
-def test_gamma_zero_predicts_rewards():
-    network, s = ToyNetwork(), stream(4, 8, seed=2)
-    loss = DQNLoss(network, 0.0)
-    assert torch.equal(loss.compute(loss.read(s.sequences())).target, s.reward)
+def test_targets_are_one_step_targets_unless_told_otherwise():
+    network, s = toy_network(), stream(4, 8, seed=1)
+    q, after = play(network, s)
+    loss = DQNLoss(network)  # gamma 0.99, lambda 0
+    wanted = s.reward + 0.99 * after.amax(-1) * ~s.terminated
+    torch.testing.assert_close(look_into(loss, s.sequences())[1], wanted, atol=1e-5, rtol=1e-5)
+    error = 0.5 * (chosen(q, s.action) - wanted).square().mean()
+    torch.testing.assert_close(loss(s.sequences())["loss"].detach(), error, atol=1e-5, rtol=1e-5)
 
 
-def test_a_target_network_gives_the_next_values_and_no_gradient():
-    network, other, s = ToyNetwork(0), ToyNetwork(5), stream(3, 7, seed=3)
-    _, after = replay(other, s)
-    loss = DQNLoss(network, GAMMA, target_network=other)
-    out = loss.compute(loss.read(s.sequences("truncated")))
-    torch.testing.assert_close(out.target, s.reward + GAMMA * after * ~s.terminated, atol=1e-5, rtol=1e-5)
-    out.loss.backward()
-    assert all(p.grad is None for p in other.parameters()) and all(p.grad is not None for p in network.parameters())
+def test_stored_targets_are_used_as_they_are():
+    network, s = toy_network(), stream(3, 7, seed=4)
+    loss, target = make_loss(network), torch.randn(3, 7)
+    error = 0.5 * (chosen(play(network, s)[0], s.action) - target).square()
+    found = loss(s.sequences().set("stored_target", target))["loss"]
+    torch.testing.assert_close(found.detach(), error.mean(), atol=1e-5, rtol=1e-5)
+    found = make_loss(network, burn_in=2)(s.sequences().set("stored_target", target))["loss"]
+    torch.testing.assert_close(found.detach(), error[:, 2:].mean(), atol=1e-5, rtol=1e-5)
+    stored = look_into(loss, s.sequences())[1]  # by the same network: as if worked out now
+    same = loss(s.sequences().set("stored_target", stored))["loss"]
+    torch.testing.assert_close(same, loss(s.sequences())["loss"])
 
 
-def test_stored_targets_are_used_as_they_are_and_final_frames_are_not_read():
-    network, s = ToyNetwork(), stream(3, 7, seed=4)
-    loss = DQNLoss(network, GAMMA, targets="stored")
-    window = loss.read(s.sequences())
-    target = torch.randn(3, 7)
-    out = loss.compute(window.roots().with_extras(target=target))
-    q, _ = replay(network, s)
-    chosen = q.gather(-1, s.action.unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(out.loss.detach(), 0.5 * (chosen - target).square().mean(), atol=1e-5, rtol=1e-5)
-    assert torch.equal(out.target, target)
-
-
-def test_stored_and_recomputed_targets_agree_while_the_network_is_the_same():
-    network, s = ToyNetwork(), stream(3, 7, seed=5)
-    stored, fresh = DQNLoss(network, GAMMA, targets="stored"), DQNLoss(network, GAMMA)
-    window = stored.read(s.sequences())
-    target = stored.compute(window).target  # none is in the window yet: they are worked out
-    later = stored.compute(window.roots().with_extras(target=target)).loss
-    torch.testing.assert_close(later, fresh.compute(window).loss)
-
-
-def test_burn_in_steps_are_read_but_not_trained():
-    network, s = ToyNetwork(), stream(3, 8, seed=6, end_share=0.0)
-    loss = DQNLoss(network, GAMMA, burn_in=3)
-    out = loss.compute(loss.read(s.sequences()))
-    error = 0.5 * (out.chosen - out.target)[:, 3:].square().mean()
-    torch.testing.assert_close(out.loss.detach(), error)
+@pytest.mark.parametrize("ends", [0.0, 0.5])
+@pytest.mark.parametrize("form", ["sequences", "stock"])
+def test_burn_in_steps_are_read_but_not_trained(ends, form):
+    network, s = toy_network(), stream(4, 8, seed=6, ends=ends)
+    q, after = play(network, s)
+    target = s.reward + GAMMA * after.amax(-1) * ~s.terminated
+    loss = make_loss(network, burn_in=3)
+    found = loss(getattr(s, form)())["loss"].detach()
+    error = 0.5 * (chosen(q, s.action) - target)[:, 3:].square().mean()
+    torch.testing.assert_close(found, error, atol=1e-5, rtol=1e-5)
     s.reward[:, :3] += 100.0
-    assert torch.equal(loss.compute(loss.read(s.sequences())).loss, out.loss)
+    assert torch.equal(loss(getattr(s, form)())["loss"], found)
+    s.is_init[:, :4] = False
+    whole = loss(getattr(s, form)())["loss"]
     s.pixels[:, 0] = 255 - s.pixels[:, 0]
-    assert not torch.equal(loss.compute(loss.read(s.sequences())).loss, out.loss)
+    assert not torch.equal(loss(getattr(s, form)())["loss"], whole)
+
+
+def test_burn_in_carries_no_gradient():
+    """R2D2's; 0.1 let it through. The gradient is that of a window that begins where the burn-in ends."""
+    network, s = toy_network(), stream(4, 8, seed=6, ends=0.3)
+    burnt = make_loss(network, burn_in=3)
+    wanted = torch.autograd.grad(
+        make_loss(network)(later(network, s, 3).sequences())["loss"], list(network.parameters())
+    )
+    found = torch.autograd.grad(burnt(s.sequences())["loss"], list(network.parameters()))
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
+
+
+@torch.no_grad()
+def later(network, s, first):
+    """The stream from a step on, with the state that acting had there."""
+    part = (slice(None), slice(None, first))
+    features = network.encode(s.pixels[part])
+    _, state = network.remember(features, s.last_action[part], s.is_init[part], s.state["memory"])
+    rest = {name: value[:, first:] for name, value in vars(s).items() if name != "state"}
+    return type(s)(**rest, state=s.state.empty().set("memory", state))
 
 
 def test_the_defaults_are_those_of_the_published_code_but_for_fresh_targets():

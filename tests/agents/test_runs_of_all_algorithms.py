@@ -6,15 +6,15 @@ import json
 import pytest
 import torch
 
-from arcade_torch.agents import CheckpointError, NonFiniteError, evaluate, load, loop, preset, train
-from arcade_torch.agents.checkpoint import list_checkpoints
+from arcade_torch.agents import CheckpointError, NonFiniteError, evaluate, load, preset, train, training
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.files import read_csv
+from arcade_torch.agents.runs.checkpoint import list_checkpoints
+from arcade_torch.agents.runs.files import read_csv
 from tests.agents.test_training import assert_same_run, stop_after, weights
 
 ALGORITHMS = ("ppo", "dqn")  # PQN: test_training
 CHANGES = {"env": "CartPoleEasy-v0", "memory": "gru", "total_frames": 256, "checkpoint_every": 128, "eval_episodes": 4}
-MAPPED = {"dqn": {"replay_ram": 0, "target_every": 2}}
+TARGET = {"dqn": {"target_every": 2}}
 
 
 def config(algorithm, **more):
@@ -42,8 +42,8 @@ def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(who
     assert_same_run(tmp_path / "run", folder)
 
 
-def test_a_mapped_replay_with_a_target_network_goes_on_to_the_bit(tmp_path):
-    what = config("dqn", **MAPPED)
+def test_a_replay_with_a_target_network_goes_on_to_the_bit(tmp_path):
+    what = config("dqn", **TARGET)
     train(what, tmp_path / "whole")
     with pytest.raises(ZeroDivisionError):
         train(what, tmp_path / "parts", progress=stop_after(3, crash))
@@ -79,13 +79,13 @@ def test_without_any_whole_replay_the_run_is_refused(whole, tmp_path):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_nan_stops_the_run_and_the_last_good_checkpoint_stays(algorithm, tmp_path, monkeypatch):
-    made, real = [], loop.Trainer
+    made, real = [], training.Trainer
 
     def spy(*args):
         made.append(real(*args))
         return made[-1]
 
-    monkeypatch.setattr(loop, "Trainer", spy)
+    monkeypatch.setattr(training, "Trainer", spy)
 
     def poison():
         next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
@@ -117,7 +117,7 @@ def test_metrics_have_the_columns_of_their_algorithm(whole):
     what, folder, _ = whole
     rows = read_csv(folder / "metrics.csv")
     filled = {name for name, value in rows[-1].items() if value}
-    of_ppo, of_q = {"policy_loss", "value_loss", "entropy", "kl", "clip_share"}, {"epsilon", "replay_frames"}
+    of_ppo, of_q = {"policy_loss", "value_loss", "entropy", "kl", "clip_fraction"}, {"epsilon", "replay_frames"}
     assert (of_ppo <= filled, bool(of_q & filled)) == (what.algorithm == "ppo", what.algorithm != "ppo")
     assert {"loss", "q_mean", "td_error", "grad_norm", "lr", "episodes"} <= filled
     if what.algorithm == "dqn":

@@ -1,0 +1,210 @@
+"""Policies: TensorDict modules that ``env.rollout``, TorchRL's ``Collector`` and ``ArcadeCollector`` take alike."""
+
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Categorical
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import EGreedyModule, QValueModule
+
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.ppo import make_actor
+from arcade_torch.agents.runs.checkpoint import Checkpoint, load_checkpoint, load_latest
+from arcade_torch.agents.runs.files import CheckpointError
+from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
+from arcade_torch.models.encoders import Encoder
+from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.models.presets import make_network
+
+__all__ = ["Agent", "Network", "build_network", "load", "make_policy"]
+
+Network = MemoryNetwork | ActorCriticNetwork
+
+
+def make_policy(
+    network: Network, explore: bool = True, epsilon: float = 1.0, num_actions: int = 5
+) -> TensorDictSequential:
+    """How a network acts.
+
+    Args:
+        network: of Q-values (``action_value``), or an actor-critic (``logits``).
+        explore: for Q-values, append TorchRL's ``EGreedyModule``; for an actor-critic, sample.
+        epsilon: probability of a random action; move it by ``policy[-1].eps.fill_(...)``.
+        num_actions: A.
+
+    Returns:
+        A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it samples. Random numbers
+        come from torch's global generator.
+    """
+    if isinstance(network, ActorCriticNetwork):
+        return make_actor(network, deterministic=not explore)
+    parts: list[Any] = [network, QValueModule(action_space="categorical")]
+    if explore:
+        parts.append(EGreedyModule(Categorical(num_actions), eps_init=float(epsilon), eps_end=0.0))
+    return TensorDictSequential(*parts)
+
+
+class Agent(TensorDictModuleBase):
+    """A trained network and the config it was trained with; as a TensorDict module it is the greedy policy.
+
+    Attributes:
+        config: of the run that trained it.
+        network: on its device; see :meth:`outputs` for what its outputs mean.
+        frames: training frames behind it.
+
+    Example:
+        >>> import arcade_torch
+        >>> from arcade_torch.agents import preset
+        >>> config = preset("small", memory="gru")
+        >>> agent = Agent(config, build_network(config))
+        >>> env = arcade_torch.make("CartPoleEasy", num_envs=2)
+        >>> env.rollout(3, agent)["action"].shape
+        torch.Size([2, 3])
+    """
+
+    def __init__(self, config: TrainConfig, network: Network, frames: int = 0) -> None:
+        super().__init__()
+        self.config, self.network, self.frames = config, network, frames
+        self.policy = make_policy(network, explore=False)
+        self.in_keys, self.out_keys = self.policy.in_keys, self.policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the greedy action and what it rests on."""
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return self.policy(tensordict)
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs", "value")."""
+        return ActorCriticNetwork.offers if isinstance(self.network, ActorCriticNetwork) else ("q", "value")
+
+    def initial_state(self, batch_size: int) -> TensorDictBase:
+        """Recurrent state before the first observation, TensorDict [N]."""
+        return self.network.initial_state(batch_size)
+
+    @torch.no_grad()
+    def act(self, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, dict[str, Tensor], TensorDictBase]:
+        """Greedy actions, with the recurrent state as an argument and a result.
+
+        Args:
+            obs: root entries ``pixels`` [N, ...], ``last_action`` int64 [N], ``is_init`` bool [N, 1].
+            state: recurrent state, TensorDict [N].
+
+        Returns:
+            ``(action int64 [N], extras, new state)``, with the extras ``q_value`` float32 [N, A], or ``logits`` [N, A]
+            and ``state_value`` [N].
+        """
+        pixels = obs.get("pixels").unsqueeze(1)
+        steps = pixels.shape[0], 1
+        last_action, is_init = obs.get("last_action").reshape(steps), obs.get("is_init").reshape(steps)
+        out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
+        out = out.squeeze(1)
+        if isinstance(self.network, ActorCriticNetwork):
+            logits, value = self.network.split(out)
+            return logits.argmax(-1), {"logits": logits, "state_value": value}, state
+        return out.argmax(-1), {"q_value": out}, state
+
+    def outputs(self, out: Tensor, what: str) -> Tensor:
+        """Read what ``network.remember`` gave as one of :attr:`offers`.
+
+        Args:
+            out: float [..., R].
+            what: ``"q"``: Q-values; ``"logits"``, ``"probs"``: of the actions; ``"value"``: of the state (for a network
+                of Q-values, the best of them).
+
+        Returns:
+            float [..., A], for ``"value"`` [..., 1].
+
+        Raises:
+            ValueError: this agent does not offer it.
+        """
+        if what not in self.offers:
+            raise ValueError(f"this {self.config.algorithm} agent offers {', '.join(self.offers)}, not {what!r}")
+        if isinstance(self.network, ActorCriticNetwork):
+            return self.network.select(out, what)
+        return out.amax(-1, keepdim=True) if what == "value" else out
+
+
+def build_network(config: TrainConfig) -> Network:
+    """The freshly initialised network of a config; the same seed gives the same weights, and no global draw moves.
+
+    Args:
+        config: of the run.
+
+    Returns:
+        The network, on ``config.device``.
+    """
+    make: Any = make_actor_critic if config.algorithm == "ppo" else make_network
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(config.seed)
+        network: Network = make(
+            config.network, memory=config.memory, obs_size=config.obs_size, **dict(config.network_options)
+        )
+    for module in network.modules():
+        if isinstance(module, Encoder):
+            module.amp = config.amp
+    network.to(config.device)
+    return network
+
+
+def compile_network(network: nn.Module, backend: str = "inductor") -> None:
+    """Compile the parts of a network that compute, in place; weights and their names stay as they are.
+
+    Args:
+        network: whose encoders, memories and heads are compiled; a loss that holds its parameters uses the same code.
+        backend: of ``torch.compile``.
+    """
+    for module in network.modules():
+        if isinstance(module, MemoryNetwork):
+            for part in (module.encoder, module.block, module.head):
+                part.compile(backend=backend)
+
+
+def load(path: str | PathLike[str], device: str | torch.device | None = None) -> Agent:
+    """Load an agent.
+
+    Args:
+        path: a run folder (its newest whole checkpoint), its ``checkpoints`` folder, or one checkpoint folder.
+        device: where to put the network; default the device of the run if it is there, else the CPU.
+
+    Returns:
+        The agent, in evaluation mode: a policy for ``env.rollout`` and every collector.
+
+    Raises:
+        CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was found.
+    """
+    checkpoint = _find(Path(path))
+    config = checkpoint.config
+    network = build_network(replace(config, device="cpu"))
+    try:
+        network.load_state_dict(checkpoint.weights)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise CheckpointError(f"the weights in {checkpoint.path} do not fit the network: {reason}") from error
+    if device is None:
+        device = config.device if config.device == "cpu" or torch.cuda.is_available() else "cpu"
+    agent = Agent(config, network.to(device), checkpoint.frames)
+    agent.eval()
+    return agent
+
+
+def _find(path: Path) -> Checkpoint:
+    try:
+        there = path.is_dir()
+    except OSError as error:  # a name that is too long, or a folder nobody may enter
+        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
+    if not there:
+        raise CheckpointError(f"{path} is not a folder; give a run folder or one of its checkpoints")
+    if (path / "meta.json").is_file():
+        return load_checkpoint(path, weights_only=True)
+    if (path / "checkpoints").is_dir():
+        return load_latest(path / "checkpoints", weights_only=True)
+    if any(path.glob("frames-*")):
+        return load_latest(path, weights_only=True)
+    raise CheckpointError(f"{path} holds no checkpoint; give a run folder or one of its checkpoints")

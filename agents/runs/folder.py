@@ -1,0 +1,160 @@
+"""The folder of a run: who may write into it, what stands in it, how far it is."""
+
+import contextlib
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+import arcade_torch
+from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format
+from arcade_torch.agents.runs.files import CsvLog, is_final, read_json, write_json
+
+METRIC_COLUMNS = (
+    "frames", "updates", "grad_steps", "seconds", "fps",
+    "loss", "q_mean", "td_error", "grad_norm",
+    "policy_loss", "value_loss", "entropy", "kl", "clip_fraction",
+    "replay_frames", "epsilon", "lr",
+    "train_return", "train_return_ewm", "train_return_last", "episodes",
+)  # fmt: skip
+"""Columns of ``metrics.csv``; a cell that means nothing for an algorithm is empty. ``seconds`` is time spent
+collecting and learning. ``train_return`` is the mean return of the episodes that ended in the rollout (empty if none),
+``train_return_ewm`` its running average, and ``train_return_last`` the last finished return of every environment
+averaged over the rollout, which is what the paper's score reads."""
+EVAL_COLUMNS = ("frames", "mean", "std", "n")
+LOCK = "lock"
+"""File in a run folder that the process which trains there holds locked. The file itself stays; a killed process
+loses the lock at once."""
+_PACKAGES = ("torch", "torchrl", "tensordict", "jax", "numpy")
+
+
+class RunFolderError(RuntimeError):
+    """A run folder cannot be used: taken, of another run, of version 0.1, or not writable."""
+
+
+class RunFolder:
+    """Paths and small files of one run.
+
+    Args:
+        path: the folder; looked at by :meth:`check`, created by :meth:`claim`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.replay = path / "replay"
+        self._config = path / "config.json"
+        self._reported = 0.0
+
+    def check(self, config: TrainConfig, resume: bool) -> None:
+        """Refuse a folder that this run may not use; writes nothing.
+
+        Args:
+            config: of the run.
+            resume: whether a folder that holds this run already may be used.
+
+        Raises:
+            RunFolderError: the folder holds something and ``resume`` is off, holds another run, or cannot be written.
+        """
+        if self._config.is_file() and resume:
+            self._check_same(config)
+        elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
+            hint = "pass resume=True to continue it, or " if self._config.is_file() else ""
+            raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
+        existing = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+        if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+            raise RunFolderError(f"cannot write to {self.path}: {existing} is not a writable folder")
+
+    @contextlib.contextmanager
+    def claim(self, config: TrainConfig) -> Iterator[None]:
+        """Hold the folder for this process alone, and make it ready.
+
+        Creates the folder, takes its lock, removes what a killed process left half written, and writes
+        ``config.json`` unless it is there already.
+
+        Raises:
+            RunFolderError: another process trains here, the folder holds another run, or it cannot be written.
+        """
+        with contextlib.ExitStack() as held:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                held.enter_context(FileLock(self.path / LOCK).acquire(timeout=0))
+                self._prepare(config)
+            except Timeout as error:
+                raise RunFolderError(f"another process trains in {self.path}: wait for it, or stop it") from error
+            except OSError as error:
+                raise RunFolderError(f"cannot write to {self.path}: {error.strerror or error}") from error
+            yield
+
+    def _prepare(self, config: TrainConfig) -> None:
+        for draft in self.path.glob(".*.[0-9]*"):
+            draft.unlink(missing_ok=True)
+        for draft in self.checkpoints.glob(".frames-*"):
+            shutil.rmtree(draft, ignore_errors=True)
+        if self._config.is_file():
+            self._check_same(config)  # another process may have come first
+        else:
+            record = {"format": FORMAT, "config": config.to_dict(), "versions": versions(), "command": sys.argv}
+            write_json(self._config, record)
+
+    def _check_same(self, config: TrainConfig) -> None:
+        try:
+            record = read_json(self._config)
+            if reason := refuse_format(f"the run in {self.path}", record.get("format", 1)):
+                raise RunFolderError(reason)
+            saved = TrainConfig.from_dict(record["config"])
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise RunFolderError(f"{self._config} does not describe a run: {error}") from error
+        if fields := differing_fields(saved, config):
+            raise RunFolderError(f"{self.path} holds another run; differing fields: {', '.join(fields)}")
+
+    def finished(self) -> dict[str, Any] | None:
+        """The final ``eval.json`` if the run is finished; a damaged one is made again from the last checkpoint."""
+        try:
+            result = read_json(self.path / "eval.json")
+        except (OSError, ValueError):
+            return None
+        needed = ("status", "frames", "seconds", "returns", "lengths", "train_max_ewm")
+        return result if is_final(result, needed) and result["frames"] is not None else None
+
+    def open_logs(self, frames: int) -> tuple[CsvLog, CsvLog]:
+        """``metrics.csv`` and ``eval.csv``, cut back to ``frames``."""
+        return (
+            CsvLog(self.path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames),
+            CsvLog(self.path / "eval.csv", EVAL_COLUMNS, keep_frames=frames),
+        )
+
+    def report(self, frames: int, total_frames: int, status: str, **more: Any) -> None:
+        """Replace ``progress.json``; while running at most about once a second."""
+        now = time.monotonic()
+        if status == "running" and now - self._reported < 1.0:
+            return
+        self._reported = now
+        progress = {"frames": frames, "total_frames": total_frames, "status": status, **more}
+        write_json(self.path / "progress.json", progress)
+
+
+def wait_until_free(path: Path, limit_s: float) -> None:
+    """Wait until no process trains in a run folder, at most so many seconds."""
+    if (path / LOCK).is_file():
+        with contextlib.suppress(OSError), FileLock(path / LOCK).acquire(timeout=limit_s):  # Timeout is an OSError
+            pass
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    found = {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -1,0 +1,273 @@
+"""Final observations put where they belong, so that one pass over a window gives the value of every next observation.
+
+A memory model reads a window of ``L`` observations once. The value of the observation *after* a step is then the value
+at the following position, but for two cases: where an episode ended, the next position holds the first observation of
+the next episode, and after the last step there is none. There the true next observation is inserted right after its
+step, where the recurrent state that led to it reads it. For a causal memory the pass over ``L + K`` positions is exact,
+and because a batch has a fixed number of places ``K``, all shapes are static.
+"""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.modules import set_recurrent_mode
+
+from arcade_torch.models.memory import MemoryModule
+from arcade_torch.models.networks import MemoryNetwork
+
+__all__ = ["NetworkInputs", "as_steps", "insert_final_observations", "standard_names", "unroll"]
+
+Key = str | tuple[str, ...]
+
+
+class NetworkInputs:
+    """Which entries of a batch a network reads, and how its recurrent state begins.
+
+    Args:
+        network: a TensorDict module; a key that it also writes under "next" is recurrent state.
+    """
+
+    def __init__(self, network: TensorDictModuleBase) -> None:
+        keys = [unravel_key(key) for key in network.in_keys]
+        written = {unravel_key(key) for key in network.out_keys}
+        self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
+        self.observation_keys = [key for key in keys if key not in self.state_keys]
+        memories = [m for m in network.modules() if isinstance(m, MemoryModule | MemoryNetwork)]
+        self.reads_first_state_only = bool(memories) and all(m.store == "sequence" for m in memories)
+
+
+def insert_final_observations(
+    batch: TensorDictBase, inputs: NetworkInputs, time_limit: str = "bootstrap", burn_in: int = 0
+) -> TensorDict:
+    """Lay out a batch for a pass that gives the values of all next observations.
+
+    Args:
+        batch: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock TorchRL batch [N, L] or [L]
+            with dense ``("next", ...)`` observations. Entries: what the network reads, ``action``, ``is_init``,
+            ``("next", "reward" | "terminated" | "truncated")``; the recurrent state before step 0 as ``initial_state``
+            [N], or per step under the network's own keys (not needed where all rows begin with an episode).
+        inputs: of the network.
+        time_limit: ``"bootstrap"``: a truncated step needs its true next observation; ``"terminal"``: it does not.
+        burn_in: first steps that only bring the recurrent state up to date; they are kept apart.
+
+    Returns:
+        TensorDict [N] with ``extended`` [N, L + K] (what the network reads), ``position`` int64 [N, L] (where each
+        step's observation stands; its true successor stands right behind it), ``burn_in`` [N, burn_in],
+        ``initial_state`` [N], and ``reward``, ``terminated``, ``cut`` (the episode or its record ends here), ``action``
+        [N, L, ...]; L without burn-in.
+
+    Raises:
+        KeyError: an entry is missing; names it.
+        ValueError: a next observation that a target needs was not stored, or the recurrent state at step 0 is unknown.
+    """
+    if batch.ndim == 1 and _get(batch, "is_init").ndim == 2:  # one sequence [L] of a stock batch
+        batch = batch.unsqueeze(0)
+    is_init = _flat(batch, "is_init")
+    terminated, truncated = _flat(batch, ("next", "terminated")), _flat(batch, ("next", "truncated"))
+    done = terminated | truncated
+    seam = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
+    if time_limit == "terminal":
+        terminated = done
+    needed = (done | seam) & ~terminated
+    index, mask, places = _final_places(batch, needed)
+    _require_stored(needed, index, mask)
+
+    length, width = is_init.shape[1] - burn_in, index.shape[1]
+    used = mask & needed.gather(1, index) & (index >= burn_in)
+    index_here = (index - burn_in).clamp_min(0)
+    steps = torch.arange(length, device=is_init.device)
+    before = (used.unsqueeze(1) & (index_here.unsqueeze(1) < steps[:, None])).sum(-1)
+    position = steps + before  # of each observation
+    slot = torch.where(
+        used, position.gather(1, index_here) + 1, length + used.sum(1, keepdim=True) + (~used).cumsum(1) - 1
+    )
+    order = torch.empty(len(is_init), length + width, dtype=torch.int64, device=is_init.device)
+    order.scatter_(1, position, steps.expand(len(is_init), -1))
+    order.scatter_(1, slot, length + torch.arange(width, device=is_init.device).expand(len(is_init), -1))
+
+    out = TensorDict(
+        position=position,
+        action=_get(batch, "action")[:, burn_in:],
+        reward=_flat(batch, ("next", "reward"))[:, burn_in:],
+        terminated=terminated[:, burn_in:],
+        cut=(done | seam)[:, burn_in:],
+        batch_size=[len(is_init)],
+    )
+    roots = {key: _get(batch, key) for key in inputs.observation_keys}
+    if "is_init" in roots:
+        roots["is_init"] = is_init.unsqueeze(-1)
+    out["extended"] = TensorDict(
+        {key: _reorder(roots[key][:, burn_in:], places(key), order) for key in inputs.observation_keys},
+        batch_size=order.shape,
+    )
+    if burn_in:
+        out["burn_in"] = TensorDict({key: root[:, :burn_in] for key, root in roots.items()}, [len(is_init), burn_in])
+    _add_state(out, batch, inputs, is_init, order, burn_in)
+    return out
+
+
+def standard_names(batch: TensorDictBase, **names: Key) -> TensorDictBase:
+    """A batch in which entries of other names also stand under those that :func:`insert_final_observations` reads.
+
+    Args:
+        batch: see there.
+        **names: where ``action``, ``is_init``, and under "next" ``reward``, ``terminated``, ``truncated`` stand.
+
+    Returns:
+        The batch, or a copy that shares its tensors.
+    """
+    other = {wanted: name for wanted, name in names.items() if name != wanted}
+    if other:
+        batch = batch.copy()
+    for wanted, name in other.items():
+        after = wanted in ("reward", "terminated", "truncated")
+        batch[("next", wanted) if after else wanted] = _get(batch, unravel_key(("next", name)) if after else name)
+    return batch
+
+
+def unroll(network: TensorDictModuleBase, inputs: NetworkInputs, sequences: TensorDictBase, key: Key) -> Tensor:
+    """Read sequences once.
+
+    Args:
+        network: what reads them; its parameters may be functional.
+        inputs: of the network.
+        sequences: [B], rows of what :func:`insert_final_observations` gave.
+        key: the output wanted.
+
+    Returns:
+        float [B, L + K, ...], the output along the extended sequence.
+    """
+    state = sequences.get("initial_state", None)
+    burn_in = sequences.get("burn_in", None)
+    if burn_in is not None and inputs.state_keys:  # no gradient: it only brings the state up to date (R2D2)
+        with torch.no_grad(), set_recurrent_mode(False):
+            for t in range(burn_in.shape[1]):
+                step = burn_in[:, t].copy() if state is None else burn_in[:, t].copy().update(state)
+                state = network(step).get("next").select(*inputs.state_keys)
+    extended = sequences["extended"].copy()
+    if state is not None:
+        _begin_with(extended, state, inputs)
+    with set_recurrent_mode(True):
+        return network(extended).get(key)  # type: ignore[no-any-return]
+
+
+def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> TensorDictBase:
+    """Sequences [N] as a batch [N, L] that recurrent modules and TorchRL's losses read.
+
+    Args:
+        batch: sequences [N] of ``ArcadeCollector.collect()``, or rows of them; a stock batch [B, T] is given back as it
+            is.
+        inputs: of the networks that will read it.
+        *keys: further entries to keep.
+
+    Returns:
+        TensorDict [N, L]; the recurrent state counts at index 0 and where an episode begins.
+    """
+    if batch.ndim != 1 or _get(batch, "is_init").ndim == 2:
+        return batch
+    shape = _flat(batch, "is_init").shape
+    out = TensorDict({key: _get(batch, key) for key in (*inputs.observation_keys, *keys)}, batch_size=shape)
+    if inputs.state_keys:
+        _begin_with(out, batch["initial_state"], inputs)
+    return out
+
+
+def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Let sequences [B, T] begin with states [B]; states that are stored later on stay, others are zero."""
+    for key in inputs.state_keys:
+        first = state.get(key)
+        if inputs.reads_first_state_only:
+            sequences[key] = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
+            continue
+        stored = sequences.get(key, None)
+        if stored is None:
+            stored = first.new_zeros(*sequences.shape, *first.shape[1:])
+        sequences[key] = torch.cat((first.unsqueeze(1), stored[:, 1:]), dim=1)
+
+
+def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor, Any]:
+    """Steps [N, K] whose next observation is at hand, which places are in use, and the observations by key."""
+    index, mask = batch.get("final_index", None), batch.get("final_mask", None)
+    if index is None:
+        count = max(int(needed.sum(1).max()), 1)  # a stock batch has as many places as it needs
+        index = (~needed).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
+        mask = needed.gather(1, index)
+    frames = batch.get("final_pixels", None)
+
+    def places(key: Key) -> Tensor:
+        return frames if key == "pixels" and frames is not None else _rows(_next(batch, key), index)
+
+    return index, mask, places
+
+
+def _next(batch: TensorDictBase, key: Key) -> Tensor:
+    """The entry of the next observations; nothing begins there."""
+    if key == "is_init":
+        return torch.zeros_like(_flat(batch, key)).unsqueeze(-1)
+    value = batch.get(("next", *((key,) if isinstance(key, str) else key)), None)
+    if value is None and key == "last_action":
+        value = _get(batch, "action")
+    if value is None:
+        raise KeyError(f"next observations are needed, but the batch has neither 'final_pixels' nor ('next', {key!r})")
+    return value  # type: ignore[no-any-return]
+
+
+def _require_stored(needed: Tensor, index: Tensor, mask: Tensor) -> None:
+    stored = torch.zeros_like(needed, dtype=torch.int8).scatter_add_(1, index, mask.to(torch.int8))
+    missing = int((needed & (stored == 0)).sum())
+    if missing:
+        raise ValueError(
+            f"{missing} next observations are needed but were not stored: collect with final_frames='truncated' "
+            "or 'all', or use time_limit='terminal'"
+        )
+
+
+def _add_state(
+    out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, is_init: Tensor, order: Tensor, burn_in: int
+) -> None:
+    """The recurrent state before the first step; where a stock batch has one a step, those as well."""
+    if not inputs.state_keys:
+        return
+    first = batch.get("initial_state", None)
+    if first is not None:
+        out["initial_state"] = first.select(*inputs.state_keys)
+        return
+    per_step = {key: batch.get(key, None) for key in inputs.state_keys}
+    if any(value is None for value in per_step.values()):
+        if not bool(is_init[:, 0].all()):
+            missing = next(key for key, value in per_step.items() if value is None)
+            raise ValueError(f"the batch begins in mid-episode but has neither 'initial_state' nor {missing!r}")
+        return
+    out["initial_state"] = TensorDict({key: value[:, 0] for key, value in per_step.items()}, batch_size=out.batch_size)
+    if not inputs.reads_first_state_only:
+        for key, value in per_step.items():
+            nothing = value.new_zeros(len(value), order.shape[1] - value.shape[1] + burn_in, *value.shape[2:])
+            out["extended"][key] = _reorder(value[:, burn_in:], nothing, order)
+
+
+def _reorder(roots: Tensor, places: Tensor, order: Tensor) -> Tensor:
+    """Roots [N, L, ...] and places [N, K, ...] in the order of time, [N, L + K, ...]."""
+    both = torch.cat((roots, places), dim=1)
+    row = torch.arange(len(order), device=order.device).unsqueeze(1) * order.shape[1]
+    return both.flatten(0, 1).index_select(0, (order + row).flatten()).view_as(both)
+
+
+def _rows(value: Tensor, index: Tensor) -> Tensor:
+    """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
+    return value[torch.arange(len(index), device=index.device).unsqueeze(1), index]
+
+
+def _get(batch: TensorDictBase, key: Key) -> Tensor:
+    value = batch.get(key, None)
+    if value is None:
+        raise KeyError(f"the batch has no entry {key!r}")
+    return value  # type: ignore[no-any-return]
+
+
+def _flat(batch: TensorDictBase, key: Key) -> Tensor:
+    """An entry [N, L] or [N, L, 1] as [N, L]."""
+    value = _get(batch, key)
+    return value.squeeze(-1) if value.ndim == 3 else value

@@ -1,0 +1,127 @@
+"""How a network acts: explores, samples, is greedy; an agent is a policy."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import arcade_torch
+from arcade_torch.agents import Agent, build_network, make_actor, make_policy, preset
+from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
+
+MANY = 20_000
+
+
+def q_policy(values, **options):
+    """Always the same Q-values."""
+    network = TensorDictModule(lambda x: torch.tensor(values).expand(len(x), -1), ["pixels"], ["action_value"])
+    return make_policy(network, **options)  # type: ignore[arg-type]
+
+
+def sampler(logits, **options):
+    """Always the same logits."""
+    network = TensorDictModule(lambda x: torch.tensor(logits).expand(len(x), -1), ["pixels"], ["logits"])
+    return make_actor(network, **options)
+
+
+def act(policy, n=MANY):
+    return policy(TensorDict({"pixels": torch.zeros(n, 1)}, [n]))
+
+
+def shares(out):
+    return torch.bincount(out["action"], minlength=ACTIONS) / len(out)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.2, 1.0])
+def test_every_action_has_a_share_of_epsilon_and_the_best_the_rest(epsilon):
+    policy = q_policy([0.0, 0.0, 1.0, 0.0, 0.0])
+    policy[-1].eps.fill_(epsilon)  # as the training loop does
+    expected = torch.full((ACTIONS,), epsilon / ACTIONS)
+    expected[2] += 1 - epsilon
+    with set_exploration_type(ExplorationType.RANDOM):
+        torch.testing.assert_close(shares(act(policy)), expected, atol=0.01, rtol=0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert (act(policy)["action"] == 2).all()
+
+
+def test_random_actions_are_independent_between_environments():
+    policy = q_policy([1.0, 0.0, 0.0, 0.0, 0.0], epsilon=0.5)
+    with set_exploration_type(ExplorationType.RANDOM):
+        explored = torch.stack([act(policy, 2)["action"] != 0 for _ in range(3000)]).double()
+    assert abs(torch.corrcoef(explored.T)[0, 1]) < 0.06
+
+
+def test_actions_are_drawn_with_the_probabilities_of_the_softmax_and_say_so():
+    logits = [0.0, 1.0, -1.0, 2.0, 0.5]
+    with set_exploration_type(ExplorationType.RANDOM):
+        out = act(sampler(logits))
+    expected = torch.tensor(logits).softmax(-1)
+    torch.testing.assert_close(shares(out), expected, atol=0.01, rtol=0)
+    torch.testing.assert_close(out["action_log_prob"], expected.log()[out["action"]])
+
+
+def test_nan_logits_still_give_an_action():
+    with set_exploration_type(ExplorationType.RANDOM):
+        out = act(sampler([float("nan")] * 5), 10)  # the learner then names the update
+    assert ((out["action"] >= 0) & (out["action"] < 5)).all() and out["action_log_prob"].isnan().all()
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [q_policy([0.0, 2.0, 1.0, 2.0, 2.0], explore=False), sampler([0.0, 3.0, 1.0, 3.0, 2.0], deterministic=True)],
+)
+def test_greedy_takes_the_best_and_of_equal_ones_the_lowest_and_draws_nothing(policy):
+    before = torch.get_rng_state()
+    out = act(policy, 50)
+    assert out["action"].dtype == torch.int64 and (out["action"] == 1).all()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("kind", ["q", "actor-critic"])
+def test_acting_step_by_step_gives_the_outputs_of_the_whole_sequence(kind):
+    s = stream(5, 9, seed=0)
+    if kind == "q":
+        network, start = toy_network(), s.state["memory"]
+    else:
+        network, s = toy_actor_critic(), with_two_states(s)
+        start = s.state["memory"]
+    whole, _ = network.remember(network.encode(s.pixels), s.last_action, s.is_init, start)
+    policy, batch, state = make_policy(network, explore=False), s.sequences(), s.state
+    for t in range(9):
+        roots = {key: batch[key][:, t] for key in ("pixels", "last_action", "is_init")}
+        out = policy(TensorDict(roots, [5]).update(state))
+        if kind == "q":
+            torch.testing.assert_close(out["action_value"], whole[:, t])
+            assert torch.equal(out["action"], whole[:, t].argmax(-1))
+        else:
+            logits, value = network.split(whole[:, t])
+            torch.testing.assert_close(out["state_value"].squeeze(-1), value)
+            log_prob = logits.log_softmax(-1).gather(-1, out["action"].unsqueeze(-1)).squeeze(-1)
+            torch.testing.assert_close(out["action_log_prob"], log_prob)
+        state = out["next"].select(*s.state.keys())
+
+
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
+def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
+    config = preset("smoke", algorithm=algorithm, memory="gru")
+    agent = Agent(config, build_network(config))
+    env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=0)
+    played, state = env.rollout(6, agent, break_when_any_done=False), agent.initial_state(2)
+    for t in range(6):  # the other way to ask it
+        roots = {key: played[key][:, t] for key in ("pixels", "last_action", "is_init")}
+        action, extras, state = agent.act(TensorDict(roots, [2]), state)
+        assert torch.equal(action, played["action"][:, t]) and extras
+    frames = torch.randint(256, (1, 3, 32, 32, 3), dtype=torch.uint8)
+    last, flags = torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.bool)
+    out, _ = agent.network.remember(agent.network.encode(frames), last, flags, agent.initial_state(1))
+    assert agent.offers == (("logits", "probs", "value") if algorithm == "ppo" else ("q", "value"))
+    assert agent.outputs(out, "value").shape == (1, 3, 1)
+    if algorithm == "ppo":
+        torch.testing.assert_close(agent.outputs(out, "probs"), agent.outputs(out, "logits").softmax(-1))
+        assert torch.equal(agent.outputs(out, "value"), out[..., -1:])
+    else:
+        assert torch.equal(agent.outputs(out, "q"), out)
+        assert torch.equal(agent.outputs(out, "value"), out.amax(-1, keepdim=True))
+    with pytest.raises(ValueError, match=r"offers .*, not 'advantage'"):
+        agent.outputs(out, "advantage")
