@@ -7,18 +7,17 @@ import signal
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.studies.engine_names import make_engine
-from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Jobs, Processes, available_cores
+from arcade_torch.tools.progress import Speed
+from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores
 from arcade_torch.tools.studies.folder import StudyFolder
-from arcade_torch.tools.studies.grid import Study
-from arcade_torch.tools.studies.progress import Display, Speed, Watcher
-from arcade_torch.tools.studies.runner import check_names, study
+from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
+from arcade_torch.tools.studies.runner import DiskFullError, Display, check_names, make_engine, shard_of, study
 from tests.tools.fabricated import small_study, write_run, write_study
 
 
@@ -29,18 +28,17 @@ class Fabricator:
         self.runs, self.fail, self.stop_after = {run.name: run for run in what.runs()}, fail, stop_after
         self.done: list[str] = []
 
-    def run(self, jobs: Jobs) -> Iterator[JobResult]:
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         for job in jobs:
-            assert job is not None
             if len(self.done) == self.stop_after:
                 raise KeyboardInterrupt
-            assert job.words[-1] == "--resume"
+            assert json.loads(job.config.read_text())["env"] == self.runs[job.name].game
             self.done.append(job.name)
             if self.fail and self.fail in job.name:
-                yield JobResult(job.name, 1, "no luck")
+                yield JobResult(job.name, "no luck")
             else:
-                write_run(Path(job.words[job.words.index("--out") + 1]), self.runs[job.name], 0.5)
-                yield JobResult(job.name, 0)
+                write_run(job.folder, self.runs[job.name], 0.5)
+                yield JobResult(job.name)
 
 
 def carry_out(what: Study, root: Path, engine: Fabricator) -> "list[dict[str, str]]":
@@ -64,7 +62,7 @@ def test_a_study_survives_being_written_and_read() -> None:
     assert Study.from_dict(json.loads(json.dumps(what.to_dict()))) == what
 
 
-def test_a_study_is_read_from_toml_and_its_settings_become_options(tmp_path: Path) -> None:
+def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(tmp_path: Path) -> None:
     file = tmp_path / "one.toml"
     file.write_text(
         textwrap.dedent("""
@@ -82,11 +80,10 @@ def test_a_study_is_read_from_toml_and_its_settings_become_options(tmp_path: Pat
     )
     what = Study.load(file)
     assert what.name == "one" and what.seeds == (0, 1)
-    words = " ".join(what.arguments(what.runs()[0], Path("here")))
-    assert words == (
-        "train --preset paper --env CartPoleEasy --observability full --memory mlp --algorithm pqn --seed 0 "
-        "--total-frames 4096 --threads 1 --eval-every 512 --pqn.learning-rate 0.001 --env-option wind=True --out here"
-    )
+    config = what.config(what.runs()[0])
+    assert (config.env, config.observability, config.memory, config.seed) == ("CartPoleEasy", "full", "mlp", 0)
+    assert (config.total_frames, config.eval_every, config.threads) == (4096, 512, 1)
+    assert config.pqn.learning_rate == 1e-3 and config.env_options == {"wind": True}
 
 
 @pytest.mark.parametrize(
@@ -178,7 +175,15 @@ def test_versions_of_the_first_runs_stay_on_record(tmp_path: Path, monkeypatch: 
 
 
 def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
-    return [Job(f"job{i}", (textwrap.dedent(text),), tmp_path / f"job{i}.log") for i, text in enumerate(scripts)]
+    """Jobs whose config is Python code, for `python_engine`."""
+    found = []
+    for name, text in ((f"job{i}", textwrap.dedent(text)) for i, text in enumerate(scripts)):
+        (tmp_path / f"{name}.py").write_text(text)
+        found.append(Job(name, tmp_path / f"{name}.py", tmp_path / name, tmp_path / f"{name}.log"))
+    return found
+
+
+RUN_CONFIG = (sys.executable, "-c", "import pathlib, sys; exec(pathlib.Path(sys.argv[3]).read_text())")
 
 
 def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_path: Path) -> None:
@@ -195,8 +200,7 @@ def test_sizes_are_an_axis_of_their_own_that_the_memory_free_agent_does_not_have
     assert [run.agent for run in what.runs() if run.observability == "full"] == ["mingru 1x64", "mingru 2x128", "mlp"]
     run = what.runs()[2]
     assert run.name == "MineSweeperEasy__full__mingru-2x128__pqn__seed0"
-    words = " ".join(what.arguments(run, Path("here")))
-    assert "--network-option layers=2 --network-option hidden_size=128" in words
+    assert what.config(run).network_options == {"layers": 2, "hidden_size": 128}
     with pytest.raises(ValueError, match="layers x width"):
         small_study(sizes=["128"])
 
@@ -221,7 +225,7 @@ def test_a_damaged_record_of_the_study_is_written_anew(tmp_path: Path) -> None:
 
 
 def python_engine(workers: int = 2) -> Processes:
-    return Processes(workers, program=(sys.executable, "-c"), poll_s=0.02)
+    return Processes(workers, program=RUN_CONFIG, poll_s=0.02)
 
 
 def test_worker_processes_run_side_by_side_and_report_how_they_ended(tmp_path: Path) -> None:
@@ -233,13 +237,12 @@ def test_worker_processes_run_side_by_side_and_report_how_they_ended(tmp_path: P
     """
     texts = [wait.replace("NAME", "up0"), wait.replace("NAME", "up1"), "raise SystemExit('broken: no disk')"]
     results = {result.name: result for result in python_engine().run(jobs(tmp_path, *texts))}
-    assert [results[f"job{i}"].exit_code for i in range(3)] == [0, 0, 1]
-    assert results["job2"].error == "broken: no disk"
+    assert [results[f"job{i}"].error for i in range(3)] == ["", "", "broken: no disk"]
 
 
 def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
     (result,) = python_engine().run(jobs(tmp_path, "import os; os.kill(os.getpid(), 9)"))
-    assert result.exit_code == -9 and "signal 9" in result.error
+    assert result.error == "ended by signal 9"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin")
@@ -254,7 +257,7 @@ def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path) -> Non
     """
     count = min(2, len(available_cores()))
     text = text.replace("COUNT", str(count))
-    assert all(result.exit_code == 0 for result in python_engine(count).run(jobs(tmp_path, *[text] * count)))
+    assert all(result.error == "" for result in python_engine(count).run(jobs(tmp_path, *[text] * count)))
     assert len(list(tmp_path.glob("core-*-1"))) == count
 
 
@@ -283,7 +286,7 @@ def test_a_worker_that_ignores_the_request_is_killed_after_the_grace_time(tmp_pa
         pathlib.Path({str(tmp_path / "up")!r}).touch()
         time.sleep(60)
     """
-    engine = Processes(2, program=(sys.executable, "-c"), poll_s=0.02, grace_s=0.3)
+    engine = Processes(2, program=RUN_CONFIG, poll_s=0.02, grace_s=0.3)
     results = engine.run(jobs(tmp_path, text, "import time; time.sleep(0.5)"))
     next(results)
     while not (tmp_path / "up").exists():
@@ -321,20 +324,17 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
     assert (tmp_path / "saved").exists()
 
 
-def test_inline_runs_one_after_the_other_and_survives_exceptions(tmp_path: Path) -> None:
-    def run_words(words: Sequence[str]) -> int:
-        if words == ("bad",):
+def test_inline_runs_one_after_the_other_and_survives_exceptions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(job: Job) -> None:
+        if job.name == "job1":
             raise RuntimeError("broken\nbadly")
-        return 0
 
-    parts = [
-        Job("a", ("good",), tmp_path / "a"),
-        Job("b", ("bad",), tmp_path / "b"),
-        Job("c", ("good",), tmp_path / "c"),
-    ]
-    results = list(Inline(run_words).run(parts))
-    assert [result.exit_code for result in results] == [0, 1, 0]
-    assert results[1].error == "RuntimeError: broken badly"
+    monkeypatch.setattr(Job, "train", train)
+    parts = jobs(tmp_path, "", "", "")
+    assert [result.error for result in Inline().run(parts)] == ["", "RuntimeError: broken badly", ""]
+    assert "in train\n" in parts[1].log.read_text() and not parts[0].log.exists()
 
 
 def test_engines_are_made_by_name() -> None:
@@ -355,25 +355,21 @@ def test_speed_is_that_of_the_last_seconds() -> None:
     assert speed.update(20, 3500) == pytest.approx(200)
 
 
-def test_the_watcher_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
+def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
     what = small_study(seeds=1)
     folder = StudyFolder(tmp_path / "s")
     runs = what.runs()
     write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
     write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
-    watcher = Watcher({run.name: folder.run(run) for run in runs}, 2048)
-    watcher.ended.add(runs[0].name)
-    seen = watcher.look()
-    assert (seen.frames, seen.total, seen.ended, seen.runs) == (2048 + 1024, 4 * 2048, 1, 4)
-    assert seen.active == {runs[1].name: (1024, 2048)}
-    assert "1/4 runs" in seen.line()
+    display = Display("toy", {run.name: folder.run(run) for run in runs}, {runs[0].name}, io.StringIO())
+    assert display.show() == "1/4 runs, 3,072 of 8,192 frames (38 %)"
 
 
-def test_the_display_prints_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
+def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
-    with Display(Watcher({}, 1), "toy", every_s=0.01, stream=stream) as display:
+    with Display("toy", {}, set(), stream) as display:
         display.note("hello")
-    assert "toy: hello" in stream.getvalue() and "toy: 0/0 runs" in stream.getvalue()
+    assert stream.getvalue() == "toy: hello\ntoy: 0/0 runs, 0 of 0 frames (0 %)\n"
 
 
 def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
@@ -381,17 +377,63 @@ def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
         def isatty(self) -> bool:
             return True
 
-    folder = write_study(tmp_path / "s", small_study(seeds=1))
     run = small_study(seeds=1).runs()[0]
-    write_run(folder.run(run).path, run, 0.5, frames=2048, status="running")
+    folder = write_study(tmp_path / "s", small_study(seeds=1)).run(run)
+    write_run(folder.path, run, 0.5, frames=2048, status="running")
     stream = Terminal()
-    with Display(Watcher({run.name: folder.run(run)}, 2048), "toy", every_s=0.01, stream=stream):
-        time.sleep(0.1)
+    with Display("toy", {run.name: folder}, set(), stream) as display:
+        display.show()
     assert "toy" in stream.getvalue() and "50%" in stream.getvalue()
 
 
 def test_numbers_of_a_learner_are_given_to_its_own_runs_only() -> None:
     what = small_study(algorithms=("pqn", "ppo"), settings={"pqn": {"gamma": 0.9}, "ppo": {"clip": 0.1}})
     for run in what.runs():
-        words = what.arguments(run, Path("here"))
-        assert ("--pqn.gamma" in words, "--ppo.clip" in words) == (run.algorithm == "pqn", run.algorithm == "ppo")
+        config, usual = what.config(run), small_study().config(run)
+        assert (config.pqn.gamma == 0.9, config.ppo.clip == 0.1) == (run.algorithm == "pqn", run.algorithm == "ppo")
+        assert config.learner != usual.learner
+
+
+def test_options_of_a_preset_stay_where_a_study_gives_others() -> None:
+    what = small_study(preset="reference", sizes=["1x64"], total_frames=10**6, settings={"env_options": {"noise": 1}})
+    config = what.config(what.runs()[0])
+    assert config.network_options == {"skip": "none", "layers": 1, "hidden_size": 64}
+    assert config.env_options == {"noise": 1}
+
+
+def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    for settings, message in (({"gama": 1}, "unknown field 'gama'"), ({"pqn": {"lam": 7}}, "pqn.lam")):
+        with pytest.raises(ValueError, match=message):
+            study(small_study(settings=settings), tmp_path / "s", "inline")
+    assert not (tmp_path / "s").exists()
+
+
+def test_shards_share_the_runs_out_and_each_knows_the_results_of_all(tmp_path: Path) -> None:
+    what, root = small_study(), tmp_path / "s"
+    engines = [Fabricator(what) for _ in range(3)]
+    results = [study(what, root, e, stream=io.StringIO(), shard=f"{i + 1}/3") for i, e in enumerate(engines)]
+    assert [result.finished for result in results] == [3, 6, 8]
+    assert sorted(name for engine in engines for name in engine.done) == sorted(run.name for run in what.runs())
+    for wrong in ("0/3", "4/3", "3", "a/b", "1/0"):
+        with pytest.raises(ValueError, match="a shard is written 3/10, the third of ten"):
+            shard_of(wrong)
+
+
+def test_a_study_on_a_full_disk_stops_at_the_first_run_that_fails_for_it(tmp_path: Path) -> None:
+    class Full(Fabricator):
+        def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+            for job in jobs:
+                self.done.append(job.name)
+                yield JobResult(job.name, "OSError: [Errno 28] No space left on device")
+
+    engine = Full(small_study())
+    with pytest.raises(DiskFullError, match="make room and start it again"):
+        carry_out(small_study(), tmp_path / "s", engine)
+    assert len(engine.done) == 1
+
+
+def test_the_presets_are_studies() -> None:
+    sizes = {name: len(study_preset(name).runs()) for name in STUDY_PRESETS}
+    assert sizes == {"demo": 16, "paper-easy": 800, "paper": 2400, "size-sweep": 192}
+    with pytest.raises(ValueError, match="unknown study preset 'papers'"):
+        study_preset("papers")

@@ -1,5 +1,6 @@
 """``arcade-torch study``."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,8 +19,7 @@ class StudyCommand:
     """Run a grid of trainings described by one TOML file; type the same again to go on after an interruption.
 
     The file names games, memories and seeds, and optionally observability, algorithms, preset, total_frames, baseline,
-    sizes, question and a table [settings] with options of train. Several such processes, on any machines that see the
-    folder, may work on one study together.
+    sizes, question and a table [settings] with fields of the config that train takes.
 
     Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
@@ -42,10 +42,13 @@ class StudyCommand:
     """Ray: GPUs, or the part of one, that a run keeps busy."""
     retries: int = 2
     """Ray: further attempts at a run whose process or machine was lost."""
+    shard: str = ""
+    """3/10 carries out the third tenth of the runs, for the array jobs of a scheduler; all write into one folder."""
     dry_run: bool = False
-    """Only print the command of every run and the frames of all together."""
+    """Only print every run with its frames, and the frames of all together."""
     report: bool = True
-    """Write the HTML report at the end."""
+    """Write the HTML report at the end; of shards, the one that finishes the study writes it."""
+    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""
@@ -54,16 +57,16 @@ class StudyCommand:
         what = self.study()
         out = self.out or Path("runs") / what.name
         if self.dry_run:
-            return self._list(what, out)
+            return self._list(what)
         try:
-            result = study(what, out, self._engine(), command=self.command())
+            result = study(what, out, self._engine(), command=self.command(), shard=self.shard)
         except DiskFullError as error:
-            print(f"stopped: {error}; finished runs are kept: {self.command()}")
+            print(f"stopped: {error}; {self.resume_hint()}")
             return 1
         print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
         for name, reason in result.errors.items():
             print(f"failed: {name}: {reason} (log: {result.root / 'logs' / f'{name}.log'})")
-        if self.report and result.finished:
+        if self.report and result.finished and (not self.shard or result.finished == len(result.rows)):
             from arcade_torch.tools.reports.build import report
 
             print(f"report: {report(result.root)}")
@@ -76,15 +79,14 @@ class StudyCommand:
             ValueError: neither or both of a file and a preset were given, or the file is no study.
             FileNotFoundError: there is no such file.
         """
-        from arcade_torch.tools.studies.grid import Study
-        from arcade_torch.tools.studies.presets import STUDY_PRESETS, study_preset
+        from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
 
         if (self.file is None) == (self.preset is None):
             raise ValueError(f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the two")
         return study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
 
     def _engine(self) -> "Engine":
-        from arcade_torch.tools.studies.engine_names import make_engine
+        from arcade_torch.tools.studies.runner import make_engine
 
         return make_engine(
             self.engine,
@@ -95,31 +97,29 @@ class StudyCommand:
             retries=self.retries,
         )
 
-    def _list(self, what: "Study", out: Path) -> int:
-        import sys
+    def _list(self, what: "Study") -> int:
+        from arcade_torch.tools.studies.runner import check_names, shard_of
 
-        from arcade_torch.tools.studies.folder import StudyFolder
-        from arcade_torch.tools.studies.presets import total_frames
-
-        for spec in what.runs():
-            print(what.command(spec, StudyFolder(out).run(spec).path))
-        print(f"{len(what.runs()):,} runs, {total_frames(what):,} frames in all", file=sys.stderr)
+        check_names(what)
+        total, runs = 0, what.runs()[shard_of(self.shard)]
+        for run in runs:
+            config = what.config(run)
+            frames = config.num_updates * config.learner.frames_per_update
+            total += frames
+            print(f"{run.name}  {frames:,} frames")
+        print(f"{len(runs):,} runs, {total:,} frames in all", file=sys.stderr)
         return 0
 
     def command(self) -> str:
-        """The line that starts this study."""
-        words = ["study", *([str(self.file)] if self.file else ["--preset", str(self.preset)])]
-        words += ["--out", str(self.out)] if self.out else []
-        words += ["--engine", self.engine, "--workers", str(self.workers)]
-        if self.engine == "ray":
-            words += ["--address", self.address] if self.address else []
-            words += ["--cpus-per-run", f"{self.cpus_per_run:g}", "--gpus-per-run", f"{self.gpus_per_run:g}"]
-            words += ["--retries", str(self.retries)]
-        return command_line(words)
+        """The line that started this study; without the shard, which is not the study's."""
+        at = self.argv.index("--shard") if "--shard" in self.argv else len(self.argv)
+        argv = [*self.argv[:at], *self.argv[at + 2 :]]
+        return command_line(["study", *(word for word in argv if not word.startswith("--shard="))])
 
-    def how_to_go_on(self) -> str:
+    def resume_hint(self) -> str:
         """What to type after an interruption."""
-        return f"finished runs are kept, the others go on from their checkpoints with: {self.command()}"
+        line = command_line(["study", *self.argv])
+        return f"finished runs are kept, the others go on from their checkpoints with: {line}"
 
 
 COMMAND = StudyCommand

@@ -1,7 +1,7 @@
 """Where the runs of a study are carried out.
 
-An engine takes jobs and yields one result for each as they end. Progress needs no channel of its own: every run writes
-``progress.json`` into its folder, which any engine on a shared file system gets for free.
+An engine takes jobs and yields one result for each as they end. A job is a JSON file, the config of a run. Progress
+needs no channel of its own: every run writes ``progress.json`` into its folder.
 """
 
 import contextlib
@@ -9,10 +9,13 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
+
+from arcade_torch.tools.errors import reason
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
@@ -27,34 +30,51 @@ class Job:
 
     Attributes:
         name: of the run.
-        words: what follows ``arcade-torch`` on the command line.
-        log: file that takes what the run prints.
-        folder: of the run, as it stands among the words.
+        config: JSON file with its config.
+        folder: of the run; one that was begun goes on.
+        log: file that takes what the run prints, or why it failed.
     """
 
     name: str
-    words: tuple[str, ...]
+    config: Path
+    folder: Path
     log: Path
-    folder: Path | None = None
 
+    @property
+    def argv(self) -> list[str]:
+        """What follows ``arcade-torch`` on the command line."""
+        files = ["--config", str(self.config), "--out", str(self.folder)]
+        return ["train", *files, "--resume", "--wait", f"{GRACE_S:g}"]
 
-Jobs = Iterable[Job | None]
-"""Jobs to start, taken one by one as there is room; None: nothing at the moment, ask again later."""
+    def train(self) -> None:
+        """Carry it out in this process.
+
+        Raises:
+            KeyboardInterrupt: it was interrupted, and has saved.
+        """
+        from arcade_torch.agents import TrainConfig, train
+        from arcade_torch.agents.runs.files import read_json
+        from arcade_torch.agents.runs.folder import wait_until_free
+        from arcade_torch.tools.keep_memory import keep_freed_memory
+
+        keep_freed_memory()
+        wait_until_free(self.folder, GRACE_S)
+        if train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status == "interrupted":
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended: exit code 0 is success; ``error`` is one line otherwise."""
+    """How a job ended; ``error`` is one line, empty for success."""
 
     name: str
-    exit_code: int
     error: str = ""
 
 
 class Engine(Protocol):
     """Carries out jobs; closing the iterator stops what still runs, in an orderly way."""
 
-    def run(self, jobs: Jobs) -> Iterator[JobResult]:
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Yield the result of each job when it ends, in any order."""
         ...
 
@@ -62,36 +82,23 @@ class Engine(Protocol):
 class Inline:
     """One job after the other in this process."""
 
-    def __init__(self, run_words: Callable[[Sequence[str]], int] | None = None, poll_s: float = 0.5) -> None:
-        """Make the engine.
-
-        Args:
-            run_words: called with a job's words, returns an exit code; the command line by default.
-            poll_s: seconds to wait where there is nothing to do at the moment.
-        """
-        self._run_words, self._poll_s = run_words, poll_s
-
-    def run(self, jobs: Jobs) -> Iterator[JobResult]:
-        """Run the jobs in order; an exception of one becomes its result."""
-        run_words = self._run_words or _command_line
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+        """Run the jobs in order; an exception of one becomes its result, and its traceback goes into the log."""
         for job in jobs:
-            if job is None:
-                time.sleep(self._poll_s)
-                continue
             try:
-                code, error = run_words(job.words), ""
-            except Exception as caught:
-                code, error = 1, f"{type(caught).__name__}: {' '.join(str(caught).split())}"
-            yield JobResult(job.name, code, error if code else "")
+                job.train()
+            except Exception as error:
+                append(job.log, traceback.format_exc())
+                yield JobResult(job.name, reason(error))
+            else:
+                yield JobResult(job.name)
 
 
-def _command_line(words: Sequence[str]) -> int:
-    from arcade_torch.tools.cli import EXIT_INTERRUPTED, main
-
-    code = main(words)
-    if code == EXIT_INTERRUPTED:
-        raise KeyboardInterrupt
-    return code
+def append(log: Path, text: str) -> None:
+    """Add text to a log; its folder is made."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", encoding="utf-8") as stream:
+        stream.write(text)
 
 
 @dataclass
@@ -108,18 +115,14 @@ class Processes:
     Attributes:
         workers: how many at once; one a core by default.
         program: start of the command line that takes a job's words.
-        environment: variables set for the workers.
         poll_s: seconds between two looks at the workers.
         grace_s: seconds an interrupted worker has for its checkpoint.
-        pin: whether a worker gets a core of its own and one thread; where there are enough cores by default.
     """
 
     workers: int = 0
     program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")
-    environment: Mapping[str, str] = field(default_factory=dict)
     poll_s: float = 0.1
     grace_s: float = GRACE_S
-    pin: bool | None = None
 
     def __post_init__(self) -> None:
         """Check the number of workers.
@@ -130,43 +133,34 @@ class Processes:
         if self.workers < 0:
             raise ValueError(f"workers must be at least 1 (or 0 for one a core), got {self.workers}")
 
-    def run(self, jobs: Jobs) -> Iterator[JobResult]:
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
         cores = available_cores()
         count = self.workers or len(cores)
         free = [cores[index % len(cores)] for index in range(count)]
-        pin = count <= len(cores) if self.pin is None else self.pin
-        waiting, more, active = iter(jobs), True, list[_Worker]()
+        waiting, active = list(jobs), list[_Worker]()
         try:
-            while more or active:
-                while more and free:
-                    try:
-                        job = next(waiting)
-                    except StopIteration:
-                        more = False
-                        break
-                    if job is None:
-                        break
-                    active.append(self._start(job, free.pop(0), pin))
+            while waiting or active:
+                while waiting and free:
+                    active.append(self._start(waiting.pop(0), free.pop(0), pin=count <= len(cores)))
                 for worker in [item for item in active if item.process.poll() is not None]:
                     active.remove(worker)
                     free.append(worker.core)
-                    yield _result(worker)
+                    yield JobResult(worker.job.name, _error(worker))
                 time.sleep(self.poll_s)
         finally:
             _stop([worker.process for worker in active], self.grace_s)
 
     def _start(self, job: Job, core: int, pin: bool) -> _Worker:
-        job.log.parent.mkdir(parents=True, exist_ok=True)
+        append(job.log, "")
         threads = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")} if pin else {}
-        environment = {**os.environ, **threads, PARENT_VARIABLE: str(os.getpid()), **self.environment}
         with job.log.open("ab") as log:
             process = subprocess.Popen(
-                [*self.program, *job.words],
+                [*self.program, *job.argv],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env=environment,
+                env={**os.environ, **threads, PARENT_VARIABLE: str(os.getpid())},
                 start_new_session=True,  # the terminal's Ctrl-C goes to the study alone, which then stops its workers
             )
         if pin and hasattr(os, "sched_setaffinity"):
@@ -176,27 +170,22 @@ class Processes:
 
 
 def available_cores() -> list[int]:
-    """The processor cores this process may use.
-
-    Returns:
-        Their numbers, at least one.
-    """
+    """Numbers of the processor cores this process may use, at least one."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
 
 
-def watch_parent(variable: str = PARENT_VARIABLE, every_s: float = 2.0) -> None:
-    """In a worker: stop with a checkpoint when the study that started it has gone, however it went.
+def watch_parent(every_s: float = 2.0) -> None:
+    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing happens.
 
     Args:
-        variable: environment variable with the parent's process id; nothing happens where it is not set.
         every_s: seconds between two looks.
     """
     import signal
     import threading
 
-    parent = os.environ.get(variable, "")
+    parent = os.environ.get(PARENT_VARIABLE, "")
     if not parent.isdigit() or int(parent) == os.getpid():
         return
 
@@ -210,8 +199,7 @@ def watch_parent(variable: str = PARENT_VARIABLE, every_s: float = 2.0) -> None:
 
 def _stop(processes: Sequence["subprocess.Popen[bytes]"], grace_s: float) -> None:
     for process in processes:
-        if process.poll() is None:
-            process.terminate()
+        process.terminate()
     deadline = time.monotonic() + grace_s
     for process in processes:
         try:
@@ -221,13 +209,13 @@ def _stop(processes: Sequence["subprocess.Popen[bytes]"], grace_s: float) -> Non
             process.wait()
 
 
-def _result(worker: _Worker) -> JobResult:
+def _error(worker: _Worker) -> str:
+    """Why a worker failed: its last words, and the signal that ended it; empty for success."""
     code = worker.process.returncode
     if code == 0:
-        return JobResult(worker.job.name, 0)
-    text = worker.job.log.read_text(encoding="utf-8", errors="replace") if worker.job.log.exists() else ""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    reason = lines[-1] if lines else f"ended by signal {-code}" if code < 0 else f"exit code {code}"
+        return ""
+    lines = worker.job.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
     if code < 0:
-        reason = f"ended by signal {-code}; last words: {reason}" if lines else reason
-    return JobResult(worker.job.name, code, reason.removeprefix("arcade-torch: "))
+        return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")
+    return last or f"exit code {code}"

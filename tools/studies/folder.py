@@ -3,45 +3,29 @@
 ::
 
     study.json    the study, its versions, the command of every run
+    configs/NAME.json  the config of a run, which `arcade-torch train --config` takes
     results.csv   one row a run, in the order of the grid; the same to the bit on every engine, interrupted or not
     timings.csv   seconds of every run
     runs/NAME/    one run folder each (see `arcade_torch.agents`)
-    logs/NAME.log what the run printed
-    locks/NAME/   which process carries the run out at the moment
-    failures/NAME.json why the last attempt at a run failed; gone when it succeeds
+    logs/NAME.log what the run printed, or why it failed
+    failures/NAME.json the same in one line; gone when the run succeeds
     analysis/     numbers and figures made from the runs
     report.html
 """
 
-import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.files import is_final
-from arcade_torch.agents.files import read_csv as read_log
-from arcade_torch.agents.lease import LOCK, Lease
+from arcade_torch.agents.runs.files import is_final
+from arcade_torch.agents.runs.files import read_csv as read_log
 from arcade_torch.tools.files import read_json, write_csv, write_json
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.versions import versions
 
-RESULT_COLUMNS = (
-    "run",
-    "game",
-    "observability",
-    "memory",
-    "agent",
-    "algorithm",
-    "seed",
-    "status",
-    "frames",
-    "eval_mean",
-    "eval_std",
-    "eval_n",
-    "train_max_ewm",
-    "error",
-)
+_CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
+_SCORES = ("eval_mean", "eval_std", "eval_n", "train_max_ewm")
+RESULT_COLUMNS = ("run", *_CELL, "status", "frames", *_SCORES, "error")
 TIMING_COLUMNS = ("run", "frames", "seconds")
 
 
@@ -92,7 +76,7 @@ class RunFolder:
         Raises:
             ValueError: it is damaged.
         """
-        return _mapping(self.path / "config.json")
+        return _table(self.path / "config.json")
 
     def table(self, name: str) -> list[dict[str, str]]:
         """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
@@ -114,36 +98,25 @@ class StudyFolder:
         """File with what the run printed."""
         return self.root / "logs" / f"{spec.name}.log"
 
-    def reservation(self, spec: RunSpec) -> Lease:
-        """The right to carry out a run of this study."""
-        return Lease(self.root / "locks" / spec.name)
-
-    def training(self, spec: RunSpec) -> Lease:
-        """The lock of whoever trains in the run's folder, for looking at."""
-        return Lease(self.run(spec).path / LOCK)
-
-    def failure(self, spec: RunSpec) -> tuple[int, str] | None:
-        """When (in file time, nanoseconds) and why the last attempt at a run failed; None if it did not."""
-        file = self._failure(spec)
-        try:
-            return file.stat().st_mtime_ns, str(read_json(file)["error"])
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-
-    def note_failure(self, spec: RunSpec, error: str) -> None:
-        """Keep why a run failed, or forget it where ``error`` is empty."""
-        if error:
-            write_json(self._failure(spec), {"error": error})
-        else:
-            self._failure(spec).unlink(missing_ok=True)
-
-    def _failure(self, spec: RunSpec) -> Path:
-        return self.root / "failures" / f"{spec.name}.json"
-
     @property
     def analysis(self) -> Path:
         """Folder for numbers and figures made from the runs."""
         return self.root / "analysis"
+
+    def failure(self, spec: RunSpec) -> str:
+        """Why the last attempt at a run failed; empty if it did not."""
+        try:
+            return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return ""
+
+    def note_failure(self, spec: RunSpec, error: str) -> None:
+        """Keep why a run failed, or forget it where ``error`` is empty."""
+        file = self.root / "failures" / f"{spec.name}.json"
+        if error:
+            write_json(file, {"error": error})
+        else:
+            file.unlink(missing_ok=True)
 
     def load(self) -> Study:
         """The study that was run here.
@@ -163,7 +136,7 @@ class StudyFolder:
 
     def record(self) -> dict[str, Any]:
         """All of ``study.json``."""
-        return _mapping(self.root / "study.json")
+        return _table(self.root / "study.json")
 
     def claim(self, study: Study, command: str = "") -> None:
         """Write ``study.json``, or go on where the same study stands already.
@@ -174,28 +147,24 @@ class StudyFolder:
         Raises:
             FileExistsError: the folder holds other files, or a study with other settings.
         """
-        file = self.root / "study.json"
         old: dict[str, Any] = {}
-        if file.exists():
-            old = self._old(file)
+        if (self.root / "study.json").exists():
+            try:
+                old = self.record()
+            except ValueError:
+                old = {}
             if old:
                 self._check_same(self.load(), study)
-        elif self.root.exists() and any(not _ours(entry) for entry in self.root.iterdir()):
+        elif self.root.exists() and not all(entry.name.startswith(".study.json.") for entry in self.root.iterdir()):
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
         commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
         # What the first runs were made with stays on record.
-        first, also = old.get("versions", versions()), _list(old.get("also"))
-        also += [] if versions() in (first, *also) else [versions()]
+        now = versions()
+        first, also = old.get("versions", now), list(old["also"]) if isinstance(old.get("also"), list) else []
+        also += [] if now in (first, *also) else [now]
         made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
         if made != old:
-            write_json(file, made)
-
-    def _old(self, file: Path) -> dict[str, Any]:
-        try:
-            values = json.loads(file.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError):
-            return {}
-        return values if isinstance(values, dict) else {}
+            write_json(self.root / "study.json", made)
 
     def _check_same(self, before: Study, study: Study) -> None:
         for key, old in before.fixed().items():
@@ -205,8 +174,7 @@ class StudyFolder:
                     "choose another --out"
                 )
         names = {run.name for run in study.runs()}
-        gone = [run.name for run in before.runs() if run.name not in names]
-        if gone:
+        if gone := [run.name for run in before.runs() if run.name not in names]:
             raise FileExistsError(f"{self.root} holds run {gone[0]}, which this study lacks: choose another --out")
 
     def write_results(self, study: Study) -> list[dict[str, Any]]:
@@ -225,20 +193,12 @@ class StudyFolder:
 
     def _row(self, run: RunSpec) -> dict[str, Any]:
         folder = self.run(run)
-        final, progress, failure = folder.final(), folder.progress(), self.failure(run)
-        error = failure[1] if failure and not final else ""
-        row: dict[str, Any] = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS)) | {
-            "run": run.name,
-            "game": run.game,
-            "observability": run.observability,
-            "memory": run.memory,
-            "agent": run.agent,
-            "algorithm": run.algorithm,
-            "seed": run.seed,
-            "status": "finished" if final else "failed" if error else "unfinished" if folder.exists() else "waiting",
-            "frames": progress.frames if progress else 0,
-            "error": error,
-        }
+        final, progress = folder.final(), folder.progress()
+        error = "" if final else self.failure(run)
+        row: dict[str, Any] = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
+        row |= {"run": run.name, "error": error} | {name: getattr(run, name) for name in _CELL}
+        row["status"] = "finished" if final else "failed" if error else "unfinished" if folder.exists() else "waiting"
+        row["frames"] = progress.frames if progress else 0
         if final:
             returns = [float(value) for value in final.get("returns", [])]
             mean = float(final["mean"]) if "mean" in final else sum(returns) / len(returns)
@@ -254,17 +214,8 @@ class StudyFolder:
         return row
 
 
-def _mapping(file: Path) -> dict[str, Any]:
+def _table(file: Path) -> dict[str, Any]:
     values = read_json(file)
     if not isinstance(values, dict):
         raise ValueError(f"{file} is damaged: it holds no table of names and values")
     return values
-
-
-def _list(values: Any) -> list[Any]:
-    return list(values) if isinstance(values, list) else []
-
-
-def _ours(entry: os.PathLike[str]) -> bool:
-    """Whether a file is the draft of another process that begins this very study."""
-    return os.path.basename(entry).startswith(".study.json.")

@@ -2,19 +2,25 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from importlib.resources import files
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from arcade_torch.tools.extensions import command_line
 
+if TYPE_CHECKING:
+    from arcade_torch.agents.config import TrainConfig
+
 OBSERVABILITIES = ("full", "partial")
+STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
 """``seeds = N`` beyond this is a slip."""
 _NAME = re.compile(r"[\w.\-]{1,80}")
 _AXES = ("games", "observability", "memories", "algorithms", "seeds")
+_GRID = {"name", "env", "observability", "memory", "algorithm", "seed", "total_frames", "out"}
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class Study:
         algorithms: learners.
         preset: settings that all runs start from.
         total_frames: environment steps of each run; None keeps the preset's.
-        settings: further options of ``arcade-torch train``, for example ``{"pqn": {"gamma": 0.9}}``.
+        settings: further fields of ``TrainConfig``, for example ``{"pqn": {"gamma": 0.9}}``.
         baseline: the memory-free agent, against which Bias is measured.
         sizes: of the memory block, ``LAYERSxWIDTH`` such as ``2x512``; the memory-free agent keeps the preset's.
         question: what the study asks, a sentence for its report.
@@ -92,23 +98,19 @@ class Study:
             raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
         for axis in _AXES:
             _check_axis(axis, getattr(self, axis), int if axis == "seeds" else str)
-        for word in ("preset", "baseline", "question"):
-            if not isinstance(getattr(self, word), str):
-                raise TypeError(f"{word} must be text, got {getattr(self, word)!r}")
+        for name in ("preset", "baseline", "question"):
+            if not isinstance(getattr(self, name), str):
+                raise TypeError(f"{name} must be text, got {getattr(self, name)!r}")
         _check_settings(self.settings)
         for size in self.sizes:
             if not isinstance(size, str) or not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
                 raise ValueError(f"sizes are layers x width, such as '2x512', got {size!r}")
         if len(set(self.sizes)) != len(self.sizes):
             raise ValueError(f"sizes names something twice: {', '.join(self.sizes)}")
-        unknown = [value for value in self.observability if value not in OBSERVABILITIES]
-        if unknown:
+        if unknown := [value for value in self.observability if value not in OBSERVABILITIES]:
             raise ValueError(f"observability must be among {', '.join(OBSERVABILITIES)}, got {unknown[0]!r}")
         if self.total_frames is not None and not (type(self.total_frames) is int and 1 <= self.total_frames <= 10**15):
             raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
-        clash = sorted(set(flatten(self.settings)) & {"env", "observability", "memory", "algorithm", "seed", "out"})
-        if clash:
-            raise ValueError(f"settings may not hold {clash[0]!r}: the grid decides it")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
@@ -122,17 +124,12 @@ class Study:
         if not isinstance(values, Mapping):
             raise ValueError(f"a study is a table of names and values, got {values!r}")
         known = [item.name for item in fields(cls)]
-        for key in values:
-            if key not in known:
-                raise ValueError(f"unknown key {key!r} in a study; known are {', '.join(known)}")
-        missing = [key for key in ("name", "games", "memories", "seeds") if key not in values]
-        if missing:
+        if unknown := [key for key in values if key not in known]:
+            raise ValueError(f"unknown key {unknown[0]!r} in a study; known are {', '.join(known)}")
+        if missing := [key for key in ("name", "games", "memories", "seeds") if key not in values]:
             raise ValueError(f"a study needs {', '.join(missing)}")
-        ready = dict(values)
-        for axis in (*_AXES, "sizes"):
-            if axis in ready:
-                ready[axis] = _as_tuple(axis, ready[axis])
-        return cls(**ready)
+        lists = {axis: _as_tuple(axis, values[axis]) for axis in (*_AXES, "sizes") if axis in values}
+        return cls(**{**values, **lists})
 
     @classmethod
     def load(cls, path: str | Path) -> "Study":
@@ -165,13 +162,11 @@ class Study:
             values = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise ValueError(f"it is not TOML: {error}") from error
-        values.setdefault("name", name)
-        return cls.from_dict(values)
+        return cls.from_dict({"name": name} | values)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
-        values = asdict(self)
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     def fixed(self) -> dict[str, Any]:
         """What may not change between two invocations in one folder: everything that decides a run's result."""
@@ -179,33 +174,57 @@ class Study:
 
     def runs(self) -> list[RunSpec]:
         """All cells; seeds vary slowest, so that an unfinished study holds every agent once before any twice."""
-        agents = [(memory, size) for memory in self.memories for size in self._sizes_of(memory)]
+        sizes = {memory: self.sizes if memory != self.baseline and self.sizes else ("",) for memory in self.memories}
+        agents = [(memory, size) for memory in self.memories for size in sizes[memory]]
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
         return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
 
-    def _sizes_of(self, memory: str) -> tuple[str, ...]:
-        return ("",) if memory == self.baseline or not self.sizes else self.sizes
+    def config(self, run: RunSpec) -> "TrainConfig":
+        """The config of one run; with one torch thread unless told, so that results are equal everywhere.
 
-    def arguments(self, run: RunSpec, out: Path) -> list[str]:
-        """The words after ``arcade-torch`` that train one run of this study."""
-        words = ["train", "--preset", self.preset, "--env", run.game, "--observability", run.observability]
-        words += ["--memory", run.memory, "--algorithm", run.algorithm, "--seed", str(run.seed)]
+        Raises:
+            ValueError: the preset or a setting does not exist, or has a value that is not allowed.
+        """
+        from arcade_torch.agents.presets import preset
+
+        changes: dict[str, Any] = {"threads": 1, **self.settings}
+        for other in set(self.algorithms) - {run.algorithm}:
+            changes.pop(other, None)
         if self.total_frames is not None:
-            words += ["--total-frames", str(self.total_frames)]
-        settings = {"threads": 1} | flatten(self.settings)  # equal results whatever the engine gives a run
+            changes["total_frames"] = self.total_frames
         if run.size:
-            layers, width = run.size.split("x")
-            settings |= {"network_options.layers": layers, "network_options.hidden_size": width}
-        for key, value in settings.items():
-            group = key.partition(".")[0]
-            if group in self.algorithms and group != run.algorithm:
-                continue  # numbers of another learner of the grid
-            words += _flag(key, value)
-        return [*words, "--out", str(out)]
+            layers, width = map(int, run.size.split("x"))
+            changes["network_options"] = {**changes.get("network_options", {}), "layers": layers, "hidden_size": width}
+        base = preset(self.preset, env=run.game, algorithm=run.algorithm)
+        for name in {"env_options", "network_options"} & set(changes):
+            changes[name] = {**getattr(base, name), **changes[name]}
+        cell = {"env": run.game, "observability": run.observability, "memory": run.memory}
+        return preset(self.preset, **cell, algorithm=run.algorithm, seed=run.seed, **changes)
 
     def command(self, run: RunSpec, out: Path) -> str:
-        """The same as one line for a shell."""
-        return command_line(self.arguments(run, out))
+        """The line for a shell that trains one run of this study in its folder ``out``."""
+        config = out.parent.parent / "configs" / f"{run.name}.json"
+        return command_line(["train", "--config", str(config), "--out", str(out), "--resume"])
+
+
+def study_preset(name: str) -> Study:
+    """A ready-made study.
+
+    * ``demo``: what ``arcade-torch demo`` runs.
+    * ``paper-easy``: the paper's agents on the easy game of each family, both twins, five seeds.
+    * ``paper``: all of the paper's main experiment: 30 games, both twins, seven memories and none, five seeds.
+    * ``size-sweep``: depth and width of the memory on two games, for the figure of that name.
+
+    Raises:
+        ValueError: there is no such preset.
+
+    Example:
+        >>> len(study_preset("paper").runs())
+        2400
+    """
+    if name not in STUDY_PRESETS:
+        raise ValueError(f"unknown study preset {name!r}; presets: {', '.join(STUDY_PRESETS)}")
+    return Study.parse((files("arcade_torch.tools") / "data" / f"study-{name}.toml").read_text("utf-8"), name)
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -215,26 +234,10 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         >>> flatten({"device": "cpu", "pqn": {"gamma": 0.9}})
         {'device': 'cpu', 'pqn.gamma': 0.9}
     """
-    return dict(_flatten(values, prefix))
-
-
-def _flatten(values: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    flat: dict[str, Any] = {}
     for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _flag(key: str, value: Any) -> list[str]:
-    head, dot, last = key.replace("_", "-").rpartition(".")
-    for table in ("env_options", "network_options"):
-        if key.startswith(f"{table}."):
-            return [f"--{table[:-1].replace('_', '-')}", f"{key.removeprefix(f'{table}.')}={value}"]
-    if isinstance(value, bool):
-        return [f"--{head}{dot}{'' if value else 'no-'}{last}"]
-    values = value if isinstance(value, list | tuple) else [value]
-    return [f"--{head}{dot}{last}", *(str(item) for item in values)]
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
 
 
 def _as_tuple(axis: str, value: Any) -> tuple[Any, ...]:
@@ -264,16 +267,13 @@ def _check_axis(axis: str, values: tuple[Any, ...], kind: type) -> None:
 
 
 def _check_settings(settings: Any) -> None:
-    """Refuse anything but options, and tables of options of one learner, game or network."""
+    """Refuse anything but a table of fields; what they are called and hold is checked by ``TrainConfig``."""
     if not isinstance(settings, Mapping):
         raise TypeError(f"settings must be a table of options, got {settings!r}")
-    for key, value in settings.items():
-        for name, inner in value.items() if isinstance(value, Mapping) else [(key, value)]:
-            items = inner if isinstance(inner, list | tuple) else [inner]
-            if not all(isinstance(item, bool | int | float | str) for item in items):
-                raise TypeError(
-                    f"settings: {name!r} must be a number, text, true, false or a list of such, got {inner!r}"
-                )
-        names = [key, *value] if isinstance(value, Mapping) else [key]
-        if odd := [name for name in names if not isinstance(name, str) or not _NAME.fullmatch(name)]:
-            raise ValueError(f"settings: {odd[0]!r} is no name of an option")
+    for name in ("env_options", "network_options"):
+        if not isinstance(settings.get(name, {}), Mapping):
+            raise TypeError(f"settings: {name} must be a table of options, got {settings[name]!r}")
+    if odd := [name for name in settings if not isinstance(name, str) or not _NAME.fullmatch(name)]:
+        raise ValueError(f"settings: {odd[0]!r} is no name of an option")
+    if clash := sorted(set(settings) & _GRID):
+        raise ValueError(f"settings may not hold {clash[0]!r}: the grid decides it")

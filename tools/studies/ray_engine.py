@@ -1,41 +1,36 @@
 """Runs of a study on a Ray cluster: one of its own on this machine, or an existing one.
 
-A Ray task starts the very command that a worker process of this machine would get, so a run does the same anywhere.
-Where the machine that got the task sees the study's folder, the run is written there. Where it does not, the run is
-carried out in a folder of that machine and its small files travel back.
+Ray places the runs, and starts one again whose worker or machine was lost; it goes on from its last checkpoint. Where
+a machine sees the study's folder, the run is written there. Where it does not, the run is carried out on the disk of
+that machine and its small files travel back.
 """
 
 import contextlib
+import getpass
+import hashlib
 import importlib
 import os
+import shutil
 import signal
-import time
-import uuid
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import tempfile
+import traceback
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.extensions import VARIABLE
+from arcade_torch.tools.errors import one_line, reason
+from arcade_torch.tools.extensions import VARIABLE, load_extensions
 from arcade_torch.tools.files import write_bytes
 from arcade_torch.tools.optional import need
-from arcade_torch.tools.studies.engines import Job, JobResult, Jobs, available_cores
-from arcade_torch.tools.studies.ray_task import Order, Outcome, carry_out
+from arcade_torch.tools.studies.engines import GRACE_S, Job, JobResult, append, available_cores
 
-OBJECT_STORE_BYTES = 128 << 20
-PROBE_DAYS = 7
-"""Older files named .shared-... are litter: left by studies that were killed."""
+_NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 
 
 class ClusterLostError(RuntimeError):
     """The cluster that a study started for itself is no more; what is finished is kept."""
-
-
-@dataclass
-class _Attempt:
-    order: Order
-    number: int
 
 
 @dataclass
@@ -48,9 +43,8 @@ class Ray:
             reach and that ends with the study.
         cpus_per_run: cores a run keeps busy.
         gpus_per_run: GPUs, or the part of one, a run keeps busy.
-        retries: further attempts at a run whose process or machine was lost; it goes on from its last checkpoint.
+        retries: further attempts at a run whose worker or machine was lost.
         module: the ray package, imported when needed.
-        poll_s: seconds between two looks.
     """
 
     workers: int = 0
@@ -59,7 +53,6 @@ class Ray:
     gpus_per_run: float = 0
     retries: int = 2
     module: Any = field(default=None, repr=False)
-    poll_s: float = 0.2
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -74,71 +67,46 @@ class Ray:
             raise ValueError(f"cpus-per-run must be above 0, got {self.cpus_per_run}")
         if self.gpus_per_run < 0 or self.retries < 0:
             raise ValueError(f"gpus-per-run and retries must be at least 0, got {self.gpus_per_run}, {self.retries}")
-        if not self.address:
-            os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
         self.module = self.module or need("ray")
 
-    def run(self, jobs: Jobs) -> Iterator[JobResult]:
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs as there is room; on Ctrl-C or close each run gets time to save."""
         with self._cluster() as ray:
-            task = ray.remote(num_cpus=self.cpus_per_run, num_gpus=self.gpus_per_run, max_retries=0)(carry_out)
-            probes: dict[Path, str] = {}
-            flying: dict[Any, _Attempt] = {}
+            self._check_room(ray)
+            options = {"num_cpus": self.cpus_per_run, "num_gpus": self.gpus_per_run, "max_retries": self.retries}
+            environment = {"env_vars": {VARIABLE: os.environ.get(VARIABLE, "")}}
+            task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
+            waiting, flying = [_absolute(job) for job in jobs], dict[Any, Job]()
             try:
-                yield from self._loop(ray, task, jobs, probes, flying)
+                while waiting or flying:
+                    while waiting and len(flying) < (self.workers or len(waiting) + len(flying)):
+                        job = waiting.pop(0)
+                        flying[task.remote(job, job.config.read_bytes())] = job
+                    ready, _ = ray.wait(list(flying), num_returns=1, timeout=1.0)
+                    self._check_alive(ray)
+                    for reference in ready:
+                        yield _result(ray, reference, flying.pop(reference))
             finally:
-                _cancel(ray, list(flying))
-                for file in probes:
-                    file.unlink(missing_ok=True)
+                for reference in flying:
+                    with contextlib.suppress(Exception):
+                        ray.cancel(reference, force=False)  # an interrupt in the task, which saves
+                if flying:
+                    with contextlib.suppress(Exception):
+                        ray.wait(list(flying), num_returns=len(flying), timeout=GRACE_S)
 
-    def _loop(
-        self, ray: Any, task: Any, jobs: Jobs, probes: dict[Path, str], flying: dict[Any, _Attempt]
-    ) -> Iterator[JobResult]:
-        waiting, more = iter(jobs), True
-        while more or flying:
-            room = self._room(ray)
-            while more and len(flying) < room:
-                try:
-                    job = next(waiting)
-                except StopIteration:
-                    more = False
-                    break
-                if job is None:
-                    break
-                order = _order(job, probes, max(1, int(self.cpus_per_run)))
-                flying[task.remote(order)] = _Attempt(order, 0)
-            if not flying:
-                time.sleep(self.poll_s)
-                continue
-            ready, _ = ray.wait(list(flying), num_returns=1, timeout=self.poll_s)
-            for reference in ready:
-                attempt = flying.pop(reference)
-                outcome = _outcome(ray, reference)
-                _keep(attempt.order, outcome)
-                if outcome.lost and attempt.number < self.retries:
-                    flying[task.remote(attempt.order)] = _Attempt(attempt.order, attempt.number + 1)
-                    continue
-                tried = f" (attempt {attempt.number + 1})" if attempt.number else ""
-                yield JobResult(attempt.order.name, outcome.exit_code, outcome.error and outcome.error + tried)
-
-    def _room(self, ray: Any) -> int:
-        """Runs that the cluster has room for now; machines may come and go. One more on a cluster that can grow."""
+    def _check_room(self, ray: Any) -> None:
         have = ray.cluster_resources()
-        if not self.address and not have.get("CPU"):  # it began with all cores of this machine
+        cpus, gpus = have.get("CPU", 0), have.get("GPU", 0)
+        if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
+            wanted = f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this machine has"
+            raise ValueError(f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run")
+
+    def _check_alive(self, ray: Any) -> None:
+        if not self.address and not ray.cluster_resources().get("CPU"):  # it began with all cores of this machine
             raise ClusterLostError(
                 "Ray's node on this machine is gone (killed, or out of memory); finished runs are kept, "
                 "the same command goes on with the others"
             )
-        room = int(have.get("CPU", 0) / self.cpus_per_run)
-        if self.gpus_per_run:
-            room = min(room, int(have.get("GPU", 0) / self.gpus_per_run))
-        if not self.address and room < 1:
-            raise ValueError(
-                f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this machine has "
-                f"{have.get('CPU', 0):g} and {have.get('GPU', 0):g}: lower --cpus-per-run or --gpus-per-run"
-            )
-        room = room if not self.address else room + 1
-        return min(room, self.workers) if self.workers else room
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Any]:
@@ -150,19 +118,11 @@ class Ray:
         for key, value in _QUIET.items():
             os.environ.setdefault(key, value)
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-        if self.address:
-            options["address"] = self.address
-        else:
-            options |= {
-                "address": "local",
-                "num_cpus": max(len(available_cores()), self.workers),
-                "include_dashboard": False,
-                "_node_ip_address": "127.0.0.1",
-                "object_store_memory": OBJECT_STORE_BYTES,
-            }
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "address": self.address or "local"}
         if not self.address:
             _stay_on_loopback()
+            options |= {"num_cpus": max(len(available_cores()), self.workers), "include_dashboard": False}
+            options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": 128 << 20}
         try:
             ray.init(**options)
         except ConnectionError as error:
@@ -186,63 +146,52 @@ def _stay_on_loopback() -> None:
         constants.ENABLE_RAY_CLUSTER = False
 
 
-def _order(job: Job, probes: dict[Path, str], threads: int) -> Order:
-    """What a machine is told: absolute paths, and a file by which it sees whether it shares the disk."""
-    folder = job.folder.absolute() if job.folder is not None else None
-    words = tuple(str(folder) if word == str(job.folder) else word for word in job.words)
-    root = folder.parent if folder is not None else job.log.absolute().parent
-    probe = next((file for file in probes if file.parent == root), None)
-    if probe is None:
-        _sweep(root)
-        probe = root / f".shared-{uuid.uuid4().hex}"
-        probes[probe] = uuid.uuid4().hex
-        write_bytes(probe, probes[probe].encode())
-    environment = {name: str(threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-    environment |= {VARIABLE: os.environ[VARIABLE]} if VARIABLE in os.environ else {}
-    return Order(job.name, words, job.log.absolute(), folder, (probe, probes[probe]), environment)
+def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
+    """Carry out a run on a machine of the cluster.
 
+    Args:
+        job: its paths are absolute, and those of the machine that sends it.
+        config: content of its config file.
 
-def _sweep(root: Path) -> None:
-    """Remove the files by which studies that were killed showed their disk; younger ones may still be needed."""
-    for old in root.glob(".shared-*"):
-        with contextlib.suppress(OSError):
-            if time.time() - old.stat().st_mtime > PROBE_DAYS * 86_400:
-                old.unlink()
-
-
-def _outcome(ray: Any, reference: Any) -> Outcome:
-    """What came of a task; a lost machine or worker is an outcome too."""
+    Returns:
+        Why it failed, in one line, and the traceback; both empty for success. Path in the run folder -> content of the
+        run's small files, where the disk is not shared.
+    """
+    shared = False
+    with contextlib.suppress(OSError):
+        shared = job.config.read_bytes() == config
+    if not shared:
+        key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]  # another attempt finds it again
+        here = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
+        job = replace(job, folder=here / "run", config=write_bytes(here / "config.json", config))
+    error = trace = ""
     try:
-        outcome: Outcome = ray.get(reference)
-        return outcome
-    except ray.exceptions.RayTaskError as error:
-        return Outcome(1, f"{type(error).__name__}: {' '.join(str(error.cause or error).split())}")
-    except ray.exceptions.RayError as error:
-        words = " ".join(str(error).split()) or "no details"
-        return Outcome(-1, f"its worker was lost: {type(error).__name__}: {words[:200]}", lost=True)
+        load_extensions()
+        job.train()
+    except Exception as caught:
+        error, trace = reason(caught), traceback.format_exc()
+    files = {} if shared else _small_files(job.folder)
+    if not shared and not error:
+        shutil.rmtree(job.config.parent)
+    return error, trace, files
 
 
-def _keep(order: Order, outcome: Outcome) -> None:
-    """Write what came back from a machine that does not share the disk; the final evaluation last."""
-    if order.folder is None:
-        return
-    for name, data in sorted(outcome.files.items(), key=lambda item: item[0] == "eval.json"):
-        target = (order.folder / name).resolve()
-        if order.folder.resolve() in target.parents:
-            write_bytes(target, data)
-    if outcome.log:
-        order.log.parent.mkdir(parents=True, exist_ok=True)
-        with order.log.open("ab") as stream:
-            stream.write(outcome.log)
+def _small_files(folder: Path) -> dict[str, bytes]:
+    names = {path: path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {name.as_posix(): path.read_bytes() for path, name in names.items() if not _NOT_SENT & set(name.parts)}
 
 
-def _cancel(ray: Any, references: list[Any]) -> None:
-    """Ask what still runs to save and stop, and wait for it."""
-    from arcade_torch.tools.studies.engines import GRACE_S
+def _absolute(job: Job) -> Job:
+    return Job(job.name, job.config.absolute(), job.folder.absolute(), job.log.absolute())
 
-    for reference in references:
-        with contextlib.suppress(Exception):
-            ray.cancel(reference, force=False)
-    if references:
-        with contextlib.suppress(Exception):
-            ray.wait(references, num_returns=len(references), timeout=GRACE_S)
+
+def _result(ray: Any, reference: Any, job: Job) -> JobResult:
+    """What came of a task; writes what travelled back, the final evaluation last."""
+    try:
+        error, trace, files = ray.get(reference)
+    except ray.exceptions.RayError as lost:
+        return JobResult(job.name, f"its worker was lost: {type(lost).__name__}: {one_line(lost)[:200]}")
+    for name, data in sorted(files.items(), key=lambda item: item[0] == "eval.json"):
+        write_bytes(job.folder / name, data)
+    append(job.log, trace)
+    return JobResult(job.name, error)
