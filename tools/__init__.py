@@ -14,7 +14,7 @@ _PUBLIC = {
     "contamination": "arcade_torch.tools.analysis.contamination",
     "shuffled_beginning": "arcade_torch.tools.analysis.contamination",
     "Policy": "arcade_torch.tools.analysis.policy",
-    "saliency_figure": "arcade_torch.tools.analysis.saliency_figure",
+    "saliency_figure": "arcade_torch.tools.figures.saliency",
     "greedy_window": "arcade_torch.tools.analysis.windows",
     "study": "arcade_torch.tools.studies.runner",
     "Study": "arcade_torch.tools.studies.grid",
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from arcade_torch.tools.analysis.pixel_saliency import saliency
     from arcade_torch.tools.analysis.policy import Policy
     from arcade_torch.tools.analysis.recall_density import recall_density
-    from arcade_torch.tools.analysis.saliency_figure import saliency_figure
     from arcade_torch.tools.analysis.windows import greedy_window
+    from arcade_torch.tools.figures.saliency import saliency_figure
     from arcade_torch.tools.reports.build import report
     from arcade_torch.tools.studies.grid import Study
     from arcade_torch.tools.studies.runner import study

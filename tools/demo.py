@@ -2,67 +2,29 @@
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from arcade_torch.tools.studies.grid import Study
-from arcade_torch.tools.studies.progress import clock
+from arcade_torch.tools.progress import Bars, clock
+from arcade_torch.tools.studies.grid import Study, study_preset
 
 GAME = "SignpostEasy"
 FRAMES = 100_000
 
 
 def demo_study(frames: int = FRAMES, seeds: int = 4, game: str = GAME) -> Study:
-    """The demo's study: one game, both twins, one memory model and the memory-free control.
-
-    Args:
-        frames: environment steps of each run.
-        seeds: runs of each agent and twin.
-        game: id of the game.
-
-    Raises:
-        ValueError: a number is below 1.
-    """
+    """The demo's study: one game, both twins, one memory model and the memory-free control."""
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
-    return Study(
-        name="demo",
-        games=(game,),
-        memories=("lru", "mlp"),
-        seeds=tuple(range(seeds)),
-        preset="small",
-        total_frames=frames,
-        question=_QUESTIONS.get(
-            game, f"What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
-        ),
-    )
+    what = replace(study_preset("demo"), games=(game,), seeds=tuple(range(seeds)), total_frames=frames)
+    return what if game == GAME else replace(what, question=_QUESTION.format(game=game))
 
 
-_QUESTIONS = {
-    "SignpostEasy": (
-        "A sign says which of four ways to take at the end of a corridor. Does a memory let an agent take it when the "
-        "sign is shown in the first frame alone (POMDP), and what does memory cost where the sign stays in view (MDP)? "
-        "Whoever forgets the sign can expect a return of 0.25 and no more."
-    ),
-    "MineSweeperEasy": (
-        "Does a memory let an agent play MineSweeper when only the number under the cursor is shown (POMDP), and what "
-        "does memory cost where every uncovered number stays in view (MDP)?"
-    ),
-}
+_QUESTION = "What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
 
 
 def demo(out: Path, study_of: Study, workers: int, command: str) -> int:
-    """Run the demo, or go on with it, and write its report.
-
-    Args:
-        out: folder.
-        study_of: what to run, see :func:`demo_study`.
-        workers: runs at once, 0 for one a core.
-        command: how the user started it.
-
-    Returns:
-        Exit code: 1 if a run failed.
-    """
-    from arcade_torch.tools.count_bar import CountBar
+    """Run the demo, or go on with it, and write its report."""
     from arcade_torch.tools.reports.build import report
     from arcade_torch.tools.studies.runner import study
 
@@ -74,7 +36,7 @@ def demo(out: Path, study_of: Study, workers: int, command: str) -> int:
     if not result.finished:
         return 1
     print("looking into the agents, playing the oracles, writing the report ...", file=sys.stderr, flush=True)
-    with CountBar() as bar:
-        page = report(out, progress=bar.update)
+    with Bars() as bars:
+        page = report(out, progress=bars.update)
     print(f"report after {clock(time.monotonic() - started)}: {page.resolve()}")
     return 1 if result.errors else 0

@@ -67,11 +67,7 @@ def imported() -> list[str]:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """A line for a shell that runs ``arcade-torch`` with these words and the same imports.
-
-    Args:
-        words: what follows ``arcade-torch``.
-    """
+    """A line for a shell that runs ``arcade-torch`` with these words and the same imports."""
     flags = [part for name in imported() for part in (FLAG, name)]
     return shlex.join(["arcade-torch", *words, *flags])
 

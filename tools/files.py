@@ -1,11 +1,13 @@
 """Reading and atomically writing the small files of runs, studies and analyses."""
 
 import csv
+import hashlib
 import io
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +43,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def write_between(page: Path, begin: str, end: str, text: str) -> Path:
-    """Put text between two marks of a page, in the place of what stood there.
-
-    Args:
-        page: an existing file in UTF-8.
-        begin: the first mark, which the page holds once.
-        end: the second one.
-        text: goes between them, with an empty line on both sides.
-
-    Raises:
-        ValueError: the page has no such marks.
-    """
+    """Put text between two marks of a page, in the place of what stood there."""
     try:
         old = page.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -126,3 +118,43 @@ def read_csv(path: Path) -> list[dict[str, str]]:
     if len(set(header)) != len(header) or any(name.splitlines() not in ([name], []) for name in header):
         raise ValueError(f"{path} has a header that names a column twice, or over several lines")
     return rows
+
+
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
+    """Write arrays atomically and compressed."""
+    import numpy as np
+
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return write_bytes(path, buffer.getvalue())
+
+
+def cached_arrays(
+    run: Path, name: str, options: Mapping[str, Any], compute: Callable[[], dict[str, Any]]
+) -> dict[str, Any]:
+    """Arrays from ``run/analysis``, computed and written there if they are missing, made for others, or damaged.
+
+    Args:
+        run: run folder; anything else (a single checkpoint, a folder that cannot be written) keeps nothing.
+        name: of the analysis.
+        options: everything that decides the numbers, the checkpoint included; JSON values.
+        compute: makes the arrays.
+
+    Returns:
+        The arrays, with the options as JSON in ``options``.
+    """
+    import numpy as np
+
+    text = json.dumps(dict(options), sort_keys=True)
+    file = run / "analysis" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.npz"
+    try:
+        with np.load(file, allow_pickle=False) as kept:
+            arrays = {key: kept[key] for key in kept.files}
+        if str(arrays["options"]) == text:
+            return arrays
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        pass  # there is none, or it is damaged: it is made anew
+    arrays = {**compute(), "options": np.array(text)}
+    if (run / "config.json").is_file() and os.access(run, os.W_OK):
+        write_npz(file, arrays)
+    return arrays

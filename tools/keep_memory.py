@@ -15,9 +15,6 @@ def keep_freed_memory() -> bool:
     that is computed changes. A gradient step of the paper's network with LRU took 0.46 s of one core instead of 0.66 s,
     and the process 1.3 GB instead of 0.85 GB. Elsewhere than on glibc nothing happens.
 
-    Returns:
-        Whether it was done.
-
     Source: ``mallopt(3)``, ``M_MMAP_MAX`` and ``M_TRIM_THRESHOLD``.
     """
     if platform.libc_ver()[0] != "glibc":

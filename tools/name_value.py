@@ -7,12 +7,6 @@ from typing import Any
 def name_and_value(text: str) -> tuple[str, Any]:
     """Read ``NAME=VALUE``; the value as JSON where it is JSON, otherwise as a word.
 
-    Args:
-        text: what was typed.
-
-    Raises:
-        ValueError: there is no name or no equals sign.
-
     Example:
         >>> name_and_value("tail=previous"), name_and_value("random_start=True")
         (('tail', 'previous'), ('random_start', True))

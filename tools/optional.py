@@ -1,4 +1,4 @@
-"""Packages that only some commands need, imported late and missed politely."""
+"""Import optional packages on first use; if one is missing, say which extra installs it."""
 
 from importlib import import_module
 from typing import Any
@@ -25,9 +25,6 @@ class MissingPackage(ImportError):
 
 def missing_package_message(name: str) -> str:
     """One line that says which package is missing and how to install it.
-
-    Args:
-        name: import name, for example ``matplotlib`` or ``matplotlib.pyplot``.
 
     Example:
         >>> missing_package_message("jinja2")

@@ -12,9 +12,6 @@ def versions() -> dict[str, str]:
     """Versions of this package, its commit, Python and the packages that decide a result.
 
     Nothing is imported for it. A package that is not installed is left out.
-
-    Returns:
-        name -> version; ``commit`` is empty outside a checkout and ends in ``+changes`` where files differ from it.
     """
     from arcade_torch import __version__
 

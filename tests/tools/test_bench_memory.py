@@ -8,9 +8,9 @@ import torch
 from arcade_torch.models import linear_scan, lru
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.back_ends import bench_back_ends
-from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, forms, looped, peak_bytes
+from arcade_torch.tools.bench.harness import KINDS, REST, op_breakdown, peak_bytes
+from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, bench_saliency, forms, looped
 from arcade_torch.tools.bench.scans import FORMS, unbind_loop
-from arcade_torch.tools.commands.bench_memory import show_back_ends
 from arcade_torch.tools.files import read_csv
 
 
@@ -53,22 +53,34 @@ def test_peak_memory_is_what_was_held_at_a_time_and_not_what_was_allocated() -> 
     assert 8000 <= peak_bytes(work) < 8200
 
 
-def test_back_ends_are_timed_beside_a_copy_and_compared_with_the_loop(capsys: pytest.CaptureFixture[str]) -> None:
+def test_back_ends_are_timed_beside_a_copy_and_compared_with_the_loop() -> None:
     names = ("doubling", "serial")
     rows = list(bench_back_ends(torch.device("cpu"), (5, 9), 2, 3, names=names, repeats=2))
     keys = [(row.steps, row.numbers, row.back_end) for row in rows]
     assert keys == [(t, numbers, name) for t in (5, 9) for numbers in ("real", "complex") for name in names]
     for row in rows:
         assert row.error < 1e-5 and min(row.forward_ms, row.backward_ms, row.forward_share, row.backward_share) > 0
-    show_back_ends(rows, "a processor")
-    assert "linear scan on a processor" in capsys.readouterr().out
 
 
-def test_the_command_prints_both_tables_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_saliency_in_two_stages_holds_less_memory_than_the_whole_network() -> None:
+    ours, whole = bench_saliency(24, 0.01, 1)
+    assert (ours["way"], whole["way"]) == ("two stages", "whole network")
+    assert ours["both_ms"] > 0 and ours["peak_mib"] < whole["peak_mib"]
+
+
+def test_kinds_of_operation_share_the_time_of_the_work() -> None:
+    x, weight = torch.rand(4, 8, 32, 32, requires_grad=True), torch.rand(8, 8, 3, 3, requires_grad=True)
+    shares = op_breakdown(lambda: torch.nn.functional.conv2d(x, weight).square().sum().backward())
+    assert set(shares) == {*KINDS, REST} and sum(shares.values()) == pytest.approx(1)
+    assert shares["convolutions"] > 0.2 and shares["recurrence"] == 0
+
+
+def test_the_command_prints_all_tables_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["bench", "memory", "mingru", "gru", "--steps", "6", "--layers", "1", "--size", "8", "--seconds", "0.001"]
-    assert cli.main([*words, "--repeats", "1", "--out", str(tmp_path / "m")]) == cli.EXIT_OK
+    words += ["--frames", "4"]
+    assert cli.main([*words, "--repeats", "1", "--out", str(tmp_path / "m.csv")]) == cli.EXIT_OK
     out = capsys.readouterr().out
-    assert "torch threads: 1" in out and "torch.nn.GRU" in out and "serial operator (in use)" in out
+    assert "torch.nn.GRU" in out and "serial operator (in use)" in out and "two stages" in out
     rows = read_csv(tmp_path / "m_models.csv")
     assert [(row["model"], row["form"]) for row in rows] == [
         ("mingru", "scan"),

@@ -1,15 +1,22 @@
 """The command line: help is quick, bad input is one line with exit code 2, work goes on after an interruption."""
 
+import json
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from arcade_torch.agents import preset
 from arcade_torch.tools import cli
+from arcade_torch.tools.commands.train import parse
 from arcade_torch.tools.optional import MissingPackage, need
+from arcade_torch.tools.progress import clock
+from tests.own_registry import own_registry  # noqa: F401
 from tests.tools.fabricated import small_study, write_study
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,7 +35,7 @@ def test_help_is_quick_and_loads_neither_torch_nor_jax() -> None:
     start = time.perf_counter()
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert time.perf_counter() - start < 10  # a tenth of a second on an idle machine
-    for heavy in ("'torch'", "'jax'", "'numpy'", "'tyro'"):
+    for heavy in ("'torch'", "'jax'", "'tyro'"):  # NumPy comes with Gymnasium, in whose registry the games stand
         assert heavy not in result.stdout
     assert "analyze gap-bias" in result.stdout
 
@@ -46,10 +53,13 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
     [
         (["trian"], "did you mean 'train'?"),
         (["analyze"], "followed by gap-bias or saliency"),
-        (["analyze", "gap"], "not 'gap'"),
+        (["analyze", "gap"], "did you mean 'gap-bias'?"),
+        (["analyze", "zzz"], "not 'zzz'"),
         (["train", "--preset", "huge"], "unknown preset 'huge'"),
         (["train", "--total-frame", "5"], "Unrecognized options: --total-frame, 5; perhaps you meant --total-frames"),
-        (["train", "--seed", "x"], "invalid literal for int() with base 10: 'x'"),
+        (["train", "--seed", "x"], "'x' is no whole number"),
+        (["train", "--env-option", "nonsense=1", "--env", "CartPoleEasy"], "nonsense"),
+        (["study", "--preset", "demo", "--shard", "3"], "a shard is written 3/10"),
         (["train", "--observability", "half"], "invalid choice 'half'"),
         (["train", "--pqn.gamma", "2"], "pqn.gamma"),
         (["train", "--env-option", "wind"], "NAME=VALUE"),
@@ -115,17 +125,18 @@ def test_a_missing_option_parser_is_named_too() -> None:
     assert result.stderr == "arcade-torch: the package tyro is missing: pip install 'arcade-torch[tools]'\n"
 
 
-def test_a_bug_is_an_internal_error_and_debug_shows_where(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fault", [lambda: 1 // 0, lambda: clock("x"), lambda: int("x"), lambda: {}["x"]])
+def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
+    fault: Callable[[], Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from arcade_torch.tools.commands import list as command
 
-    def broken(self: object) -> int:
-        return 1 // 0
-
-    monkeypatch.setattr(command.List, "run", broken)
-    assert "internal error: ZeroDivisionError" in one_error(capsys, ["list"], cli.EXIT_FAILED)
-    with pytest.raises(ZeroDivisionError):
+    monkeypatch.setattr(command.List, "run", lambda self: fault())
+    assert cli.main(["list"]) == cli.EXIT_FAILED
+    said = capsys.readouterr().err
+    assert said.startswith("arcade-torch: this is a fault of arcade-torch") and "Traceback" in said
+    assert "test_cli.py" in said
+    with pytest.raises((ArithmeticError, TypeError, ValueError, KeyError)):
         cli.main(["list", "--debug"])
 
 
@@ -137,25 +148,70 @@ def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], m
 
     monkeypatch.setattr(command.Demo, "run", interrupted)
     said = one_error(capsys, ["demo", "--frames", "4096", "--out", "runs/a b"], cli.EXIT_INTERRUPTED)
-    again = "arcade-torch demo --game SignpostEasy --frames 4096 --seeds 4 --out 'runs/a b'"
-    assert f"go on from their checkpoints with: {again}" in said
+    assert said.endswith("go on from their checkpoints with: arcade-torch demo --frames 4096 --out 'runs/a b'\n")
+
+
+@pytest.mark.usefixtures("own_registry")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["demo", "--workers", "3", "--seeds", "2"],
+        ["study", "--preset", "demo", "--workers", "3", "--no-report", "--engine", "inline", "--shard", "1/2"],
+        ["train", "--preset", "smoke", "--env", "PairsEasy", "--out", "1e3", "--resume"],
+    ],
+)
+def test_the_hint_after_an_interruption_keeps_every_option(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: object) -> int:
+        raise KeyboardInterrupt
+
+    command = import_module(f"arcade_torch.tools.commands.{words[0]}").COMMAND
+    monkeypatch.setattr(command, "run", interrupted)
+    own_game = str(ROOT / "examples/own_game.py")
+    said = one_error(capsys, [*words, "--import", own_game], cli.EXIT_INTERRUPTED)
+    assert said.endswith(f": arcade-torch {' '.join(words)} --import {own_game}\n")
 
 
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
-    from arcade_torch.tools.commands.train import parse
-
     words = ["--preset", "small", "--total-frames", "2e4", "--eval-every", "40_000", "--pqn.lam", "0.5"]
-    config = parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").config
+    config = parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").settings
     assert (config.total_frames, config.eval_every, config.pqn.lam) == (20_000, 40_000, 0.5)
     assert config.pqn.num_envs == 64  # of the preset
     assert (dict(config.env_options), config.network_options["skip"]) == ({"noise": 0.5}, "residual")
 
 
-def test_a_dry_run_prints_the_command_of_every_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_folder_may_be_called_like_a_number() -> None:
+    parsed = parse(["--preset", "smoke", "--out", "1e3", "--seed", "1e3"], "train")
+    assert (parsed.out, parsed.settings.seed) == (Path("1e3"), 1000)
+
+
+def test_a_run_can_start_from_the_config_of_another_and_change_it(tmp_path: Path) -> None:
+    file = tmp_path / "config.json"
+    config = preset("smoke", env="SignpostEasy", pqn={"lam": 0.5})
+    for content in (config.to_dict(), {"config": config.to_dict(), "versions": {}}):
+        file.write_text(json.dumps(content))
+        assert parse(["--config", str(file)], "train").settings == config
+    changed = parse(["--config", str(file), "--seed", "3", "--pqn.gamma", "0.5"], "train").settings
+    assert changed == preset("smoke", env="SignpostEasy", seed=3, pqn={"lam": 0.5, "gamma": 0.5})
+
+
+def test_a_config_file_that_is_none_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "config.json"
+    assert "no config at" in one_error(capsys, ["train", "--config", str(file)])
+    for content, message in (("{", "does not hold JSON"), ("[]", "holds no config"), ('{"x": 1}', "unknown field 'x'")):
+        file.write_text(content)
+        assert message in one_error(capsys, ["train", "--config", str(file)])
+    assert "not both" in one_error(capsys, ["train", "--config", str(file), "--preset", "smoke"])
+
+
+def test_a_dry_run_prints_every_run_with_its_frames(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "grid.toml"
     file.write_text('games = ["CartPoleEasy"]\nmemories = ["mlp"]\nseeds = 2\n')
     assert cli.main(["study", str(file), "--out", str(tmp_path / "out"), "--dry-run"]) == 0
-    assert capsys.readouterr().out.count("arcade-torch train --preset paper --env CartPoleEasy") == 4
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == "CartPoleEasy__full__mlp__pqn__seed0  9,998,336 frames" and len(out.splitlines()) == 4
+    assert err == "4 runs, 39,993,344 frames in all\n"
     assert not (tmp_path / "out").exists()
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arcade_torch.tools import cli
-from arcade_torch.tools.analysis.references import cached_references
+from arcade_torch.tools import cli, players
 from arcade_torch.tools.bench.envs import NAMES, bench_envs, read_all
 from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -52,6 +51,33 @@ def test_a_finished_study_is_not_trained_again(finished: Path, capsys: pytest.Ca
     assert before == {path: path.stat().st_mtime_ns for path in (finished / "runs").rglob("*.csv")}
 
 
+def test_a_job_is_a_config_in_json_and_trains_the_same_run(finished: Path, tmp_path: Path) -> None:
+    for line in json.loads((finished / "study.json").read_text())["runs"].values():
+        words = line.split()[1:]
+        assert words[:2] == ["train", "--config"] and words[3:] == ["--out", words[4], "--resume"]
+    words[4] = str(tmp_path / "again")
+    assert cli.main(words) == 0
+    found = [json.loads((path / "eval.json").read_text()) for path in (tmp_path / "again", Path(line.split()[5]))]
+    assert found[0]["returns"] == found[1]["returns"] and found[0]["train_max_ewm"] == found[1]["train_max_ewm"]
+
+
+@pytest.mark.parametrize("engine", ["inline", "processes"])
+def test_a_run_that_fails_leaves_its_reason_and_a_log(
+    engine: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "toy.toml").write_text(TOML + 'observability = "full"')
+    run = tmp_path / "out" / "runs" / "MineSweeperEasy__full__mlp__pqn__seed0"
+    run.mkdir(parents=True)
+    (run / "thesis.tex").write_text("precious")
+    (tmp_path / "out" / "study.json").write_text("")
+    words = ["study", str(tmp_path / "toy.toml"), "--out", str(tmp_path / "out"), "--engine", engine, "--no-report"]
+    assert cli.main(words) == 1
+    (row,) = read_csv(tmp_path / "out" / "results.csv")
+    assert (row["status"], row["error"]) == ("failed", f"{run} is not empty; choose another folder")
+    log = tmp_path / "out" / "logs" / f"{run.name}.log"
+    assert f"{row['error']} (log: {log})" in capsys.readouterr().out and "is not empty" in log.read_text()
+
+
 def test_an_agent_can_be_evaluated_on_both_twins(
     finished: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -82,15 +108,15 @@ def test_the_report_holds_a_strip_of_every_agent(
     text = page.read_text()
     assert text.count("data:image/png;base64,") >= 2
     assert "100.0 % of the gradient on the last one" in text
-    kept = sorted(path.stem for path in (finished / "analysis" / "saliency").iterdir())
-    assert kept == sorted(run.name for run in StudyFolder(finished).load().runs())
+    folder = StudyFolder(finished)
+    assert all(list((folder.run(run).path / "analysis").glob("saliency-*.npz")) for run in folder.load().runs())
 
 
 def test_reference_returns_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = cached_references("MineSweeperEasy", tmp_path, episodes=16)
-    assert found["random"]["mean"] < found["frames"]["mean"] < found["state"]["mean"] == pytest.approx(1.0)
-    monkeypatch.setattr("arcade_torch.tools.analysis.references.reference_returns", None)
-    assert cached_references("MineSweeperEasy", tmp_path, episodes=16) == found
+    found = players.references("MineSweeperEasy", tmp_path, episodes=16)
+    assert found["random"].mean < found["frames"].mean < found["state"].mean == pytest.approx(1.0)
+    monkeypatch.setattr(players, "measure", None)
+    assert players.references("MineSweeperEasy", tmp_path, episodes=16) == found
 
 
 def test_the_benchmark_consumes_every_frame_it_counts() -> None:

@@ -11,7 +11,7 @@ from arcade_torch.tools import gap_and_bias
 from arcade_torch.tools.analysis.bootstrap import measured_coverage, percentile_interval, resampled_means
 from arcade_torch.tools.analysis.gap_bias import GapBias
 from arcade_torch.tools.analysis.normalise import normalise, split_id
-from arcade_torch.tools.analysis.scores import Score, read_scores
+from arcade_torch.tools.runs import Score, read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
 

@@ -16,11 +16,11 @@ import arcade_torch
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES
 from arcade_torch.tools import cli
-from arcade_torch.tools.analysis.scores import read_scores
 from arcade_torch.tools.files import read_csv, write_csv
 from arcade_torch.tools.play import terminal, window
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay, score_row
 from arcade_torch.tools.play.session import KEYS, Attempt, Session
+from arcade_torch.tools.runs import read_scores
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "MineSweeperEasy"

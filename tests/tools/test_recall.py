@@ -80,7 +80,7 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     words += ["--out", str(out), "--page", str(page)]
     threads = torch.get_num_threads()
     assert cli.main(words) == cli.EXIT_OK
-    assert torch.get_num_threads() == threads and "training gdn, delay 2" in capsys.readouterr().err
+    assert torch.get_num_threads() == threads and "measuring gdn, delay 2" in capsys.readouterr().err
     text = page.read_text()
     assert recall.markdown(recall.read_recall(out)) in text
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text

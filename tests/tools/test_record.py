@@ -12,8 +12,8 @@ from tensordict import TensorDict
 
 import arcade_torch
 from arcade_torch.agents import evaluate, held_out_seed, preset
-from arcade_torch.agents.agent import build_network
-from arcade_torch.agents.checkpoint import save_checkpoint
+from arcade_torch.agents.policy import build_network
+from arcade_torch.agents.runs.checkpoint import save_checkpoint
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.oracles import make_oracle
 from arcade_torch.envs_jax.oracles import play as oracle_play

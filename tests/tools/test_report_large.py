@@ -7,8 +7,9 @@ import pytest
 from arcade_torch.agents import preset, train
 from arcade_torch.tools import cli, report
 from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.reports import build, memory
-from arcade_torch.tools.reports.chosen import chosen_cells, representatives
+from arcade_torch.tools.reports import build, panels
+from arcade_torch.tools.reports.selection import representatives, select_cells
+from arcade_torch.tools.runs import Runs, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import write_run
@@ -40,7 +41,7 @@ def check(page: str) -> Checker:
 
 
 def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "cached_references", lambda game, folder, rules: LEVELS)
+    monkeypatch.setattr(build, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
     page = report(folder.root, saliency=False, recall=False, contamination=False).read_text()
     assert len(page) < 400_000
@@ -57,8 +58,8 @@ def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: P
     folder, study = large_study(tmp_path / "s", seeds=4)
     for run in study.runs():
         (folder.run(run).path / "checkpoints").mkdir()
-    rows = folder.write_results(study)
-    cells, note = chosen_cells(folder, study, rows, build._finals(study, rows))
+    runs = Runs(tuple(run for spec in study.runs() if (run := open_run(folder.run(spec))) is not None))
+    cells, note = select_cells(runs, build._finals(runs), study.baseline)
     assert {cell.agent for cell in cells} == {"mlp", "lru"}
     assert {cell.game for cell in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
     assert all(len(cell.runs) == 3 for cell in cells)
@@ -110,8 +111,8 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     told: list[tuple[str, int, int]] = []
     page = report(trained, saliency=False, references=False, progress=lambda *step: told.append(step)).read_text()
     check(page)
-    assert ("recall density, mlp on SignpostEasy", 16, 16) in told
-    assert ("contamination, lru on SignpostEasy", memory.NOISE["starts"], memory.NOISE["starts"]) in told
+    assert ("recall density, mlp on SignpostEasy-v0", 16, 16) in told
+    assert ("contamination, lru on SignpostEasy-v0", panels.NOISE["starts"], panels.NOISE["starts"]) in told
     recall = page[page.index('id="recall"') : page.index('id="contamination"')]
     rows = [row.split("<td>")[1:] for row in recall.split("<tr>")[2:]]
     assert rows[1][3].startswith("100.0 %") and rows[1][4].startswith("0.0 %")  # no memory: all on the last frame

@@ -210,3 +210,15 @@ def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> Non
         saliency((encode, remember), frames(3), dtype=F64, **options)
     with pytest.raises(TypeError, match="got object"):
         saliency(object(), frames(3))
+
+
+def test_the_encoder_never_sees_more_than_one_chunk() -> None:
+    encode, remember, _, _ = linear_model(0.9)
+    sizes = []
+
+    def counted(o: Tensor) -> Tensor:
+        sizes.append(len(o))
+        return encode(o)
+
+    saliency((counted, remember), frames(9), chunk=4, dtype=F64)
+    assert sizes == [4, 4, 1] * 2  # features, then gradients

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 import arcade_torch
 from arcade_torch.agents import Agent, preset
-from arcade_torch.agents.agent import build_network
+from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import greedy_window, saliency
 
 GAME = "MineSweeperEasy"
@@ -80,9 +80,8 @@ def test_the_saliency_of_a_kept_end_is_that_of_the_whole_episode(env: Any, agent
 def test_replaying_a_window_gives_the_values_that_were_acted_on(env: Any, agent: Agent) -> None:
     window = greedy_window(agent, env, seed=1, max_steps=12)
     with torch.no_grad():
-        q, _ = agent.network(
-            window.frames[None], window.last_action[None], window.is_init[None], agent.initial_state(1)
-        )
+        features = agent.network.encode(window.frames[None])
+        q, _ = agent.network.remember(features, window.last_action[None], window.is_init[None], agent.initial_state(1))
     assert torch.equal(q[0].argmax(-1), window.action)
     found = saliency(agent, window.frames, window.last_action, window.is_init, window.state)
     np.testing.assert_allclose(

@@ -41,13 +41,6 @@ def point_sampled(shares: Array, taus: Array) -> Array:
     """The paper's curve: the share of step floor(tau n), n the index of the last step.
 
     It does not integrate to one over trajectories of different length; `binned` does.
-
-    Args:
-        shares: float64 [n + 1].
-        taus: float64 [P] in [0, 1].
-
-    Returns:
-        float64 [P].
     """
     return shares[np.floor(taus * (shares.size - 1) + 1e-9).astype(np.int64)]
 

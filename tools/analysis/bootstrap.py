@@ -29,8 +29,8 @@ class Interval:
         return bool(self.low > 0 or self.high < 0)
 
 
-def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> Array:
-    """Means over tasks with the seeds of each task resampled with replacement.
+def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> list[Array]:
+    """The seeds of each task, resampled with replacement.
 
     Args:
         cells: for each task the scores of its seeds, float64 [n_seeds].
@@ -38,12 +38,29 @@ def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator
         rng: source of the draws.
 
     Returns:
-        float64 [D].
+        For each task float64 [D, n_seeds].
     """
-    total = np.zeros(draws)
-    for cell in cells:
-        total += cell[rng.integers(len(cell), size=(draws, len(cell)))].mean(axis=1)
-    return total / len(cells)
+    return [cell[rng.integers(len(cell), size=(draws, len(cell)))] for cell in cells]
+
+
+def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> Array:
+    """Means over tasks of resampled seeds, float64 [D]; arguments as for `resampled`."""
+    return mean_over_tasks(resampled(cells, draws, rng))
+
+
+def mean_over_tasks(cells: Sequence[Array]) -> Array:
+    """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...]."""
+    return np.asarray(sum(cell.mean(axis=-1) for cell in cells) / len(cells))
+
+
+def iqm(cells: Sequence[Array]) -> Array:
+    """Interquartile mean: the mean of the middle half of all runs of all tasks; [..., n_seeds] a task to [...].
+
+    Source: Agarwal et al. (2021), arXiv 2108.13264; the same as ``aggregate_iqm`` of rliable 1.2.
+    """
+    runs = np.sort(np.concatenate(cells, axis=-1), axis=-1)
+    cut = int(0.25 * runs.shape[-1])
+    return np.asarray(runs[..., cut : runs.shape[-1] - cut].mean(axis=-1))
 
 
 def percentile_interval(value: float, draws: Array, confidence: float, known: bool = True) -> Interval:

@@ -2,18 +2,21 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 import arcade_torch
 from arcade_torch.tools.analysis.contamination import Contamination, contamination, shuffled_beginning
-from arcade_torch.tools.analysis.kept import Arrays, kept
+from arcade_torch.tools.analysis.pixel_saliency import saliency
 from arcade_torch.tools.analysis.recall_density import RecallDensity, recall_density
-from arcade_torch.tools.analysis.subject import Twin
+from arcade_torch.tools.analysis.resolve import Twin, episode_window
+from arcade_torch.tools.analysis.windows import Window
+from arcade_torch.tools.files import cached_arrays
+from arcade_torch.tools.runs import AgentKey, agent_names, find_runs
 
 Progress = Callable[[int, int], None]
 
@@ -23,76 +26,80 @@ class Label:
     """Which checkpoint this is: one seed of an agent on one twin of a game.
 
     Attributes:
-        agent: name of its memory, with the algorithm in front where it is not PQN.
+        key: which agent.
         game: environment id.
         observability: the twin that is looked at.
         seed: of the training.
         frames: of training behind it.
         path: run folder or checkpoint.
+        agent: name of the agent among those it is compared with, see `with_names`.
     """
 
-    agent: str
+    key: AgentKey
     game: str
     observability: str
     seed: int
     frames: int
     path: Path
+    agent: str = ""
 
     @property
     def task(self) -> tuple[str, str, str]:
         """What seeds are pooled over: (agent, game, observability)."""
         return self.agent, self.game, self.observability
 
+    def __str__(self) -> str:
+        """Agent, game, twin and seed in a few words."""
+        return f"{self.agent} on {self.game} ({self.observability}), seed {self.seed}"
+
 
 def load_labelled(path: Path, observability: Twin | None = None) -> tuple[Any, Label]:
-    """An agent and what it is.
-
-    Args:
-        path: run folder or checkpoint.
-        observability: another twin than the one trained on.
-
-    Raises:
-        CheckpointError: there is nothing to load, or it is damaged.
-    """
+    """An agent and what it is, called by the name of its memory alone."""
     from arcade_torch.agents import load
 
     agent = load(path)
     config = agent.config
-    name = config.memory if config.algorithm == "pqn" else f"{config.algorithm}-{config.memory}"
-    return agent, Label(name, config.env, observability or config.observability, config.seed, agent.frames, path)
+    key = AgentKey.of(config.to_dict())
+    twin = observability or config.observability
+    return agent, Label(key, config.env, twin, config.seed, agent.frames, path, key.memory)
 
 
-def check_distinct(labels: Sequence[Label]) -> None:
-    """Refuse two checkpoints that would be pooled as if they were two seeds.
+Found = TypeVar("Found")
 
-    Raises:
-        ValueError: two checkpoints are of the same agent, twin, game and seed; names them.
-    """
+
+def with_names(measured: Sequence[tuple[Label, Found]]) -> list[tuple[Label, Found]]:
+    """Measures of checkpoints, with names that tell their agents apart."""
+    names = agent_names(label.key for label, _ in measured)
+    named = [(replace(label, agent=names[label.key]), found) for label, found in measured]
     seen: dict[tuple[str, str, str, int], Path] = {}
-    for label in labels:
+    for label, _ in named:
         cell = (*label.task, label.seed)
         if cell in seen:
-            raise ValueError(
-                f"{seen[cell]} and {label.path} are both {label.agent} on {label.game} ({label.observability}), "
-                f"seed {label.seed}: give one of them"
-            )
+            raise ValueError(f"{seen[cell]} and {label.path} are both {label}: give one of them")
         seen[cell] = label.path
+    return named
+
+
+def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Run folders and checkpoints as they are, and the finished runs below other folders; notes on the rest."""
+    found, notes = list[Path](), list[str]()
+    for path in paths:
+        if (path / "meta.json").is_file() or (path / "config.json").is_file() or (path / "checkpoints").is_dir():
+            found.append(path)
+        else:
+            runs = find_runs([path])
+            found += [run.folder.path for run in runs.runs]
+            notes += runs.notes
+    return found, notes
 
 
 def density_of_run(
     path: Path, options: Mapping[str, Any], observability: Twin | None = None, progress: Progress | None = None
 ) -> tuple[Label, RecallDensity]:
-    """Recall density of a checkpoint.
-
-    Args:
-        path: run folder or checkpoint.
-        options: keyword arguments of `recall_density`.
-        observability: another twin than the one trained on.
-        progress: as for `recall_density`.
-    """
+    """Recall density of a checkpoint."""
     agent, label = load_labelled(path, observability)
 
-    def compute() -> Arrays:
+    def compute() -> dict[str, Any]:
         found = recall_density(agent, observability=observability, progress=progress, **options)
         return {
             "shares": np.concatenate([*found.shares, np.zeros(0)]),
@@ -102,7 +109,7 @@ def density_of_run(
             "how": np.array([found.end, found.norm, found.reduce, found.target]),
         }
 
-    arrays = kept(path, "recall_density", _identity(agent, label, recall_density, options), compute)
+    arrays = cached_arrays(path, "recall_density", _identity(agent, label, recall_density, options), compute)
     cuts = np.cumsum(arrays["lengths"])[:-1]
     shares = tuple(np.split(arrays["shares"], cuts)) if arrays["lengths"].size else ()
     dropped, silent = (int(count) for count in arrays["counts"])
@@ -117,26 +124,36 @@ def contamination_of_run(
     observability: Twin | None = None,
     progress: Progress | None = None,
 ) -> tuple[Label, Contamination]:
-    """State contamination of a checkpoint.
-
-    Args:
-        path: run folder or checkpoint.
-        options: keyword arguments of `contamination`, or of `shuffled_beginning`.
-        shuffle: whether to permute early frames in place of adding noise.
-        observability: another twin than the one trained on.
-        progress: as for `contamination`.
-    """
+    """State contamination of a checkpoint."""
     agent, label = load_labelled(path, observability)
     measure = shuffled_beginning if shuffle else contamination
 
-    def compute() -> Arrays:
+    def compute() -> dict[str, Any]:
         found = asdict(measure(agent, observability=observability, progress=progress, **options))
         return {name: np.asarray(value) for name, value in found.items()}
 
     name = "shuffle" if shuffle else "contamination"
-    arrays = kept(path, name, _identity(agent, label, measure, options), compute)
+    arrays = cached_arrays(path, name, _identity(agent, label, measure, options), compute)
     plain: dict[str, Any] = {name: value.item() if value.ndim == 0 else value for name, value in arrays.items()}
     return label, Contamination(**{field.name: plain[field.name] for field in fields(Contamination)})
+
+
+def saliency_of_run(path: Path, show: int, tries: int) -> tuple[Label, dict[str, Any]]:
+    """Saliency of the last decision of a greedy episode of a checkpoint."""
+    agent, label = load_labelled(path)
+
+    def compute() -> dict[str, Any]:
+        windows: list[Window] = []
+        while len(windows) < tries and not (windows and windows[-1].n + 1 >= show):
+            windows.append(episode_window(agent, seed=len(windows)))
+        w = max(windows, key=lambda window: window.n)
+        found = saliency(agent, w.frames, w.last_action, w.is_init, w.state)
+        arrays: dict[str, Any] = {"frames": w.frames, "action": w.action, "reward": w.reward}
+        arrays |= {"maps": found.maps, "per_frame": found.per_frame, "output": found.output, "seed": w.seed}
+        return {name: np.asarray(value) for name, value in arrays.items()}
+
+    how = {"show": show, "tries": tries}
+    return label, cached_arrays(path, "saliency", _identity(agent, label, episode_window, how), compute)
 
 
 NO_OPTIONS = ("agent", "env", "observability", "progress", "chunk")

@@ -21,10 +21,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.tools.analysis.gradients import encode_frames
+from arcade_torch.tools.analysis.perturbation import disturbed_frames, replayed, shuffle_order
 from arcade_torch.tools.analysis.policy import Policy, Target, evaluation, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.replay import disturbed_frames, replayed, shuffle_order
-from arcade_torch.tools.analysis.subject import subject
-from arcade_torch.tools.analysis.two_stage import encode_all
+from arcade_torch.tools.analysis.resolve import resolve_agent
 from arcade_torch.tools.analysis.windows import MAX_STEPS, Window, greedy_windows
 
 Floats = NDArray[np.float64]
@@ -37,8 +37,6 @@ DELAYS = (0, 1, 2, 5, 10, 20, 50, 100)
 
 POINTS_AN_EPISODE = 4
 """Start points drawn from one trajectory."""
-
-CHUNK = 16
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ def contamination(
         noisy = disturbed_frames(window.frames, places, grid.sigmas, clip, int(rng.integers(2**62)))
         rows = features.repeat(1 + noisy.shape[0], 1, 1)
         index = torch.as_tensor(np.repeat(places, len(grid.sigmas)))
-        rows[torch.arange(1, 1 + noisy.shape[0]), index] = encode_all(policy.encode, noisy, CHUNK, torch.float32)
+        rows[torch.arange(1, 1 + noisy.shape[0]), index] = encode_frames(policy.encode, noisy)
         return _Rows(rows, places, places)
 
     options = _Options(starts, POINTS_AN_EPISODE, feedback, seed, cap, target, 2)
@@ -244,7 +242,7 @@ def _measure(
 ) -> Contamination:
     if options.starts < 1:
         raise ValueError(f"starts must be at least 1, got {options.starts}")
-    player, env = subject(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability)
     what = resolve(player, options.target)
     if what == "value":
         raise ValueError("contamination compares actions: target must be q, logits or probs, not value")
@@ -259,7 +257,7 @@ def _measure(
             if window.n + 1 < max(2, options.shortest):
                 skipped += 1
                 continue
-            features = encode_all(policy.encode, window.frames, CHUNK, torch.float32)[None]
+            features = encode_frames(policy.encode, window.frames)[None]
             wanted = min(options.per_window, options.starts - len(points))
             rows = disturb(policy, window, features, rng, wanted)
             raw = replayed(policy, window, rows.features, rows.touched, options.feedback)
@@ -308,5 +306,5 @@ def _clean_error(policy: Policy, window: Window, features: Tensor, rows: _Rows, 
     """What the machinery itself does: a frame in the middle is replaced by itself, encoded alone."""
     middle = window.n // 2
     again = features.clone()
-    again[0, middle] = encode_all(policy.encode, window.frames[middle : middle + 1], 1, torch.float32)[0]
+    again[0, middle] = encode_frames(policy.encode, window.frames[middle : middle + 1])[0]
     return float((replayed(policy, window, again, rows.touched, feedback)[0] - clean).abs().max())

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.tools.analysis.gradients import encode_frames
+from arcade_torch.tools.analysis.perturbation import WHITE, disturbed_frames, replayed, shuffle_order
 from arcade_torch.tools.analysis.policy import Target, evaluation, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.replay import WHITE, disturbed_frames, replayed, shuffle_order
-from arcade_torch.tools.analysis.two_stage import encode_all
 from arcade_torch.tools.analysis.windows import Window
 
 ACTIONS = ("up", "down", "left", "right", "fire")
@@ -72,11 +72,9 @@ def noise_examples(
     noisy = disturbed_frames(window.frames, places, np.array([sigma]), clip, seed)
     policy = policy_of(model)
     with evaluation(policy):
-        clean = encode_all(policy.encode, window.frames, 16, torch.float32)
+        clean = encode_frames(policy.encode, window.frames)
         rows = clean.repeat(1 + len(hits), 1, 1)
-        rows[torch.arange(1, 1 + len(hits)), torch.as_tensor(places)] = encode_all(
-            policy.encode, noisy, 16, torch.float32
-        )
+        rows[torch.arange(1, 1 + len(hits)), torch.as_tensor(places)] = encode_frames(policy.encode, noisy)
         values = _values(model, replayed(policy, window, rows, places, feedback), target)
     shown = noisy.clamp(0, WHITE).round().to(torch.uint8)
     pictures = [_pick(window.frames, [0, hits[0], window.n])]
@@ -108,7 +106,7 @@ def shuffle_example(
     order = shuffle_order(window.n + 1, first, last, np.random.default_rng(seed))
     policy = policy_of(model)
     with evaluation(policy):
-        clean = encode_all(policy.encode, window.frames, 16, torch.float32)[None]
+        clean = encode_frames(policy.encode, window.frames)[None]
         rows = torch.cat([clean, clean[:, torch.as_tensor(order)]])
         values = _values(model, replayed(policy, window, rows, np.array([first]), feedback), target)
     early = list(range(first + 1, min(last, first + 3) + 1))

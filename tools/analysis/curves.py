@@ -1,4 +1,4 @@
-"""Learning curves of the agents of a study, with intervals over seeds."""
+"""Learning curves of agents, with intervals over seeds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
-from arcade_torch.tools.studies.folder import RunFolder, StudyFolder
-from arcade_torch.tools.studies.grid import RunSpec, Study
+from arcade_torch.tools.studies.folder import RunFolder
 
 POINTS = 120
 """Points of a training curve."""
@@ -15,18 +14,7 @@ POINTS = 120
 
 @dataclass(frozen=True)
 class Curve:
-    """One agent on one task, averaged over seeds.
-
-    Attributes:
-        agent: its name.
-        game: environment id.
-        observability: ``full`` or ``partial``.
-        frames: float64 [P].
-        mean: float64 [P], mean over seeds.
-        low: float64 [P], lower end of the interval (NaN with one seed).
-        high: float64 [P], upper end.
-        seeds: float64 [n_seeds, P], the single runs.
-    """
+    """One agent on one task, averaged over seeds."""
 
     agent: str
     game: str
@@ -38,29 +26,6 @@ class Curve:
     seeds: Array
 
 
-def agent_name(study: Study, run: RunSpec) -> str:
-    """What a run's agent is called in tables: its memory, with the algorithm where there are several."""
-    return run.agent if len(study.algorithms) == 1 else f"{run.algorithm}-{run.agent}"
-
-
-def learning_curves(folder: StudyFolder, study: Study, kind: str = "eval", confidence: float = 0.95) -> list[Curve]:
-    """Curves of all agents and tasks.
-
-    Args:
-        folder: the study on disk.
-        study: what it asks.
-        kind: ``eval`` (greedy evaluations) or ``train`` (running mean of training returns, exploration included).
-        confidence: of the intervals: percentile bootstrap over seeds.
-
-    Returns:
-        One curve an (agent, game, observability) with at least one run, cut to the frames that all its runs reached.
-    """
-    groups: dict[tuple[str, str, str], list[RunFolder]] = {}
-    for run in study.runs():
-        groups.setdefault((agent_name(study, run), run.game, run.observability), []).append(folder.run(run))
-    return curves_of_runs(groups, kind, confidence)
-
-
 def curves_of_runs(
     groups: Mapping[tuple[str, str, str], Sequence[RunFolder]], kind: str = "eval", confidence: float = 0.95
 ) -> list[Curve]:
@@ -68,8 +33,8 @@ def curves_of_runs(
 
     Args:
         groups: (agent, game, observability) -> its runs, one a seed.
-        kind: as for `learning_curves`.
-        confidence: as for `learning_curves`.
+        kind: ``eval`` (greedy evaluations) or ``train`` (running mean of training returns, exploration included).
+        confidence: of the intervals: percentile bootstrap over seeds.
 
     Returns:
         One curve a group whose runs have logged something at frames that all of them reached.

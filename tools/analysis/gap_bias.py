@@ -16,12 +16,14 @@ import numpy as np
 from arcade_torch.tools.analysis.bootstrap import (
     Array,
     Interval,
+    iqm,
+    mean_over_tasks,
     measured_coverage,
     percentile_interval,
-    resampled_means,
+    resampled,
 )
 from arcade_torch.tools.analysis.normalise import normalise, split_id
-from arcade_torch.tools.analysis.scores import Runs, Score, read_scores
+from arcade_torch.tools.runs import Score, Source, find_baseline, read_scores
 
 TWINS = ("full", "partial")
 
@@ -40,6 +42,8 @@ class AgentRow:
         gap: mdp - pomdp.
         bias: mdp - mdp of the memory-free agent.
         coverage: measured coverage of the interval of Gap; NaN where there is no interval.
+        mdp_iqm: interquartile mean of the normalised returns of all MDP runs.
+        pomdp_iqm: the same of the POMDP runs.
     """
 
     agent: str
@@ -51,6 +55,8 @@ class AgentRow:
     gap: Interval
     bias: Interval
     coverage: float
+    mdp_iqm: Interval
+    pomdp_iqm: Interval
 
 
 @dataclass(frozen=True)
@@ -80,11 +86,7 @@ class GapBias:
     _pomdp_draws: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def row(self, agent: str) -> AgentRow:
-        """The row of an agent.
-
-        Raises:
-            ValueError: there is no such agent.
-        """
+        """The row of an agent."""
         for row in self.rows:
             if row.agent == agent:
                 return row
@@ -109,7 +111,7 @@ class GapBias:
 
 
 def gap_and_bias(
-    runs: Runs,
+    runs: Source,
     *,
     metric: str = "eval_final",
     baseline: str = "mlp",
@@ -123,7 +125,7 @@ def gap_and_bias(
     same resample of its MDP runs, so that their covariance is kept; MDP and POMDP seeds are never paired.
 
     Args:
-        runs: a study's folder, run folders, a CSV file, or scores; see `read_scores` in the module ``scores``.
+        runs: a study's folder, run folders, a CSV file, or scores; see `arcade_torch.tools.runs.read_scores`.
         metric: ``eval_final`` (greedy) or ``train_max_ewm`` (the paper's).
         baseline: the memory-free agent (any case).
         draws: bootstrap draws.
@@ -142,7 +144,7 @@ def gap_and_bias(
         raise ValueError(f"draws must be at least 1, got {draws}")
     cells = _cells(read_scores(runs, metric))
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
-    base = next((agent for agent in agents if agent.lower() == baseline.lower()), None)
+    base = find_baseline(agents, baseline)
     if base is None:
         raise ValueError(f"no scores for the memory-free agent {baseline!r}; there are {', '.join(agents) or 'none'}")
     agents = [base, *(agent for agent in agents if agent != base)]
@@ -155,7 +157,7 @@ def gap_and_bias(
     without = {}
     for game in games if len(games) > 1 else []:
         rest = [task for task in tasks if split_id(task).game != game]
-        without[game] = _rows(cells, agents, rest, draws, confidence, seed)[0]
+        without[game] = _rows(cells, agents, rest, draws, confidence, seed, with_iqm=False)[0]
     dropped = tuple(game for game in every if game not in tasks)
     return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, gaps, pomdps)
 
@@ -175,42 +177,46 @@ def _cells(scores: Sequence[Score]) -> Cells:
 
 
 def _rows(
-    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, confidence: float, seed: int
+    cells: Cells,
+    agents: Sequence[str],
+    tasks: Sequence[str],
+    draws: int,
+    confidence: float,
+    seed: int,
+    with_iqm: bool = True,
 ) -> tuple[tuple[AgentRow, ...], dict[str, Array], dict[str, Array]]:
     raw = {key: cells[key] for key in ((a, t, twin) for a in agents for t in tasks for twin in TWINS)}
     scaled = {key: normalise(key[1], values) for key, values in raw.items()}
-    resampled = {
-        # the stream of an agent's twin depends on its place alone, and raw and normalised means share it
-        (agent, twin): [
-            resampled_means([source[agent, task, twin] for task in tasks], draws, np.random.default_rng([seed, i, j]))
-            for source in (raw, scaled)
-        ]
-        for i, agent in enumerate(agents)
-        for j, twin in enumerate(TWINS)
-    }
     base = agents[0]
+    found: dict[tuple[str, str], dict[str, tuple[float, Array]]] = {}  # values and draws
+    for i, agent in enumerate(agents):
+        for j, twin in enumerate(TWINS):
+            # The stream depends on the place of the agent's twin alone: raw, normalised and IQM share its draws.
+            parts = {}
+            for name, source in (("raw", raw), ("mean", scaled)):
+                drawn = resampled(
+                    [source[agent, task, twin] for task in tasks], draws, np.random.default_rng([seed, i, j])
+                )
+                parts[name] = (_mean(source, agent, tasks, twin), mean_over_tasks(drawn))
+            middle = float(iqm([scaled[agent, task, twin] for task in tasks]))
+            parts["iqm"] = (middle, iqm(drawn) if with_iqm else np.full(1, np.nan))
+            found[agent, twin] = parts
     rows, gaps, pomdps = [], {}, {}
     for agent in agents:
-        means = {twin: [_mean(source, agent, tasks, twin) for source in (raw, scaled)] for twin in TWINS}
+        full, partial = found[agent, "full"], found[agent, "partial"]
         counts = {twin: tuple(len(raw[agent, task, twin]) for task in tasks) for twin in TWINS}
         least = min(counts["full"] + counts["partial"])
-        base_least = min(len(raw[base, task, "full"]) for task in tasks)
-        full, partial = resampled[agent, "full"], resampled[agent, "partial"]
-        gaps[agent], pomdps[agent] = full[1] - partial[1], partial[1]
-        bias = means["full"][1] - _mean(scaled, base, tasks, "full")
-        rows.append(
-            AgentRow(
-                agent,
-                least,
-                percentile_interval(means["full"][0], full[0], confidence, least > 1),
-                percentile_interval(means["partial"][0], partial[0], confidence, least > 1),
-                percentile_interval(means["full"][1], full[1], confidence, least > 1),
-                percentile_interval(means["partial"][1], partial[1], confidence, least > 1),
-                percentile_interval(means["full"][1] - means["partial"][1], gaps[agent], confidence, least > 1),
-                percentile_interval(bias, full[1] - resampled[base, "full"][1], confidence, min(least, base_least) > 1),
-                measured_coverage(counts["full"], counts["partial"], confidence) if least > 1 else float("nan"),
-            )
+        free, base_least = found[base, "full"]["mean"], min(len(raw[base, task, "full"]) for task in tasks)
+        gaps[agent], pomdps[agent] = full["mean"][1] - partial["mean"][1], partial["mean"][1]
+        values = {"mdp_raw": full["raw"], "pomdp_raw": partial["raw"], "mdp": full["mean"], "pomdp": partial["mean"]}
+        values |= {"mdp_iqm": full["iqm"], "pomdp_iqm": partial["iqm"]}
+        values["gap"] = (full["mean"][0] - partial["mean"][0], gaps[agent])
+        intervals = {name: percentile_interval(*pair, confidence, least > 1) for name, pair in values.items()}
+        intervals["bias"] = percentile_interval(
+            full["mean"][0] - free[0], full["mean"][1] - free[1], confidence, min(least, base_least) > 1
         )
+        coverage = measured_coverage(counts["full"], counts["partial"], confidence) if least > 1 else float("nan")
+        rows.append(AgentRow(agent, least, coverage=coverage, **intervals))
     return tuple(rows), gaps, pomdps
 
 
@@ -220,7 +226,7 @@ def _mean(source: Cells, agent: str, tasks: Sequence[str], twin: str) -> float:
 
 def _plain(row: AgentRow, without: str) -> dict[str, Any]:
     values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
-    for name in ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias"):
+    for name in ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm"):
         interval: Interval = getattr(row, name)
         values |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return values | {"coverage": row.coverage}

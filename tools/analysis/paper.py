@@ -20,12 +20,7 @@ SEEDS = 5
 
 @dataclass(frozen=True)
 class Spread:
-    """Errors of an aggregate over tasks.
-
-    Attributes:
-        sem: as the published code draws it: mean over tasks of the standard deviations, by the root of all runs.
-        half_width: of a 95 % interval with independent tasks.
-    """
+    """Errors of an aggregate over tasks."""
 
     sem: float
     half_width: float
@@ -33,13 +28,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """The published aggregates.
-
-    Attributes:
-        table: Gap and Bias of every agent with normal 95 % intervals, also without each game.
-        mdp: agent -> error of its MDP return.
-        pomdp: agent -> error of its POMDP return.
-    """
+    """The published aggregates."""
 
     table: GapBias
     mdp: Mapping[str, Spread]

@@ -1,7 +1,7 @@
 """Pixel saliency: how the decision at step n depends on every pixel seen at steps t <= n.
 
 ``S(o_t) = sum_a || d Q(s_n, a) / d o_t ||^2``, the norm taken over colour channels at each pixel. Computed in two
-stages, see ``two_stage``.
+stages, see ``gradients``.
 
 Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation differentiates the sum over actions
 instead (``reduce="sum", norm="l1"``, divided by 3).
@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.tools.analysis.gradients import Norm, Reduce, encode_frames, frame_norms, memory_jacobian
 from arcade_torch.tools.analysis.policy import Target, evaluation, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.two_stage import Norm, Reduce, encoder_stage, memory_stage, record_all
 
 __all__ = ["Norm", "Reduce", "Saliency", "Target", "frame_gradients", "saliency"]
 
@@ -116,15 +116,7 @@ def frame_gradients(
     dtype: torch.dtype = torch.float32,
     maps: bool = False,
 ) -> tuple[Tensor | None, Tensor, Tensor]:
-    """Both stages for the last of some frames; arguments as in `saliency`.
-
-    Returns:
-        ``(norm over channels [T, H, W] or None without maps, norm over frames [T], outputs at the last step)``.
-
-    Raises:
-        ValueError: an option has an unknown value.
-        TypeError: ``model`` is no policy.
-    """
+    """Both stages for the last of some frames; arguments as in `saliency`."""
     for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
         if value not in get_args(kind):
             raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
@@ -132,10 +124,10 @@ def frame_gradients(
         raise ValueError(f"chunk must be at least 1, got {chunk}")
     policy, scalars = policy_of(model), outputs(model, target)
     with evaluation(policy), torch.enable_grad():
-        features, pulls = record_all(policy, frames, chunk, dtype)
-        cotangents, output = memory_stage(policy, scalars, features, last_action, is_init, state, reduce)
-        pixels, totals = encoder_stage(pulls, frames.shape, cotangents, norm, chunk, dtype, maps)
-    return None if pixels is None else pixels.detach(), totals.detach(), output
+        features = encode_frames(policy.encode, frames, chunk, dtype)
+        jacobian, output = memory_jacobian(policy, scalars, features, last_action, is_init, state, reduce)
+        pixels, totals = frame_norms(policy.encode, frames, jacobian, norm, chunk, dtype, maps)
+    return pixels, totals, output
 
 
 def _window(frames: Tensor, last_action: Tensor | None, is_init: Tensor | None, n: int) -> tuple[int, Tensor, Tensor]:

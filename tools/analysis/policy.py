@@ -22,8 +22,6 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from arcade_torch.models.pullback import Record, record_of
-
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Encode = Callable[[Tensor], Tensor]
 Remember = Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
@@ -38,15 +36,7 @@ def _no_state(batch_size: int) -> None:
 
 
 def read_plain(out: Tensor, what: str) -> Tensor:
-    """Read outputs that are one number per action, or a single value.
-
-    Args:
-        out: float [..., A].
-        what: ``q`` and ``logits`` are the outputs as they are, ``probs`` their softmax, ``value`` their maximum.
-
-    Returns:
-        float [..., A], for ``value`` [..., 1].
-    """
+    """Read outputs that are one number per action, or a single value."""
     if what == "probs":
         return out.softmax(-1)
     return out.amax(-1, keepdim=True) if what == "value" else out
@@ -64,7 +54,6 @@ class Policy:
         read: what its outputs mean: ``(out, one of TARGETS) -> [..., A or 1]``.
         offers: which of `TARGETS` its outputs can be read as.
         module: put into evaluation mode while an analysis runs.
-        record: ``encode`` with a way back for gradients, where there is a faster one than autograd's.
     """
 
     encode: Encode
@@ -73,7 +62,6 @@ class Policy:
     read: Callable[[Tensor, str], Tensor] = read_plain
     offers: tuple[str, ...] = TARGETS
     module: nn.Module | None = None
-    record: Record | None = None
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""
@@ -81,15 +69,7 @@ class Policy:
 
     @torch.no_grad()
     def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
-        """Greedy actions for a batch of observations, as an agent gives them.
-
-        Args:
-            obs: has ``pixels`` [N, H, W, C], ``last_action`` [N] and ``is_init`` [N, 1].
-            state: recurrent state of the batch.
-
-        Returns:
-            ``(action int64 [N], {}, new state)``.
-        """
+        """Greedy actions for a batch of observations, as an agent gives them."""
         steps = obs["pixels"].shape[0], 1
         features = self.encode(obs["pixels"]).unsqueeze(1)
         out, state = self.remember(features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state)
@@ -115,8 +95,7 @@ def policy_of(model: Any) -> Policy:
         module = network if isinstance(network, nn.Module) else None
         read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
         offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
-        record = record_of(network, "encode")
-        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module, record)
+        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module)
     raise TypeError(
         "model must be an agent, a network with encode and remember, a Policy or a pair (encode, remember), "
         f"got {type(model).__name__}"
@@ -124,11 +103,7 @@ def policy_of(model: Any) -> Policy:
 
 
 def resolve(model: Any, what: str) -> str:
-    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities.
-
-    Raises:
-        ValueError: there is no such output, or this model does not offer it.
-    """
+    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities."""
     if what not in get_args(Target):
         raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {what!r}")
     names = policy_of(model).offers

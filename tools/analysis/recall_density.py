@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from arcade_torch.tools.analysis.binning import mean_mass, mean_points
 from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, Target, frame_gradients
 from arcade_torch.tools.analysis.policy import resolve
-from arcade_torch.tools.analysis.subject import subject
+from arcade_torch.tools.analysis.resolve import resolve_agent
 from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Window, greedy_windows
 
 Array = NDArray[np.float64]
@@ -56,11 +56,7 @@ class RecallDensity:
         return np.array([share.size for share in self.shares], dtype=np.int64)
 
     def mass(self, bins: int) -> Array:
-        """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1.
-
-        Raises:
-            ValueError: no trajectory is left, or ``bins`` is below 1.
-        """
+        """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1."""
         return mean_mass(self._some(), bins)
 
     def points(self, taus: Array) -> Array:
@@ -118,7 +114,7 @@ def recall_density(
     Raises:
         ValueError: an option is out of range, or this agent does not offer ``target``.
     """
-    player, env = subject(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     done = (lambda count: progress(count, episodes)) if progress is not None else None
     return density_of_windows(

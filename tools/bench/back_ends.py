@@ -8,8 +8,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from arcade_torch.models.scan import linear_scan_loop
-from arcade_torch.models.scan_ops import BACK_ENDS
+from arcade_torch.models.scan import BACK_ENDS, linear_scan_loop
 
 RESETS = 0.02
 """Share of the steps that open an episode."""
@@ -22,19 +21,7 @@ queue the work, so that neither a warm cache nor the launch is measured."""
 
 @dataclass(frozen=True)
 class BackEndRow:
-    """One back end at one length.
-
-    Attributes:
-        back_end: key of ``scan_ops.BACK_ENDS``.
-        steps: T.
-        numbers: "real" or "complex".
-        forward_ms: milliseconds of the forward pass, median.
-        backward_ms: of the backward pass alone.
-        forward_share: time of a copy that moves the bytes of the forward pass, by the time of the forward pass; 1 is as
-            fast as memory.
-        backward_share: the same for the backward pass.
-        error: largest difference of h from a loop in float64.
-    """
+    """One back end at one length."""
 
     back_end: str
     steps: int
@@ -47,13 +34,7 @@ class BackEndRow:
 
 
 def device_ms(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Milliseconds that the device takes, median; on a card its own clock, with cold caches.
-
-    Args:
-        work: what to do once; done once before, untimed.
-        device: where it runs.
-        repeats: how often it is timed.
-    """
+    """Milliseconds that the device takes, median; on a card its own clock, with cold caches."""
     work()
     if device.type != "cuda":
         times = []
@@ -83,20 +64,7 @@ def bench_back_ends(
     repeats: int = 20,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Iterator[BackEndRow]:
-    """Measure the operators themselves, without autograd, float32 and complex64.
-
-    Args:
-        device: where.
-        steps: lengths T.
-        batch: B.
-        size: H.
-        names: keys of ``scan_ops.BACK_ENDS``.
-        repeats: how often each is timed.
-        tell: called with a line before each length.
-
-    Yields:
-        A row a back end, length and kind of number.
-    """
+    """Measure the operators themselves, without autograd, float32 and complex64."""
     for length in steps:
         for dtype in (torch.float32, torch.complex64):
             numbers = "complex" if dtype.is_complex else "real"

@@ -4,10 +4,9 @@ Every frame is consumed. Frames are results of the compiled call, so they must b
 reads every byte. The checksum has a clock of its own: rates are given without it and with it.
 """
 
-import os
-import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,9 +15,9 @@ import numpy as np
 import torch
 
 import arcade_torch
-from arcade_torch.envs_jax import make
+from arcade_torch.envs_jax import make, registered_ids
 from arcade_torch.envs_jax.batch import BatchedGame, env_keys
-from arcade_torch.tools.bench.timing import Measure, Measured, interleaved
+from arcade_torch.tools.bench.harness import Measure, Measured, interleaved
 
 WINDOW_BYTES = 2**27
 """Pixels in a collector's window, at most, unless 4 steps need more."""
@@ -31,6 +30,43 @@ NAMES = {
     "fill": "plain fill of the same bytes",
     "copy": "plain copy of the same bytes",
 }
+
+
+@dataclass
+class Options:
+    """Frames per second of games at several batch sizes, every frame consumed by a checksum.
+
+    Beside frames/s stand GB/s and the share of a plain fill and of a plain copy of the same bytes in the same run.
+
+    Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
+    """
+
+    games: tuple[str, ...] = ()
+    """Environment ids; every registered Easy game by default."""
+    sizes: tuple[int, ...] = (128,)
+    """Sides of the frames, 128 or 256."""
+    batches: tuple[int, ...] = (1, 16, 128, 512)
+    """Numbers of envs."""
+    seconds: float = 0.5
+    """For each measure in each repeat."""
+    repeats: int = 5
+    """Turns; medians are shown."""
+    out: Path | None = None
+    """File for the numbers, .csv or .json; overwritten."""
+
+
+SIZES: dict[str, dict[str, Any]] = {
+    "tiny": {"games": ("SignpostEasy",), "batches": (2,), "seconds": 0.01, "repeats": 1},
+    "quick": {"batches": (16, 128), "seconds": 0.2, "repeats": 3},
+    "full": {"sizes": (128, 256)},
+}
+
+
+def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table ``envs``."""
+    games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
+    for row in bench_envs(games, options.sizes, options.batches, options.seconds, options.repeats, tell):
+        yield "envs", asdict(row)
 
 
 @dataclass(frozen=True)
@@ -64,22 +100,6 @@ class Row:
     checksum: int
 
 
-def machine() -> dict[str, Any]:
-    """Device, cores and versions that a result was measured with."""
-    from arcade_torch.tools.versions import versions
-
-    device = jax.devices()[0]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "jax_device": f"{device.platform} ({device.device_kind})",
-        "torch_device": "cuda" if torch.cuda.is_available() else "cpu",
-        "processor": platform.processor() or platform.machine(),
-        "cores": cores,
-        "torch_threads": torch.get_num_threads(),
-        **versions(),
-    }
-
-
 def bench_envs(
     games: Sequence[str],
     sizes: Sequence[int] = (128,),
@@ -88,22 +108,7 @@ def bench_envs(
     repeats: int = 5,
     tell: Callable[[str], None] = lambda text: None,
 ) -> list[Row]:
-    """Measure games at batch and picture sizes.
-
-    Args:
-        games: environment ids.
-        sizes: sides of the frames, 128 or 256.
-        batches: numbers of envs.
-        seconds: for each measure in each repeat.
-        repeats: measures are taken in turns so many times; the median counts.
-        tell: called with a line before each configuration.
-
-    Returns:
-        Six rows a configuration, one for each of `NAMES`.
-
-    Raises:
-        ValueError: a game, size or number of envs is not allowed.
-    """
+    """Measure games at batch and picture sizes."""
     for count in batches:
         if count < 1:
             raise ValueError(f"a batch holds at least 1 env, got {count}")
@@ -145,11 +150,7 @@ def _row(game: str, size: int, count: int, name: str, result: Measured, rate: di
 
 
 def read_all(frames: Any) -> int:
-    """Read every byte of an array and return a sum over it, modulo 2**64.
-
-    Args:
-        frames: JAX array or torch tensor whose bytes are a multiple of 8; on a GPU the sum is made there.
-    """
+    """Read every byte of an array and return a sum over it, modulo 2**64."""
     tensor = frames if isinstance(frames, torch.Tensor) else torch.utils.dlpack.from_dlpack(frames)
     return int(tensor.detach().reshape(-1).view(torch.int64).sum()) % 2**64
 
@@ -212,11 +213,11 @@ def _bridge(game: str, size: int, count: int) -> dict[str, Measure]:
     def env_work() -> Any:
         kept["step"] += 1
         _, kept["td"] = env.step_and_maybe_reset(kept["td"].set("action", actions[kept["step"] % 64]))
-        return _finished(kept["td"].get("pixels"))
+        return kept["td"].get("pixels")
 
     return {
         "env": Measure(env_work, read_all, count),
-        "collector": Measure(lambda: _finished(collector.collect().get("pixels")), read_all, count * steps),
+        "collector": Measure(lambda: collector.collect().get("pixels"), read_all, count * steps),
     }
 
 
@@ -227,17 +228,6 @@ def _plain(size: int, count: int) -> dict[str, Measure]:
     source = torch.randint(256, target.shape, dtype=torch.uint8, device=device)
     value = iter(range(10**12))
     return {
-        "fill": Measure(lambda: _finished(target.fill_(next(value) % 256)), read_all, count),
-        "copy": Measure(lambda: _finished(target.copy_(source)), read_all, count),
+        "fill": Measure(lambda: target.fill_(next(value) % 256), read_all, count),
+        "copy": Measure(lambda: target.copy_(source), read_all, count),
     }
-
-
-def _finished(tensor: torch.Tensor) -> torch.Tensor:
-    if tensor.is_cuda:
-        torch.cuda.synchronize(tensor.device)
-    return tensor
-
-
-def as_dicts(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Rows as plain values, for CSV and JSON."""
-    return [asdict(row) for row in rows]

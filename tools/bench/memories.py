@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from arcade_torch.tools.bench.timing import Measure, interleaved, no_check, torch_threads
+from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, torch_threads
 
 __all__ = ["MemoryCost", "MemoryTime", "memory_cost", "time_memories"]
 
@@ -35,15 +35,7 @@ class MemoryTime:
 
 
 def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
-    """Count what a memory model needs.
-
-    Args:
-        memory: a memory model, see ``MemoryContract``.
-        input_size: D.
-
-    Returns:
-        the counts, exact.
-    """
+    """Count what a memory model needs."""
     import torch
     from torch.utils.flop_counter import FlopCounterMode
 
@@ -62,17 +54,7 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
 
 
 def time_memories(names: Sequence[str], size: int, *, seconds: float = 0.3, repeats: int = 5) -> dict[str, MemoryTime]:
-    """Time memory models in turns, on one thread, so that a slow minute of the machine hits all of them.
-
-    Args:
-        names: of the models.
-        size: D and H.
-        seconds: time for each measure in each repeat.
-        repeats: turns; the best counts.
-
-    Returns:
-        name -> times.
-    """
+    """Time memory models in turns, on one thread, so that a slow minute of the machine hits all of them."""
     measures = {}
     with torch_threads(1):
         for name in names:

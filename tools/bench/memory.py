@@ -1,17 +1,19 @@
-"""Memory models over whole sequences: time and memory of every scan beside its own loop and ``torch.nn.GRU``."""
+"""Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.profiler import ProfilerActivity, profile
 
-from arcade_torch.models import fast_weights, lru, make_memory, matrix_scan_loop, mingru
-from arcade_torch.tools.bench.scans import unbind_loop
-from arcade_torch.tools.bench.timing import Measure, interleaved, no_check, torch_threads
+from arcade_torch.models import fast_weights, lru, make_memory, matrix_scan_loop, memory_names, mingru
+from arcade_torch.tools.bench.back_ends import bench_back_ends
+from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, peak_bytes, torch_threads
+from arcade_torch.tools.bench.scans import bench_scans, unbind_loop
 
 TORCH_GRU = "torch.nn.GRU"
 RESETS = 0.02
@@ -28,9 +30,96 @@ def _matrix_loop(*args: Any) -> tuple[Tensor, Tensor]:
 LOOPS: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "lru": (lru, "linear_scan", unbind_loop),
     "mingru": (mingru, "linear_scan", unbind_loop),
-    **{name: (fast_weights, "matrix_scan", _matrix_loop) for name in ("fart", "gdn", "ttt")},
+    **{name: (fast_weights, "matrix_scan", _matrix_loop) for name in ("linear_transformer", "gdn", "ttt")},
 }
 """Models that scan, and the plain loop over time in place of their scan: module, name, loop."""
+
+
+@dataclass
+class Options:
+    """Time and memory of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; of saliency.
+
+    Measures take turns; the best turn counts. Peak memory is what torch's allocator had handed out, the same on every
+    machine. With a CUDA device, a further table has the back ends of the scan there, as shares of the speed of a copy.
+
+    Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
+    """
+
+    memories: tuple[str, ...] = ()
+    """Memory models; all of them by default."""
+    steps: tuple[int, ...] = (132, 1024)
+    """Lengths of the sequences."""
+    layers: tuple[int, ...] = (1, 2)
+    """Cells one above the other."""
+    size: int = 512
+    """Width of input and output."""
+    batch: int = 16
+    """Sequences."""
+    frames: int = 64
+    """Of the episode whose last decision saliency explains."""
+    threads: int = 1
+    """Of torch."""
+    seconds: float = 0.3
+    """For each measure in each repeat, at least one pass."""
+    repeats: int = 3
+    """Turns."""
+    out: Path | None = None
+    """File for the numbers: .json, or .csv with the name of the table added; overwritten."""
+
+
+SIZES: dict[str, dict[str, Any]] = {
+    "tiny": {
+        **{"memories": ("gru",), "steps": (8,), "layers": (1,), "size": 8, "batch": 2},
+        **{"frames": 4, "seconds": 0.01, "repeats": 1},
+    },
+    "quick": {"steps": (132,), "layers": (1,), "seconds": 0.2, "repeats": 2},
+    "full": {},
+}
+
+
+def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the tables ``models``, ``scans``, ``saliency`` and, with CUDA, ``back_ends``."""
+    if min((1, *options.steps, *options.layers, options.size, options.batch, options.threads, options.frames)) < 1:
+        raise ValueError("steps, layers, size, batch, frames and threads must be at least 1")
+    how: dict[str, Any] = {"threads": options.threads, "seconds": options.seconds, "repeats": options.repeats}
+    names = options.memories or tuple(memory_names())
+    for row in bench_memory(names, options.steps, options.layers, options.size, options.batch, tell=tell, **how):
+        yield "models", asdict(row)
+    for scan in bench_scans(options.steps, options.batch, options.size, tell=tell, **how):
+        yield "scans", asdict(scan)
+    tell("saliency")
+    with torch_threads(options.threads):
+        yield from (("saliency", row) for row in bench_saliency(options.frames, options.seconds, options.repeats))
+    if torch.cuda.is_available():
+        for back_end in bench_back_ends(torch.device("cuda"), options.steps, options.batch, options.size, tell=tell):
+            yield "back_ends", asdict(back_end)
+
+
+def bench_saliency(frames: int, seconds: float, repeats: int) -> list[dict[str, Any]]:
+    """Maps of one decision on the small network with LRU: two stages against the whole network action by action."""
+    from arcade_torch.agents import preset
+    from arcade_torch.agents.policy import build_network
+    from arcade_torch.tools.analysis.pixel_saliency import saliency
+
+    network: Any = build_network(preset("small", memory="lru")).eval()
+    seen = torch.randint(0, 256, (frames, 128, 128, 3), dtype=torch.uint8)
+    actions, starts = torch.randint(0, 5, (frames,)), torch.arange(frames) == 0
+
+    def whole() -> Tensor:
+        x = seen.float().requires_grad_()
+        q, _ = network.remember(network.encode(x)[None], actions[None], starts[None], network.initial_state(1))
+        rows = (torch.autograd.grad(value, x, retain_graph=True)[0].square().sum(-1) for value in q[0, -1])
+        return sum(rows, torch.zeros(seen.shape[:3]))
+
+    ways: dict[str, Callable[[], object]] = {
+        "two stages": partial(saliency, network, seen, actions, starts),
+        "whole network": whole,
+    }
+    found = interleaved({way: Measure(work, no_check, 1) for way, work in ways.items()}, seconds, repeats, warm_ups=1)
+    return [
+        {"way": way, "frames": frames, "both_ms": 1e3 / max(found[way].rates), "peak_mib": peak_bytes(work) / 2**20}
+        for way, work in ways.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -55,23 +144,6 @@ class Row:
     forward_ms: float
     both_ms: float
     peak_mib: float
-
-
-def peak_bytes(work: Callable[[], object]) -> int:
-    """Most bytes that torch's CPU allocator handed out at a time while ``work`` ran, above what stood before.
-
-    Read from the memory events of torch's profiler: exact and the same on every machine, whatever else runs. Scratch
-    space inside a matrix library is not in it.
-    """
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
-        work()
-    events = [event for event in run.profiler.kineto_results.events() if event.name() == "[memory]"]
-    events.sort(key=lambda event: event.start_ns())
-    held = most = 0
-    for event in events:
-        held += event.nbytes()
-        most = max(most, held)
-    return most
 
 
 class Stack(nn.Module):
@@ -134,22 +206,7 @@ def bench_memory(
     repeats: int = 3,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Row]:
-    """Measure models over whole sequences, in turns.
-
-    Args:
-        names: of the models.
-        steps: lengths T.
-        layers: numbers of cells.
-        size: D and H.
-        batch: B.
-        threads: of torch.
-        seconds: for each measure in each repeat, at least one pass.
-        repeats: turns; the best counts.
-        tell: called with a line before each configuration.
-
-    Yields:
-        A row a model, form, number of layers and length.
-    """
+    """Measure models over whole sequences, in turns."""
     with torch_threads(threads):
         for length in steps:
             x, is_init = torch.randn(batch, length, size), torch.rand(batch, length) < RESETS

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from arcade_torch.models import MemoryBlock, memory_names
-from arcade_torch.tools.files import read_csv, write_csv
+from arcade_torch.tools.bench.harness import torch_threads
+from arcade_torch.tools.files import read_csv, write_between, write_csv
 
 SYMBOLS, DISTRACTORS = 4, 4
 ASK = SYMBOLS + DISTRACTORS
@@ -58,6 +59,60 @@ class Setting:
     check_every: int = 25
     answers: int = 2000
     seed: int = 0
+
+
+@dataclass
+class Options:
+    """Delayed recall: see one of four symbols, wait among distractors, name it when asked.
+
+    Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget is spent; chance is
+    25 %. Where the windows of attention end is measured too. Keeps a CSV file that it goes on with after an
+    interruption, and can write the table into a Markdown page.
+
+    Example: arcade-torch bench recall lru attention --delays 8 32 --out recall.csv
+    """
+
+    memories: tuple[str, ...] = ()
+    """Memory models; all of them, and attention with several windows, by default."""
+    delays: tuple[int, ...] = (8, 32, 96)
+    """Steps between symbol and question."""
+    hidden_size: int = 64
+    """Width of the memory block."""
+    seconds: float = 60.0
+    """Budget of each training, processor time."""
+    seed: int = 0
+    """Of weights and data."""
+    out: Path | None = Path("recall.csv")
+    """Table; rows it holds are not measured again."""
+    page: Path | None = None
+    """Markdown page that gets the table between its marks."""
+
+
+SIZES: dict[str, dict[str, Any]] = {
+    "tiny": {"memories": ("gru",), "delays": (2,), "seconds": 0.5},
+    "quick": {"memories": ("lru", "mingru", "gru"), "delays": (8,), "seconds": 10.0},
+    "full": {},
+}
+KEEPS_ITS_FILE = True
+
+
+def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table ``recall``."""
+    if options.seconds <= 0 or options.hidden_size < 1 or not options.delays or min(options.delays) < 1:
+        raise ValueError(
+            "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
+            f"{options.seconds}, {options.hidden_size} and {options.delays}"
+        )
+    cases = [(entry, delay) for entry in entries(options.memories) for delay in options.delays]
+    cases += [] if options.memories else [case for case in CAPACITY if case[1] in options.delays]
+    setting = Setting(hidden_size=options.hidden_size, seconds=options.seconds, seed=options.seed)
+    rows = []
+    with torch_threads(1):
+        for row in measure_all(cases, setting, options.out, tell):
+            rows.append(row)
+            yield "recall", asdict(row)
+    if options.page is not None:
+        write_between(options.page, BEGIN, END, markdown(rows))
 
 
 @dataclass(frozen=True)
@@ -126,13 +181,7 @@ windows of W steps reach L (W - 1) steps back: 31, 33, 32 and 46."""
 
 @dataclass(frozen=True)
 class Windows:
-    """A batch of sequences.
-
-    Attributes:
-        tokens: int64 [B, T], 0 to 8.
-        is_init: bool [B, T], where an episode begins.
-        answers: int64 [B, T], the symbol where one is asked for, elsewhere -100.
-    """
+    """A batch of sequences."""
 
     tokens: Tensor
     is_init: Tensor
@@ -140,17 +189,7 @@ class Windows:
 
 
 def windows(rng: np.random.Generator, rows: int, delay: int, *, mixed: bool = False) -> Windows:
-    """Draw sequences of 2 (delay + 2) steps, episode after episode.
-
-    Args:
-        rng: where the randomness comes from.
-        rows: B.
-        delay: steps between symbol and question, at least 1.
-        mixed: the curriculum, half of the delays are 1 to ``delay``.
-
-    Raises:
-        ValueError: the delay is below 1.
-    """
+    """Draw sequences of 2 (delay + 2) steps, episode after episode."""
     if delay < 1:
         raise ValueError(f"a delay is at least 1 step, got {delay}")
     length = 2 * (delay + 2)
@@ -190,16 +229,7 @@ class Reader(nn.Module):
 
 
 def train(entry: Entry, delay: int, setting: Setting | None = None) -> Recall:
-    """Train one model until it is right or the budget is spent, then test it on fresh data.
-
-    Args:
-        entry: which model.
-        delay: steps between symbol and question.
-        setting: how.
-
-    Returns:
-        The row of the table.
-    """
+    """Train one model until it is right or the budget is spent, then test it on fresh data."""
     setting = setting or Setting()
     torch.manual_seed(setting.seed)
     data, tests = (np.random.default_rng([setting.seed, delay, part]) for part in range(2))
@@ -256,17 +286,7 @@ def measure_all(
     out: Path | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Iterator[Recall]:
-    """One case after another; rows that the file holds already are not measured again.
-
-    Args:
-        cases: models and delays.
-        setting: how all of them are trained.
-        out: CSV file, written anew after each row.
-        tell: called with a line before each case that is measured.
-
-    Yields:
-        The rows, those from the file as well.
-    """
+    """One case after another; rows that the file holds already are not measured again."""
     rows = read_recall(out) if out is not None and out.exists() else []
     known = {(row.model, row.delay, row.hidden_size, row.seed): row for row in rows}
     for entry, delay in cases:
@@ -280,11 +300,7 @@ def measure_all(
 
 
 def read_recall(path: Path) -> list[Recall]:
-    """The rows of a file that `measure_all` has written.
-
-    Raises:
-        ValueError: it is another table.
-    """
+    """The rows of a file that `measure_all` has written."""
     kinds = {item.name: item.type for item in fields(Recall)}
     try:
         return [Recall(**{name: kinds[name](row[name]) for name in kinds}) for row in read_csv(path)]  # type: ignore[operator]

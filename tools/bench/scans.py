@@ -1,21 +1,17 @@
 """The linear scan on a CPU: the operator of this package beside the other ways to write it, in one run.
 
 Every form solves h_t = a_t h_{t-1} + b_t from zeros, real or complex, with starts folded in as a_t = 0, so that all of
-them do the same. "own backward" means one more scan of the same form, run the other way on conj(a) shifted by one;
-"autograd" that torch differentiates the forward pass operation by operation.
+them do the same. The operator has a backward pass of its own; the others are differentiated by autograd.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from arcade_torch.models.scan import linear_scan, linear_scan_loop
-from arcade_torch.models.scan_ops import scan, scan_doubling
-from arcade_torch.tools.bench.timing import Measure, interleaved, no_check, torch_threads
+from arcade_torch.models.scan import linear_scan, scan_doubling
+from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, torch_threads
 
 Scan = Callable[[Tensor, Tensor], Tensor]
 CHOSEN = "serial operator (in use)"
@@ -35,21 +31,6 @@ def unbind_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | 
     return torch.stack(states, dim=1)
 
 
-def chunked(a: Tensor, b: Tensor) -> Tensor:
-    """About sqrt(T) chunks side by side, then what each hands on to the next."""
-    steps = b.shape[1]
-    size = math.ceil(math.sqrt(steps))
-    spare = -steps % size
-    a, b = (torch.nn.functional.pad(x, (0, 0, 0, spare)).unflatten(1, (-1, size)) for x in (a, b))
-    h, product = b.clone(), a.clone()
-    for t in range(1, size):
-        h[:, :, t].addcmul_(a[:, :, t], h[:, :, t - 1])
-        product[:, :, t] *= product[:, :, t - 1]
-    for n in range(1, h.shape[1]):
-        h[:, n].addcmul_(product[:, n], h[:, n - 1, -1:])
-    return h.flatten(1, 2)[:, :steps]
-
-
 def doubling(a: Tensor, b: Tensor) -> Tensor:
     """log2(T) passes over the whole tensor (Hillis and Steele 1986): the back end of CUDA without Triton."""
     h: Tensor = scan_doubling(a, b, None, torch.zeros_like(b[:, 0]))
@@ -67,56 +48,17 @@ def generic_associative_scan(a: Tensor, b: Tensor) -> Tensor:
     return h
 
 
-class _OwnBackward(torch.autograd.Function):
-    """A form whose derivative is the same form, backwards."""
-
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, form: Scan) -> Tensor:
-        h = form(a, b)
-        ctx.save_for_backward(a, h)
-        ctx.form = form
-        return h
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> tuple[Tensor | None, ...]:
-        a, h = ctx.saved_tensors
-        shifted = torch.cat([torch.zeros_like(a[:, :1]), a[:, 1:].conj().resolve_conj().flip(1)], dim=1)
-        grad_b = ctx.form(shifted, grads[0].flip(1)).flip(1)
-        grad_a = torch.cat([torch.zeros_like(a[:, :1]), grad_b[:, 1:] * h[:, :-1].conj()], dim=1)
-        return grad_a, grad_b, None
-
-
-def own_backward(form: Scan) -> Scan:
-    """The form with one scan as its derivative."""
-    return lambda a, b: _OwnBackward.apply(a, b, form)
-
-
 FORMS: dict[str, Scan] = {
-    CHOSEN: lambda a, b: scan(a, b, None, torch.zeros_like(b[:, 0])),
-    "loop over unbind, autograd": unbind_loop,
-    "loop, indexing, autograd": linear_scan_loop,
-    "sqrt(T) chunks, own backward": own_backward(chunked),
-    "doubling, own backward": own_backward(doubling),
-    "doubling, autograd": doubling,
+    CHOSEN: linear_scan,
+    "loop over unbind": unbind_loop,
+    "doubling": doubling,
     "torch's associative_scan, generic": generic_associative_scan,
 }
-QUADRATIC = "loop, indexing, autograd"
-"""Left out beyond `QUADRATIC_STEPS`: a minute a pass."""
-QUADRATIC_STEPS = 256
 
 
 @dataclass(frozen=True)
 class ScanRow:
-    """One form at one length.
-
-    Attributes:
-        form: key of `FORMS`.
-        steps: T.
-        numbers: "real" or "complex".
-        forward_ms: milliseconds of the forward pass alone, best turn.
-        both_ms: of forward and backward pass.
-        error: largest difference of h from a loop in float64.
-    """
+    """One form at one length."""
 
     form: str
     steps: int
@@ -136,20 +78,7 @@ def bench_scans(
     repeats: int = 3,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ScanRow]:
-    """Time every form in turns.
-
-    Args:
-        steps: lengths T.
-        batch: B.
-        size: H.
-        threads: of torch.
-        seconds: for each measure in each repeat.
-        repeats: turns; the best counts.
-        tell: called with a line before each length.
-
-    Yields:
-        A row a form, length and kind of number.
-    """
+    """Time every form in turns."""
     with torch_threads(threads):
         for length in steps:
             for dtype in (torch.float32, torch.complex64):
@@ -169,8 +98,6 @@ def _forms(
     weight = torch.randn_like(b)
     measures, errors = {}, {}
     for name, form in FORMS.items():
-        if name == QUADRATIC and length > QUADRATIC_STEPS:
-            continue
         errors[name] = float((form(a, b) - exact).abs().max())
         measures[f"{name}, forward"] = Measure(_forward(form, a, b), no_check, 1)
         measures[f"{name}, both"] = Measure(_both(form, a, b, weight), no_check, 1)

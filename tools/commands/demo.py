@@ -1,8 +1,11 @@
 """``arcade-torch demo``."""
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
+
+import tyro
+
+from arcade_torch.tools.extensions import command_line
 
 
 @dataclass
@@ -26,6 +29,7 @@ class Demo:
     """Folder of the study."""
     workers: int = 0
     """Runs at once; 0 for one a core."""
+    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Run the study and write its report."""
@@ -35,10 +39,9 @@ class Demo:
 
     def command(self) -> str:
         """The line that starts this demo."""
-        words = ["--game", self.game, "--frames", str(self.frames), "--seeds", str(self.seeds), "--out", str(self.out)]
-        return shlex.join(["arcade-torch", "demo", *words])
+        return command_line(["demo", *self.argv])
 
-    def how_to_go_on(self) -> str:
+    def resume_hint(self) -> str:
         """What to type after an interruption."""
         return f"finished runs are kept, the others go on from their checkpoints with: {self.command()}"
 

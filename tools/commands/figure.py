@@ -1,78 +1,86 @@
-"""``arcade-torch figure``."""
+"""``arcade-torch figure NAME`` and ``arcade-torch analyze NAME``: two words for one thing.
 
-from dataclasses import dataclass
+They differ in where the files go by default: ``figure`` writes into ``figures``, ``analyze`` into the analysis folder
+of the first run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import tyro
+
+from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures.registry import FIGURES, Options, module_of
+from arcade_torch.tools.options import parse as parse_options
 
 
 @dataclass
 class Figure:
-    """Draw one of the paper's figures from run folders, as PDF and PNG with its numbers beside it.
+    """A figure that was asked for."""
 
-    Figures: returns, gap-bias, curves, saliency, recall-density, contamination, size-sweep, throughput, human,
-    hyperparameters.
-
-    Example: arcade-torch figure returns --runs runs/study --out figures --style print
-    """
-
-    name: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
-    """Which figure."""
-    runs: tuple[Path, ...] = ()
-    """Folders with runs: studies, run folders, or folders that hold such; for throughput the file of `bench envs`."""
-    paper: bool = False
-    """Draw the paper's published numbers; returns, gap-bias, human and hyperparameters have them."""
-    out: Path = Path("figures")
-    """Folder for the files; older ones of the same name are replaced."""
-    style: Literal["light", "print"] = "light"
-    """For a screen, or for a page."""
-    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"
-    """Score of a run: final greedy evaluation, or the paper's best smoothed training return."""
-    baseline: str = "mlp"
-    """The memory-free agent."""
-    confidence: float = 0.95
-    """Of intervals."""
-    episodes: int = 100
-    """Trajectories of each checkpoint, for recall-density and contamination."""
-    bins: tuple[int, ...] = (3, 16)
-    """Numbers of bins, for recall-density."""
-    end: Literal["last", "random"] = "last"
-    """Decision of trajectories, for recall-density."""
+    name: str
+    options: Options
+    argv: tuple[str, ...] = ()
 
     def run(self) -> int:
-        """Draw and save."""
-        from arcade_torch.tools.count_bar import CountBar
-        from arcade_torch.tools.figures.registry import Request, make_figure
+        """Measure, draw, save, print."""
         from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.optional import need
+        from arcade_torch.tools.progress import Bars
+        from arcade_torch.tools.tables import print_csv
 
         keep_freed_memory()
         need("matplotlib")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"confidence must lie between 0 and 1, got {self.confidence}")
-        if self.episodes < 1 or not self.bins or min(self.bins) < 1:
-            raise ValueError(f"--episodes and --bins must be at least 1, got {self.episodes} and {list(self.bins)}")
-        with CountBar() as bar:
-            made = make_figure(
-                self.name,
-                Request(
-                    runs=self.runs,
-                    out=self.out,
-                    style=self.style,
-                    paper=self.paper or self.name == "human",
-                    metric=self.metric,
-                    baseline=self.baseline,
-                    confidence=self.confidence,
-                    episodes=self.episodes,
-                    bins=self.bins,
-                    end=self.end,
-                    progress=bar.update,
-                ),
-            )
-        for line in [*filter(None, [made.text]), *made.notes, *map(str, made.files)]:
+        confidence = getattr(self.options, "confidence", 0.95)
+        if not 0 < confidence < 1:
+            raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+        with Bars() as bars:
+            made = module_of(self.name).make(self.options, bars.update)
+        if self.options.csv:
+            print_csv(made.rows)
+            return 0
+        for table in made.tables:
+            table.show()
+        for line in [*made.notes, *map(str, made.files)]:
             print(line)
         return 0
 
 
 COMMAND = Figure
+
+
+def parse(words: Sequence[str], prog: str) -> Figure:
+    """Read the options of one figure; runs are named with or without ``--runs``.
+
+    Args:
+        words: the options.
+        prog: the command, ``arcade-torch figure NAME`` or ``arcade-torch analyze NAME``.
+
+    Raises:
+        ValueError: an option is unknown or malformed.
+    """
+    _, group, name = prog.split()
+    entry, module = FIGURES[name], module_of(name)
+    words = [part for word in words for part in _positional(word)]
+    registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
+    module.Options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
+    options: Any = parse_options(module.Options, words, prog)
+    if options.out is None and group == "analyze":
+        options = replace(options, out=_analysis_folder(options.runs))
+    return Figure(name, options)
+
+
+def _positional(word: str) -> list[str]:
+    """``--runs DIR`` means the same as ``DIR``."""
+    if word == "--runs":
+        return []
+    return [word.removeprefix("--runs=")]
+
+
+def _analysis_folder(runs: Sequence[Path]) -> Path | None:
+    """Where figures about a run folder, a checkpoint or a study go by default; None for other files."""
+    if not runs or not runs[0].is_dir():
+        return None
+    return (runs[0].parent.parent if (runs[0] / "meta.json").is_file() else runs[0]) / "analysis"

@@ -1,35 +1,95 @@
 """``arcade-torch list``."""
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from arcade_torch.tools.tables import show_table
+from arcade_torch.tools.tables import Table
 
 PAPER_SIZE = 512
 
 
 @dataclass
 class List:
-    """Show the registered environments, the memory models and what they cost, or both.
+    """Show the games, the memory models and what they cost, what players earn in the games, or a picture of the games.
+
+    list baselines lets the random player and both scripted players play; it keeps a CSV file that it goes on with after
+    an interruption. list sheet draws both twins of every game, or, with --steps, some moments of one episode.
 
     Example: arcade-torch list memories --measure
     """
 
-    what: tyro.conf.Positional[Literal["all", "envs", "memories"]] = "all"
-    """What to show."""
+    what: tyro.conf.Positional[Literal["all", "envs", "memories", "baselines", "sheet"]] = "all"
+    """What to show; all: envs and memories."""
+    games: tyro.conf.Positional[tuple[str, ...]] = ()
+    """For baselines and sheet: ids; all, or the ten games of one level, by default."""
     measure: bool = False
     """Also time the memory models on this machine, on one thread (about a minute)."""
+    episodes: int = 1000
+    """For baselines: of each player in each game, at most."""
+    seconds: float = 60.0
+    """For baselines: for each player in each game; what is begun is finished."""
+    page: Path | None = None
+    """For baselines: Markdown page that gets the table between its marks."""
+    level: Literal["Easy", "Medium", "Hard"] = "Easy"
+    """For sheet, when no games are named."""
+    steps: tuple[int, ...] = ()
+    """For sheet: after these steps of the scripted player in one game."""
+    out: Path | None = None
+    """File for baselines (baselines.csv by default) or sheet (games.png)."""
 
     def run(self) -> int:
         """Print the tables."""
+        if self.what == "baselines":
+            self._baselines()
+        if self.what == "sheet":
+            self._sheet()
         if self.what in ("all", "envs"):
             _environments()
         if self.what in ("all", "memories"):
             _memories(self.measure)
         return 0
+
+    def _baselines(self) -> None:
+        from arcade_torch.envs_jax import registered_ids, resolve_id
+        from arcade_torch.tools import players
+        from arcade_torch.tools.files import write_between
+        from arcade_torch.tools.progress import Bars
+
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        ids = [resolve_id(name) for name in self.games] or registered_ids()
+        rows, total = [], len(ids) * len(players.PLAYERS)
+        with Bars() as bars:
+            for row in players.measure_all(ids, self.episodes, self.seconds, self._table()):
+                rows.append(row)
+                bars.update("players", len(rows), total, f"{row.id} {row.player} {row.mean:.3f}")
+        table = players.markdown(rows)
+        print(table)
+        if self.page is not None:
+            print(f"\nwritten into {write_between(self.page, players.BEGIN, players.END, table)}")
+
+    def _table(self) -> Path:
+        return self.out or Path("baselines.csv")
+
+    def _sheet(self) -> None:
+        from arcade_torch.envs_jax import registered_ids, resolve_id
+        from arcade_torch.tools.contact_sheet import sheet, strip, write_png
+
+        ids = [resolve_id(name) for name in self.games]
+        if self.steps and len(ids) != 1:
+            raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
+        ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
+        picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
+        print(write_png(picture, self.out or Path("games.png")).resolve())
+
+    def resume_hint(self) -> str:
+        """What to type after an interruption."""
+        return f"finished rows are in {self._table()}; the same command goes on with the others"
 
 
 COMMAND = List
@@ -40,23 +100,23 @@ def _environments() -> None:
 
     games = [make(env_id) for env_id in registered_ids()]
     rows = [(game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games]
-    show_table("environments", ("id", "time limit", "return"), rows)
+    Table("environments", ("id", "time limit", "return"), rows).show()
     print("each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, 3]; 5 actions")
 
 
 def _memories(measure: bool) -> None:
     from arcade_torch.models import make_memory, memory_names
-    from arcade_torch.models.networks import PRESETS
+    from arcade_torch.models.presets import PRESETS
 
-    small = PRESETS["small"].hidden_size
     rows = []
     for name in memory_names():
         kind = type(make_memory(name, 1, 1))
         says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
         rows.append((name, says.strip().partition("\n")[0]))
-    show_table("memory models", ("name", "what it is"), rows, left=2)
-    _costs("one cell of the paper's network", PAPER_SIZE, measure)
-    _costs("the cell of the small network", small, measure)
+    Table("memory models", ("name", "what it is"), rows, left=2).show()
+    names: Sequence[str] = memory_names()
+    _costs("one cell of the paper's network", PAPER_SIZE, measure, names)
+    _costs("the cell of the small network", PRESETS["small"].hidden_size, measure, names)
     print("multiply-adds: in matrix products, one step of one env, acting")
     if measure:
         print(
@@ -64,12 +124,11 @@ def _memories(measure: bool) -> None:
         )
 
 
-def _costs(title: str, size: int, measure: bool) -> None:
+def _costs(title: str, size: int, measure: bool, names: Sequence[str]) -> None:
     """One line a memory model at one width."""
-    from arcade_torch.models import make_memory, memory_names
+    from arcade_torch.models import make_memory
     from arcade_torch.tools.bench.memories import memory_cost, time_memories
 
-    names = memory_names()
     columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
     rows = []
     for name in names:
@@ -83,4 +142,4 @@ def _costs(title: str, size: int, measure: bool) -> None:
             time = times[name]
             ratio = time.learning / times["lru"].learning
             row += [f"{time.acting:.1f}", f"{time.learning:.1f}", f"{ratio:.2f}"]
-    show_table(f"{title}, {size} wide", columns, rows)
+    Table(f"{title}, {size} wide", columns, rows).show()

@@ -31,10 +31,10 @@ class Report:
 
     def run(self) -> int:
         """Write the page."""
-        from arcade_torch.tools.count_bar import CountBar
+        from arcade_torch.tools.progress import Bars
         from arcade_torch.tools.reports.build import report
 
-        with CountBar() as bar:
+        with Bars() as bars:
             page = report(
                 self.study,
                 self.out,
@@ -43,7 +43,7 @@ class Report:
                 recall=self.recall,
                 contamination=self.contamination,
                 references=self.references,
-                progress=bar.update,
+                progress=bars.update,
             )
         print(f"report: {page}")
         return 0

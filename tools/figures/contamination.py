@@ -1,21 +1,26 @@
 """State contamination: flip rate and relative change by delay, with intervals over seeds; and single examples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
-from arcade_torch.tools.analysis.checkpoints import Label, check_distinct, contamination_of_run, load_labelled
+from arcade_torch.tools.analysis.checkpoints import (
+    Label,
+    checkpoints_of,
+    contamination_of_run,
+    load_labelled,
+    with_names,
+)
 from arcade_torch.tools.analysis.contamination import Contamination
 from arcade_torch.tools.analysis.contamination_examples import ACTIONS, Examples, noise_examples, shuffle_example
-from arcade_torch.tools.analysis.episode_saliency import episode_window
-from arcade_torch.tools.analysis.subject import Twin
+from arcade_torch.tools.analysis.resolve import episode_window
 from arcade_torch.tools.analysis.windows import Window
-from arcade_torch.tools.figures.registry import Made, Request
-from arcade_torch.tools.figures.runs import find_runs
+from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures.registry import Made, Progress, tell
 from arcade_torch.tools.figures.style import (
     CLEAN_BEST,
     DISTURBED_BEST,
@@ -23,7 +28,7 @@ from arcade_torch.tools.figures.style import (
     NEUTRAL,
     OTHER_BAR,
     TWIN_NAMES,
-    agent_colour,
+    agent_colours,
     drawing,
     footnote,
     inches,
@@ -31,6 +36,7 @@ from arcade_torch.tools.figures.style import (
     seeds_note,
     whiskers,
 )
+from arcade_torch.tools.tables import Table
 
 MEASURES = {
     "flip": "share of changed decisions",
@@ -38,10 +44,7 @@ MEASURES = {
     "kl": "KL(pi || pi') in nats",
 }
 LEAST_SCALE = 0.1
-"""Axes reach at least so far, so that nothing looks like much."""
-STARTS_AN_EPISODE = 2
-"""The figure takes twice as many start points as it is asked for episodes."""
-
+"""Axes reach at least so far, so that small effects look small."""
 Found = Sequence[tuple[Label, Contamination]]
 
 
@@ -53,61 +56,96 @@ class Pooled:
     seeds: int
 
 
-def make(request: Request) -> Made:
-    """Figures ``contamination-GAME-TWIN`` and, of each task's first agent with memory, an example."""
-    found = find_runs(request.runs)
-    options = {"starts": STARTS_AN_EPISODE * request.episodes}
-    measured = measure([run.folder.path for run in found.runs], request, options)
-    made = draw(measured, request)
-    return Made(made.files, found.notes + found.single_seeds() + made.notes)
+@dataclass
+class Options(registry.Options):
+    """Options of the figure."""
+
+    sigmas: tuple[float, ...] = (0.1, 0.3, 1.0)
+    """Standard deviations of the noise; 1 is the range of a pixel."""
+    delays: tuple[int, ...] = (0, 1, 2, 5, 10, 20, 50, 100)
+    """Steps from the noisy frame to the decision; 0 is the ceiling."""
+    starts: int = 200
+    """Start points of each checkpoint, at most four an episode."""
+    horizon: int = 10
+    """Step of the decision in the example."""
+    shuffle: bool = False
+    """Permute frames 2 to 10 in place of adding noise."""
+    clip: bool = False
+    """Keep noisy pixels in their range."""
+    feedback: bool = False
+    """Let the replay choose the previous actions itself, as the published code does."""
+    observability: Literal["full", "partial"] | None = None
+    """Another twin than the agents were trained on."""
+    target: Literal["auto", "q", "logits", "probs"] = "auto"
+    """What is compared; Q-values, or a policy's probabilities, by default."""
+    seed: int = 0
+    """Of episodes, start points and noise."""
+    confidence: float = 0.95
+    """Of the bars."""
+
+
+def make(options: Options, progress: Progress | None) -> Made:
+    """Figures ``contamination-KIND-GAME-TWIN`` and, of each task's first agent, an example."""
+    options.checkpoints()
+    options.check_folder()
+    if options.horizon < 2:
+        raise ValueError(f"--horizon must be at least 2, got {options.horizon}")
+    paths, notes = checkpoints_of(options.runs)
+    measured = measure(paths, options, progress)
+    made = Made([], notes)
+    pooled = pool(measured, options.confidence)
+    kind = measured[0][1].kind
+    with drawing(options.style) as plt:
+        for game, twin in dict.fromkeys((label.game, label.observability) for label, _ in measured):
+            here = {task[0]: value for task, value in pooled.items() if task[1:] == (game, twin)}
+            label, first = next(item for item in measured if item[0].task[1:] == (game, twin))
+            figure = lines(plt, here, first, f"{game}, {TWIN_NAMES[twin]}", options)
+            rows = _rows(here, first, game, twin)
+            made.files += save(options, f"contamination-{kind}-{game}-{twin}", figure, rows)
+            made.rows = [*made.rows, *rows]
+            examples, why = example_of(label, kind, options.horizon)
+            if examples is None:
+                made.notes.append(why)
+                continue
+            title = f"{label.agent}, {game}, {TWIN_NAMES[twin]}"
+            arrays = {"frames": examples.frames, "values": examples.values, "labels": np.array(examples.labels)}
+            picture = example_figure(plt, title, examples, options.style)
+            made.files += save(options, f"contamination-{kind}-example-{game}-{twin}", picture, (), arrays)
+    made.tables = [_table(label, item, options.shuffle) for label, item in measured]
+    return made
 
 
 def measure(
-    paths: Sequence[Path],
-    request: Request,
-    options: Mapping[str, Any],
-    shuffle: bool = False,
-    observability: Twin | None = None,
+    paths: Sequence[Path], options: Options, progress: Progress | None = None
 ) -> list[tuple[Label, Contamination]]:
     """Contamination of checkpoints.
 
     Args:
         paths: run folders or checkpoints.
-        request: its ``progress`` counts.
-        options: of `contamination` or `shuffled_beginning`.
-        shuffle: permute early frames in place of adding noise.
-        observability: another twin than the one trained on.
+        options: of the measure.
+        progress: called with (run, start points done, of how many).
     """
-    found = []
-    for path in paths:
-        found.append(contamination_of_run(path, options, shuffle, observability, request.tell(path.name)))
-    check_distinct([label for label, _ in found])
-    return found
+    how: dict[str, Any] = {"delays": options.delays, "starts": options.starts, "feedback": options.feedback}
+    how |= {"target": options.target, "seed": options.seed}
+    how |= {} if options.shuffle else {"sigmas": options.sigmas, "clip": options.clip}
+    twin = options.observability
+    return with_names(
+        [contamination_of_run(path, how, options.shuffle, twin, tell(progress, path.name)) for path in paths]
+    )
 
 
-def draw(measured: Found, request: Request, horizon: int = 10) -> Made:
-    """Draw and save what `measure` found: one figure a task, one example of its first agent at step ``horizon``."""
-    files: list[Path] = []
-    notes: list[str] = []
-    pooled = pool(measured, request.confidence)
-    kind = measured[0][1].kind
-    with drawing(request.style) as plt:
-        for game, twin in dict.fromkeys((label.game, label.observability) for label, _ in measured):
-            here = {task[0]: value for task, value in pooled.items() if task[1:] == (game, twin)}
-            first = next(item for label, item in measured if (label.game, label.observability) == (game, twin))
-            figure = lines(plt, here, first, f"{game}, {TWIN_NAMES[twin]}", request)
-            base = request.out / f"contamination-{kind}-{game}-{twin}"
-            files += save(figure, base, _rows(here, first, game, twin))
-            chosen = next(label for label, _ in measured if (label.game, label.observability) == (game, twin))
-            examples, why = example_of(chosen, kind, horizon)
-            if examples is None:
-                notes.append(why)
-                continue
-            title = f"{chosen.agent}, {game}, {TWIN_NAMES[twin]}"
-            arrays = {"frames": examples.frames, "values": examples.values, "labels": np.array(examples.labels)}
-            picture = example_figure(plt, [(title, examples)], request.style)
-            files += save(picture, request.out / f"contamination-{kind}-example-{game}-{twin}", (), arrays)
-    return Made(files, notes)
+def _table(label: Label, found: Contamination, shuffle: bool) -> Table:
+    rows = [
+        ["shuffled" if shuffle else f"{sigma:g}", *(f"{100 * x:.1f}" for x in line)]
+        for sigma, line in zip(found.sigmas, found.mean("flip"), strict=True)
+    ]
+    return Table(
+        f"{label}: changed decisions in %",
+        ("sigma", *(f"+{delay}" for delay in found.delays)),
+        rows,
+        f"{len(found.points)} start points ({', '.join(map(str, found.counts()[0]))} by delay); "
+        f"a frame replaced by itself moves outputs by {found.clean_error:.1e}",
+    )
 
 
 def pool(measured: Found, confidence: float) -> dict[tuple[str, str, str], Pooled]:
@@ -122,33 +160,20 @@ def pool(measured: Found, confidence: float) -> dict[tuple[str, str, str], Poole
     return pooled
 
 
-def lines(plt: Any, agents: Mapping[str, Pooled], first: Contamination, title: str, request: Request) -> Any:
+def lines(plt: Any, agents: Mapping[str, Pooled], first: Contamination, title: str, options: Options) -> Any:
     """One row a measure, one column a strength of the noise; the dashed line is an agent without memory."""
     shown = [name for name in MEASURES if any(np.isfinite(value.values[name][0]).any() for value in agents.values())]
     columns = len(first.sigmas)
-    size = inches(request.style, max(6.5, 3.6 * columns), 1.3 + 2.5 * len(shown))
+    size = inches(options.style, max(6.5, 3.6 * columns), 1.3 + 2.5 * len(shown))
     figure, axes = plt.subplots(
         len(shown), columns, figsize=size, squeeze=False, sharex=True, sharey="row", layout="constrained"
     )
-    reached = [np.isfinite(mean).any(0) for value in agents.values() for mean, _, _ in value.values.values()]
-    count = int(np.flatnonzero(np.any(reached, axis=0))[-1]) + 1  # episodes may be shorter than the longest delay
-    places = np.arange(count)
+    count = reached(agents.values())
     for row, name in enumerate(shown):
         for column, sigma in enumerate(first.sigmas):
-            axis = axes[row, column]
-            for place, (agent, value) in enumerate(agents.items()):
-                mean, low, high = (part[column, :count] for part in value.values[name])
-                colour = agent_colour(agent, place)
-                x = places + 0.1 * (place - (len(agents) - 1) / 2)
-                axis.plot(x, mean, color=colour, marker=MARKERS[place % len(MARKERS)], label=agent)
-                known = np.isfinite(low)
-                if known.any():
-                    errors = whiskers(low[known], mean[known], high[known])
-                    axis.errorbar(x[known], mean[known], errors, fmt="none", ecolor=colour, capsize=2, lw=1)
-            axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
-            axis.set_xticks(places, [str(delay) for delay in first.delays[:count]])
+            plot(agents, axes[row, column], name, column, first.delays[:count].tolist())
             if row == 0 and np.isfinite(sigma):
-                axis.set_title(f"noise sigma = {sigma:g}")
+                axes[row, column].set_title(f"noise sigma = {sigma:g}")
         axes[row, 0].set_ylabel(MEASURES[name])
         top = max(axes[row, 0].get_ylim()[1], LEAST_SCALE)
         axes[row, 0].set_ylim(-0.05 * top, top)
@@ -162,23 +187,44 @@ def lines(plt: Any, agents: Mapping[str, Pooled], first: Contamination, title: s
     ceiling = "0 steps: the decision's own frame" if first.kind == "noise" else "0 steps: the last shuffled frame"
     footnote(
         figure,
-        f"{seeds_note([value.seeds for value in agents.values()], request.confidence)}; "
+        f"{seeds_note([value.seeds for value in agents.values()], options.confidence)}; "
         f"{len(first.points)} start points each, {how};\n{ceiling}; dashed: without memory nothing changes after it",
     )
     return figure
 
 
+def reached(agents: Iterable[Pooled]) -> int:
+    """How many of the delays were reached: episodes may be shorter than the longest one."""
+    known = [np.isfinite(mean).any(0) for value in agents for mean, _, _ in value.values.values()]
+    return int(np.flatnonzero(np.any(known, axis=0))[-1]) + 1
+
+
+def plot(
+    agents: Mapping[str, Pooled],
+    axis: Any,
+    name: str,
+    column: int,
+    delays: Sequence[int],
+    colours: Mapping[str, str] | None = None,
+) -> None:
+    """Draw one measure by delay, a line an agent; the dashed line is an agent without memory."""
+    colours = colours or agent_colours(list(agents))
+    places = np.arange(len(delays))
+    for place, (agent, value) in enumerate(agents.items()):
+        mean, low, high = (part[column, : len(delays)] for part in value.values[name])
+        colour = colours[agent]
+        x = places + 0.1 * (place - (len(agents) - 1) / 2)
+        axis.plot(x, mean, color=colour, marker=MARKERS[place % len(MARKERS)], label=agent)
+        known = np.isfinite(low)
+        if known.any():
+            errors = whiskers(low[known], mean[known], high[known])
+            axis.errorbar(x[known], mean[known], errors, fmt="none", ecolor=colour, capsize=2, lw=1)
+    axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
+    axis.set_xticks(places, [str(delay) for delay in delays])
+
+
 def example_of(label: Label, kind: str, horizon: int) -> tuple[Examples | None, str]:
-    """A single example of one checkpoint: noise on three frames before the decision, or shuffled frames 2 to 10.
-
-    Args:
-        label: which checkpoint.
-        kind: ``noise`` or ``shuffle``.
-        horizon: index of the decision; earlier where the episode ends earlier, at least 13 for ``shuffle``.
-
-    Returns:
-        The example, or why there is none.
-    """
+    """A single example of one checkpoint: noise on three frames before the decision, or shuffled frames 2 to 10."""
     twin: Any = label.observability
     agent, _ = load_labelled(label.path, twin)
     last = horizon if kind == "noise" else max(horizon, 13)
@@ -198,38 +244,26 @@ def _n(window: Window) -> int:
     return window.n
 
 
-def example_figure(plt: Any, groups: Sequence[tuple[str, Examples]], style: str) -> Any:
-    """Rows: undisturbed and disturbed versions; columns: some of their frames and the bars of the last decision.
-
-    Args:
-        plt: from `drawing`.
-        groups: (title, examples), side by side.
-        style: light or print.
-    """
-    rows = max(len(item.labels) for _, item in groups)
-    pictures = sum(item.frames.shape[1] + 1.6 for _, item in groups)
-    figure = plt.figure(figsize=inches(style, 1.75 * pictures, 1.9 * rows + 0.6), layout="constrained")
-    widths = [item.frames.shape[1] + 1.6 for _, item in groups]
-    parts = figure.subfigures(1, len(groups), squeeze=False, width_ratios=widths)[0]
-    for part, (title, item) in zip(parts, groups, strict=True):
-        part.suptitle(title, x=0.02, ha="left")
-        count = item.frames.shape[1]
-        axes = part.subplots(len(item.labels), count + 1, squeeze=False, width_ratios=[1.0] * count + [1.6])
-        best = int(item.values[0].argmax())
-        for row, label in enumerate(item.labels):
-            for column in range(count):
-                axis = axes[row, column]
-                axis.imshow(item.frames[row, column], interpolation="nearest")
-                axis.set_title(f"${item.names[row][column]}$", fontsize="small")
-                axis.set_axis_off()
-            axes[row, 0].set_axis_on()
-            axes[row, 0].set(xticks=[], yticks=[])
-            axes[row, 0].spines[:].set_visible(False)
-            axes[row, 0].set_ylabel(label, fontsize="small")
-            _bars(axes[row, -1], item.values[row], CLEAN_BEST if row == 0 else DISTURBED_BEST, best)
-            axes[row, -1].set_ylim(*_limits(item.values))
-        name = "probability" if item.target == "probs" else "relative value A"
-        axes[0, -1].set_title(f"{name} at $o_{{{item.n}}}$", fontsize="small")
+def example_figure(plt: Any, title: str, item: Examples, style: str) -> Any:
+    """Rows: undisturbed and disturbed versions; columns: some of their frames and the bars of the last decision."""
+    rows, count = len(item.labels), item.frames.shape[1]
+    size = inches(style, 1.75 * (count + 1.6), 1.9 * rows + 0.6)
+    figure, axes = plt.subplots(
+        rows, count + 1, figsize=size, squeeze=False, width_ratios=[1.0] * count + [1.6], layout="constrained"
+    )
+    figure.suptitle(title, x=0.02, ha="left")
+    best = int(item.values[0].argmax())
+    for row, label in enumerate(item.labels):
+        for column in range(count):
+            axis = axes[row, column]
+            axis.imshow(item.frames[row, column], interpolation="nearest")
+            axis.set_title(f"${item.names[row][column]}$", fontsize="small")
+            axis.set(xticks=[], yticks=[], frame_on=False)
+        axes[row, 0].set_ylabel(label, fontsize="small")
+        _bars(axes[row, -1], item.values[row], CLEAN_BEST if row == 0 else DISTURBED_BEST, best)
+        axes[row, -1].set_ylim(*_limits(item.values))
+    name = "probability" if item.target == "probs" else "relative value A"
+    axes[0, -1].set_title(f"{name} at $o_{{{item.n}}}$", fontsize="small")
     footnote(figure, "coloured bar: best action (blue: undisturbed, red: disturbed); dot: best action undisturbed")
     return figure
 

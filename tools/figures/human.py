@@ -1,23 +1,34 @@
 """Returns of people on every task, beside those of the memory-free agent; from the paper's table only."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from arcade_torch.tools.analysis.normalise import DIFFICULTIES
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS
-from arcade_torch.tools.figures.registry import Made, Request
+from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures.registry import Made, Progress
 from arcade_torch.tools.figures.style import TWIN_COLOURS, agent_colour, drawing, footnote, inches, save
 from arcade_torch.tools.files import read_csv
 
 
-def make(request: Request) -> Made:
+@dataclass
+class Options(registry.Options):
+    """Options of the figure."""
+
+    paper: bool = False
+    """The paper's table; there is no other."""
+
+
+def make(options: Options, progress: Progress | None) -> Made:
     """The figure ``human``; runs are not looked at."""
     rows = read_csv(PAPER_RETURNS)
     people = [row for row in rows if row["model"] == "human"]
     machine = {(row["env"], row["difficulty"]): row for row in rows if row["model"] == "MLP"}
     games = list(dict.fromkeys(row["env"] for row in people))
-    notes = ["people cannot be measured again: --runs is not looked at"] if request.runs else []
-    with drawing(request.style) as plt:
-        size = inches(request.style, 12.5, 5.6)
+    notes = ["people cannot be measured again: --runs is not looked at"] if options.runs else []
+    with drawing(options.style) as plt:
+        size = inches(options.style, 12.5, 5.6)
         figure, axes = plt.subplots(2, 5, figsize=size, sharey=True, layout="constrained")
         for axis, game in zip(axes.flat, games, strict=True):
             here = [row for row in people if row["env"] == game]
@@ -50,4 +61,4 @@ def make(request: Request) -> Made:
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
         footnote(figure, f"published; n = {SEEDS} people, bars: one standard deviation over people")
-        return Made(save(figure, request.out / "human", people), notes)
+        return Made(save(options, "human", figure, people), notes, rows=people)

@@ -1,13 +1,15 @@
 """Settings as a table, generated from the configs themselves so that it cannot go stale."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, get_args, get_type_hints
 
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.tools.figures.registry import Made, Request
-from arcade_torch.tools.figures.runs import find_runs
+from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures.registry import Made, Progress
 from arcade_torch.tools.figures.style import drawing, inches, save
-from arcade_torch.tools.files import write_csv, write_text
+from arcade_torch.tools.files import write_text
+from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.grid import flatten
 
 CELL = ("env", "observability", "memory", "seed")
@@ -16,17 +18,25 @@ CELL = ("env", "observability", "memory", "seed")
 NOT_SETTINGS = ("device", "threads", "checkpoint_every")
 
 
-def make(request: Request) -> Made:
+@dataclass
+class Options(registry.Options):
+    """Options of the figure."""
+
+    paper: bool = False
+    """The settings of the preset ``paper`` in the place of runs."""
+
+
+def make(options: Options, progress: Progress | None) -> Made:
     """``hyperparameters``: CSV and Markdown, and the table as a picture; one column an algorithm."""
     notes: list[str] = []
-    if request.paper:
+    if options.paper:
         from arcade_torch.agents import preset
 
         algorithms = get_args(get_type_hints(TrainConfig)["algorithm"])
         columns = {name: _settings(preset("paper", algorithm=name).to_dict()) for name in algorithms}
         notes.append(f"total_frames is that of {TrainConfig().env}; the paper's budget depends on the game")
     else:
-        found = find_runs(request.runs)
+        found = find_runs(options.runs)
         notes, columns = found.notes, {}
         for run in found.runs:
             columns.setdefault(str(run.config.get("algorithm", "pqn")), {})
@@ -36,15 +46,10 @@ def make(request: Request) -> Made:
     names = list(dict.fromkeys(name for settings in columns.values() for name in settings))
     rows = [{"setting": name} | {key: settings.get(name, "") for key, settings in columns.items()} for name in names]
     head = ["setting", *columns]
-    base = request.out / "hyperparameters"
     table = [[str(row[name]) for name in head] for row in rows]
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(f"| {' | '.join(line)} |" for line in table)]
-    files = [
-        write_csv(base.with_suffix(".csv"), rows, head),
-        write_text(base.with_suffix(".md"), "\n".join(lines) + "\n"),
-    ]
-    with drawing(request.style) as plt:
-        size = inches(request.style, 2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2))
+    with drawing(options.style) as plt:
+        size = inches(options.style, 2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2))
         figure, axis = plt.subplots(figsize=size, layout="constrained")
         axis.set_axis_off()
         drawn = axis.table(table, colLabels=head, bbox=(0, 0, 1, 1), cellLoc="left", edges="horizontal")
@@ -53,8 +58,10 @@ def make(request: Request) -> Made:
             cell.set_edgecolor("#d0d0d0")
             if line == 0:
                 cell.set_text_props(weight="bold")
-        files += save(figure, base)
-    return Made(files, notes)
+        files = save(options, "hyperparameters", figure, rows)
+        base, _ = options.path("hyperparameters")
+        files.append(write_text(base.with_suffix(".md"), "\n".join(lines) + "\n"))
+    return Made(files, notes, rows=rows)
 
 
 def _settings(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,17 +3,16 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from arcade_torch.tools.analysis.binning import no_memory, uniform_memory
 from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
-from arcade_torch.tools.analysis.checkpoints import Label, check_distinct, density_of_run
+from arcade_torch.tools.analysis.checkpoints import Label, checkpoints_of, density_of_run, with_names
 from arcade_torch.tools.analysis.recall_density import RecallDensity
-from arcade_torch.tools.analysis.subject import Twin
-from arcade_torch.tools.figures.registry import Made, Request
-from arcade_torch.tools.figures.runs import find_runs, listed
+from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures.registry import Made, Progress, tell
 from arcade_torch.tools.figures.style import (
     MDP_THIRDS,
     NEUTRAL,
@@ -26,6 +25,8 @@ from arcade_torch.tools.figures.style import (
     save,
     seeds_note,
 )
+from arcade_torch.tools.runs import is_baseline, listed
+from arcade_torch.tools.tables import Table
 
 BARS_UP_TO = 6
 """Up to so many bins are drawn as stacked bars, more as curves."""
@@ -38,14 +39,7 @@ Densities = Sequence[tuple[Label, RecallDensity]]
 
 @dataclass(frozen=True)
 class Pooled:
-    """Mass in bins over the seeds of one agent on one task.
-
-    Attributes:
-        seeds: float64 [n, B].
-        mean: float64 [B].
-        low: float64 [B], NaN with a single seed.
-        high: float64 [B].
-    """
+    """Mass in bins over the seeds of one agent on one task."""
 
     seeds: Array
     mean: Array
@@ -53,61 +47,103 @@ class Pooled:
     high: Array
 
 
-def make(request: Request) -> Made:
-    """Figures ``recall-density-B`` for every number of bins."""
-    found = find_runs(request.runs)
-    densities, notes = measure([run.folder.path for run in found.runs], request, None)
-    made = draw(densities, request)
-    return Made(made.files, found.notes + found.single_seeds() + notes + made.notes)
+@dataclass
+class Options(registry.Options):
+    """Options of the figure."""
+
+    bins: tuple[int, ...] = (3, 16)
+    """Numbers of bins, a figure each; up to 6 as stacked bars."""
+    episodes: int = 100
+    """Greedy trajectories of each checkpoint."""
+    end: Literal["last", "random"] = "last"
+    """The decision: the one that ended the episode, or a random one."""
+    observability: Literal["full", "partial"] | None = None
+    """Another twin than the agents were trained on."""
+    max_frames: int = 512
+    """Longest trajectory; a longer episode gives a window with a random end."""
+    norm: Literal["l1", "l2sq", "l2"] = "l1"
+    """Norm of a gradient over a frame."""
+    reduce: Literal["per_action", "sum"] = "per_action"
+    """Sum of the actions' norms (the paper), or norm of the sum over actions."""
+    target: Literal["auto", "q", "logits", "probs", "value"] = "auto"
+    """What is differentiated; Q-values, or a policy's probabilities, by default."""
+    seed: int = 0
+    """Of the episodes."""
+    confidence: float = 0.95
+    """Of the bands."""
+
+
+def make(options: Options, progress: Progress | None) -> Made:
+    """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
+    options.checkpoints()
+    options.check_folder()
+    if not options.bins or min(options.bins) < 1 or options.episodes < 1:
+        raise ValueError(f"--bins and --episodes must be at least 1, got {list(options.bins)} and {options.episodes}")
+    paths, notes = checkpoints_of(options.runs)
+    densities, more = measure(paths, options, progress)
+    made = Made([], notes + more)
+    with drawing(options.style) as plt:
+        for bins in options.bins:
+            pooled = pool(densities, bins, options.confidence)
+            draw = stacked_bars if bins <= BARS_UP_TO else binned_curves
+            figure = draw(plt, densities, pooled, bins, options)
+            extra = _arrays(densities) if bins == options.bins[0] else None
+            rows = _rows(pooled, bins)
+            made.files += save(options, f"recall-density-{bins}", figure, rows, extra)
+            made.rows = [*made.rows, *rows]
+    head = ("run", "trajectories", "mean length", "on the last frame %", "thirds %")
+    cells = [
+        (
+            label,
+            len(density.shares),
+            f"{density.lengths.mean():.1f}",
+            f"{100 * density.last_share():.1f}",
+            " / ".join(f"{100 * mass:.1f}" for mass in density.mass(3)),
+        )
+        for label, density in densities
+    ]
+    made.tables.append(Table("share of the gradient of the last decision", head, cells))
+    return made
 
 
 def measure(
-    paths: Sequence[Path], request: Request, observability: Twin | None, **options: Any
+    paths: Sequence[Path], options: Options, progress: Progress | None = None
 ) -> tuple[list[tuple[Label, RecallDensity]], list[str]]:
     """Densities of checkpoints, and notes on those that gave none.
 
     Args:
         paths: run folders or checkpoints.
-        request: its ``episodes``, ``end`` and ``progress`` count.
-        observability: another twin than the one trained on.
-        **options: of `recall_density`.
+        options: of the measure.
+        progress: called with (run, trajectories done, of how many).
+
+    Raises:
+        ValueError: no trajectory is left of any checkpoint.
     """
+    how: dict[str, Any] = {
+        "episodes": options.episodes,
+        "end": options.end,
+        "cap": options.max_frames,
+        "norm": options.norm,
+    }
+    how |= {"reduce": options.reduce, "target": options.target, "seed": options.seed}
     densities, empty = [], []
-    options = {"episodes": request.episodes, "end": request.end} | options
     for path in paths:
-        label, density = density_of_run(path, options, observability, request.tell(path.name))
+        label, density = density_of_run(path, how, options.observability, tell(progress, path.name))
         if density.shares:
             densities.append((label, density))
         else:
             empty.append(f"{path.name} ({density.dropped} too short, {density.silent} without gradient)")
-    check_distinct([label for label, _ in densities])
     if not densities:
         raise ValueError(f"no trajectory is left of any checkpoint: {listed(empty)}")
     notes = [f"left out, no trajectory: {listed(empty)}"] if empty else []
     short = sum(density.dropped for _, density in densities)
-    if short:
-        notes.append(f"{short} trajectories with fewer than 3 frames were left out")
-    return densities, notes
-
-
-def draw(densities: Densities, request: Request) -> Made:
-    """Draw and save what `measure` found; also one npz file with every trajectory."""
-    files: list[Path] = []
-    notes: list[str] = []
+    notes += [f"{short} trajectories with fewer than 3 frames were left out"] if short else []
+    densities = with_names(densities)
     twins = {(label.agent, label.game): set[str]() for label, _ in densities}
     for label, _ in densities:
         twins[label.agent, label.game].add(label.observability)
     alone = [f"{agent} on {game}" for (agent, game), seen in twins.items() if len(seen) < 2]
-    if alone:
-        notes.append(f"only one twin is there: {listed(alone)}")
-    with drawing(request.style) as plt:
-        for bins in request.bins:
-            pooled = pool(densities, bins, request.confidence)
-            plot = stacked_bars if bins <= BARS_UP_TO else binned_curves
-            figure = plot(plt, densities, pooled, bins, request)
-            extra = _arrays(densities) if bins == request.bins[0] else None
-            files += save(figure, request.out / f"recall-density-{bins}", _rows(pooled, bins), extra)
-    return Made(files, notes)
+    return densities, notes + ([f"only one twin is there: {listed(alone)}"] if alone else [])
 
 
 def pool(densities: Densities, bins: int, confidence: float) -> dict[tuple[str, str, str], Pooled]:
@@ -119,12 +155,12 @@ def pool(densities: Densities, bins: int, confidence: float) -> dict[tuple[str, 
 
 
 def stacked_bars(
-    plt: Any, densities: Densities, pooled: Mapping[tuple[str, str, str], Pooled], bins: int, request: Request
+    plt: Any, densities: Densities, pooled: Mapping[tuple[str, str, str], Pooled], bins: int, options: Options
 ) -> Any:
     """Two panels, MDP and POMDP; a bar a game, all memory models and seeds pooled; the darkest part is most recent."""
     remembering = {task: value for task, value in pooled.items() if not _memory_free(task[0])} or dict(pooled)
     games = list(dict.fromkeys(game for _, game, _ in remembering))
-    size = inches(request.style, max(8.0, 3.4 + 1.1 * len(games)), 4.2)
+    size = inches(options.style, max(8.0, 3.4 + 1.1 * len(games)), 4.2)
     figure, axes = plt.subplots(1, 2, figsize=size, sharey=True, layout="constrained")
     for axis, twin, shades in zip(axes, ("full", "partial"), (MDP_THIRDS, POMDP_THIRDS), strict=True):
         chosen = [[value.mean for (_, name, t), value in remembering.items() if (name, t) == (g, twin)] for g in games]
@@ -148,35 +184,32 @@ def stacked_bars(
     agents = list(dict.fromkeys(agent for agent, _, _ in remembering))
     counts = [len(value.seeds) for value in remembering.values()]
     seeds = f"{_range(counts)} seed{'s' * (max(counts) > 1)}"
-    under = f"mean over {', '.join(agents)}; n = {seeds} x {_trajectories(densities)}; {_end(request)}; "
+    under = f"mean over {', '.join(agents)}; n = {seeds} x {_trajectories(densities)}; {_end(options)}; "
     footnote(figure, under + "dotted: uniform memory; without memory: all in the most recent part")
     return figure
 
 
 def binned_curves(
-    plt: Any, densities: Densities, pooled: Mapping[tuple[str, str, str], Pooled], bins: int, request: Request
+    plt: Any, densities: Densities, pooled: Mapping[tuple[str, str, str], Pooled], bins: int, options: Options
 ) -> Any:
     """One row an agent, one panel a game; MDP and POMDP, with reference lines."""
     agents = list(dict.fromkeys(agent for agent, _, _ in pooled))
     games = list(dict.fromkeys(game for _, game, _ in pooled))
-    size = inches(request.style, max(6.4, 3.4 * len(games)), 1.1 + 2.7 * len(agents))
+    size = inches(options.style, max(6.4, 3.4 * len(games)), 1.1 + 2.7 * len(agents))
     figure, axes = plt.subplots(
         len(agents), len(games), figsize=size, squeeze=False, sharex=True, sharey=True, layout="constrained"
     )
-    edges = np.arange(bins + 1) / bins
     for row, agent in enumerate(agents):
         for column, game in enumerate(games):
             axis = axes[row, column]
             lengths = [int(n) for label, d in densities if label.task[:2] == (agent, game) for n in d.lengths]
-            for twin in ("full", "partial"):
-                if (value := pooled.get((agent, game, twin))) is not None:
-                    _curve(axis, value, edges, TWIN_COLOURS[twin], TWIN_NAMES[twin])
-            axis.stairs(uniform_memory(bins), edges, color=NEUTRAL, lw=1, ls=":", label="uniform memory")
-            if lengths:
-                axis.stairs(no_memory(lengths, bins), edges, color=NEUTRAL, lw=1, ls="-.", label="no memory")
+            twins = {
+                TWIN_NAMES[twin]: (pooled[agent, game, twin], TWIN_COLOURS[twin])
+                for twin in ("full", "partial")
+                if (agent, game, twin) in pooled
+            }
+            plot(twins, axis, bins, lengths)
             axis.set_title(f"{agent}, {game}")
-            axis.set_xlim(0, 1)
-            axis.set_ylim(0, 1.05)
     for axis in axes[-1]:
         axis.set_xlabel("time in the trajectory (1: the decision)")
     for axis in axes[:, 0]:
@@ -186,19 +219,27 @@ def binned_curves(
         handles |= {label: handle for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
     counts = [len(value.seeds) for value in pooled.values()]
-    under = f"{seeds_note(counts, request.confidence, 'bands')} x {_trajectories(densities)}; {_end(request)}"
+    under = f"{seeds_note(counts, options.confidence, 'bands')} x {_trajectories(densities)}; {_end(options)}"
     footnote(figure, under)
     return figure
 
 
-def _curve(axis: Any, value: Pooled, edges: Array, colour: str, name: str) -> None:
-    if np.isfinite(value.low).all():
-        axis.stairs(value.high, edges, baseline=value.low, color=colour, alpha=0.22, fill=True, lw=0)
-    axis.stairs(value.mean, edges, color=colour, label=name, ls="-" if name == "MDP" else (0, (4, 1)))
+def plot(series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths: Sequence[int] = ()) -> None:
+    """Draw densities over the time of a trajectory, with the reference lines of uniform memory and of none."""
+    edges = np.arange(bins + 1) / bins
+    for place, (name, (value, colour)) in enumerate(series.items()):
+        if np.isfinite(value.low).all():
+            axis.stairs(value.high, edges, baseline=value.low, color=colour, alpha=0.22, fill=True, lw=0)
+        axis.stairs(value.mean, edges, color=colour, label=name, ls="-" if place % 2 == 0 else (0, (4, 1)), lw=1.8)
+    axis.stairs(uniform_memory(bins), edges, color=NEUTRAL, lw=1, ls=":", label="uniform memory")
+    if len(lengths):
+        axis.stairs(no_memory(lengths, bins), edges, color=NEUTRAL, lw=1, ls="-.", label="no memory")
+    axis.set_xlim(0, 1)
+    axis.set_ylim(0, 1.05)
 
 
 def _memory_free(agent: str) -> bool:
-    return agent.rpartition("-")[2] in MEMORY_FREE
+    return any(is_baseline(agent, name) for name in MEMORY_FREE)
 
 
 def _shades(plt: Any, thirds: Sequence[str], bins: int) -> list[Any]:
@@ -226,8 +267,8 @@ def _range(counts: Sequence[int]) -> str:
     return str(min(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 
 
-def _end(request: Request) -> str:
-    return "decision: the one that ended the episode" if request.end == "last" else "decision: at a random step"
+def _end(options: Options) -> str:
+    return "decision: the one that ended the episode" if options.end == "last" else "decision: at a random step"
 
 
 def _rows(pooled: Mapping[tuple[str, str, str], Pooled], bins: int) -> list[dict[str, Any]]:

@@ -1,14 +1,16 @@
 """How figures look, and how they are saved: the one place for colours, sizes and files."""
 
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from io import BytesIO
+from html import escape
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.analysis.kept import write_npz
-from arcade_torch.tools.files import write_bytes, write_csv
+from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options
+from arcade_torch.tools.files import write_bytes, write_csv, write_npz
 from arcade_torch.tools.optional import need
 
 STYLES = ("light", "print")
@@ -20,6 +22,7 @@ AGENT_COLOURS = {
     "lru": "#0072b2",
     "gru": "#009e73",
     "mingru": "#e69f00",
+    "linear_transformer": "#cc79a7",
     "fart": "#cc79a7",
     "attention": "#d55e00",
     "gdn": "#56b4e9",
@@ -79,6 +82,8 @@ _SHARED = {
     "axes.axisbelow": True,
     "legend.frameon": False,
     "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "arcade-torch",
     "figure.facecolor": "white",
     "axes.titlesize": "medium",
 }
@@ -87,12 +92,7 @@ _SCALE = {"light": 1.0, "print": 0.62}
 
 @contextmanager
 def drawing(style: str) -> Iterator[Any]:
-    """matplotlib.pyplot in one of `STYLES`, without a window.
-
-    Raises:
-        ValueError: there is no such style.
-        MissingPackage: matplotlib is not installed.
-    """
+    """matplotlib.pyplot in one of `STYLES`, without a window."""
     if style not in STYLES:
         raise ValueError(f"unknown style {style!r}: allowed are {', '.join(STYLES)}")
     need("matplotlib").use("Agg")
@@ -115,6 +115,16 @@ def agent_colour(name: str, place: int = 0) -> str:
     return AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
 
 
+def agent_colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour for every agent: that of its memory, or a spare one where another agent has that already."""
+    found: dict[str, str] = {}
+    for place, name in enumerate(names):
+        colour = agent_colour(name, place)
+        free = [spare for spare in SPARE_COLOURS if spare not in found.values()]
+        found[name] = free[0] if colour in found.values() and free else colour
+    return found
+
+
 def whiskers(low: Any, value: Any, high: Any) -> Any:
     """Lengths of error bars [2, n] for matplotlib; 0 where there is no interval."""
     import numpy as np
@@ -132,11 +142,6 @@ def footnote(figure: Any, text: str) -> None:
 
 def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:
     """How many seeds, which interval, and what it is worth.
-
-    Args:
-        seeds: number of seeds behind each value.
-        confidence: nominal.
-        what: how the interval is drawn.
 
     Example:
         >>> seeds_note([1], 0.95)
@@ -156,30 +161,47 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> s
 
 
 def save(
-    figure: Any,
-    base: Path,
+    options: Options,
+    name: str,
+    figure: Any = None,
     rows: Sequence[Mapping[str, Any]] = (),
     arrays: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write a figure as PDF and PNG, and its numbers beside it.
-
-    Args:
-        figure: from matplotlib.
-        base: path without ending.
-        rows: numbers for a CSV file.
-        arrays: numbers for an npz file.
-
-    Returns:
-        What was written.
-    """
+    """Write a figure, and its numbers beside it."""
+    base, endings = options.path(name)
     written = []
-    for ending in (".pdf", ".png"):
+    for ending in [ending for ending in endings if ending in PICTURES] if figure is not None else []:
         buffer = BytesIO()
         figure.savefig(buffer, format=ending[1:])
         written.append(write_bytes(base.with_name(base.name + ending), buffer.getvalue()))
     if rows:
         columns = list(dict.fromkeys(name for row in rows for name in row))
         written.append(write_csv(base.with_name(base.name + ".csv"), rows, columns))
-    if arrays:
+    if arrays and endings != NUMBERS:
         written.append(write_npz(base.with_name(base.name + ".npz"), arrays))
     return written
+
+
+_ID = re.compile(r'(\bid="|url\(#|href="#)')
+_NUMBER = re.compile(r"-?\d+\.\d{2,}")
+
+
+def svg(figure: Any, name: str) -> str:
+    """A figure as an SVG element that can stand in a page beside others."""
+    buffer = StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
+    text = re.sub(r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text)
+    text = _NUMBER.sub(lambda found: f"{float(found[0]):.4g}", text)
+    prefix = re.sub(r"\W+", "-", name)
+    text = _ID.sub(lambda found: f"{found[1]}{prefix}-", re.sub(r">\s+<", "><", text))
+    return text.replace("<svg", f'<svg role="img" aria-label="{escape(name)}"', 1)
+
+
+def png(figure: Any, colours: int = 128) -> bytes:
+    """A figure as a small PNG file, its colours counted."""
+    buffer, packed = BytesIO(), BytesIO()
+    figure.savefig(buffer, format="png", dpi=150)
+    need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(packed, "PNG", optimize=True)
+    return packed.getvalue()

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.bench.others import PACKAGES, bench_others, installed
-from arcade_torch.tools.figures.registry import Made, Request
+from arcade_torch.tools.bench.external_envs import PACKAGES, bench_others, installed
+from arcade_torch.tools.figures.registry import Made, Options, Progress
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, SPARE_COLOURS, drawing, footnote, inches, save
 from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.versions import versions
@@ -28,16 +28,12 @@ class Series:
     rates: Any
 
 
-def make(request: Request) -> Made:
+def make(options: Options, progress: Progress | None) -> Made:
     """The figure ``throughput``: our games with and without drawing; and our mean beside other packages.
 
-    ``request.runs`` is the one file; rates have the checksum over every frame inside the clock.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: there is not one file, or it is of another command.
+    ``options.runs`` is the one file; rates have the checksum over every frame inside the clock.
     """
-    file = _one_file(request.runs)
+    file = _one_file(options.runs)
     rows = read_rows(file)
     sizes = sorted({int(row["obs_size"]) for row in rows})
     here = [row for row in rows if int(row["obs_size"]) == sizes[0]]
@@ -49,9 +45,9 @@ def make(request: Request) -> Made:
     plain = {game: series(here, game, "step") for game in games}
     means = [mean_series(here, games, measure, name) for measure, name in OURS.items()]
     limit = mean_series(here, games, LIMIT, "writing the same bytes")
-    with drawing(request.style) as plt:
+    with drawing(options.style) as plt:
         figure, (left, right) = plt.subplots(
-            1, 2, figsize=inches(request.style, 11.5, 5.4), sharey=True, layout="constrained"
+            1, 2, figsize=inches(options.style, 11.5, 5.4), sharey=True, layout="constrained"
         )
         for place, game in enumerate(games):
             colour = SPARE_COLOURS[place % len(SPARE_COLOURS)]
@@ -74,16 +70,12 @@ def make(request: Request) -> Made:
             f"{first.get('jax_device', 'unknown device')}, {first.get('cores', '?')} cores, "
             f"arcade-torch {first.get('arcade-torch', '?')} ({first.get('commit') or 'no commit'})",
         )
-        return Made(save(figure, request.out / "throughput", _rows(drawn, plain, [*means, limit, *others])), notes)
+        numbers = _rows(drawn, plain, [*means, limit, *others])
+        return Made(save(options, "throughput", figure, numbers), notes, rows=numbers)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a benchmark's file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not of ``arcade-torch bench envs``.
-    """
+    """Rows of a benchmark's file."""
     rows = read_csv(path)
     missing = [name for name in NEEDED if not rows or name not in rows[0]]
     if missing:
@@ -154,7 +146,7 @@ def _others(rows: Sequence[dict[str, str]]) -> tuple[list[Series], list[str]]:
 
 def this_machine() -> dict[str, str]:
     """What a file of this machine would say, for `MACHINE`."""
-    from arcade_torch.tools.bench.envs import machine
+    from arcade_torch.tools.bench.harness import machine
 
     return {name: str(value) for name, value in (machine() | versions()).items() if name in MACHINE}
 

@@ -36,14 +36,7 @@ _ID = re.compile(r"(?P<env>\w+?)(?P<difficulty>Easy|Medium|Hard)?-v\d+")
 
 
 def score_row(attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = "") -> dict[str, Any]:
-    """One line of the table.
-
-    Args:
-        attempt: the episode.
-        game: what was played.
-        options: of the game, beside size and rules.
-        player: who played.
-    """
+    """One line of the table."""
     match = _ID.fullmatch(game.id)
     return {
         "model": "human",
@@ -65,11 +58,7 @@ def score_row(attempt: Attempt, game: Game[Any], options: Mapping[str, Any], pla
 
 
 def read_scores_file(path: Path) -> list[dict[str, str]]:
-    """The lines of a table; none if the file does not exist.
-
-    Raises:
-        ValueError: the file is no table of human scores.
-    """
+    """The lines of a table; none if the file does not exist."""
     if not path.exists():
         return []
     rows = read_csv(path)

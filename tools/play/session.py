@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import ACTION_NAMES, Game
-from arcade_torch.gym_batch import NumpyBatch, seed_keys
+from arcade_torch.gym.batch import NumpyBatch, seed_keys
 
 Frame = npt.NDArray[np.uint8]
 End = Literal["terminated", "truncated", "abandoned"]

@@ -58,14 +58,6 @@ def decode_keys(data: bytes) -> list[str]:
 def shrink(frame: Frame, height: int, width: int) -> Frame:
     """Make a frame smaller by means over areas; one that fits already stays as it is.
 
-    Args:
-        frame: uint8 [H, W, 3].
-        height: most rows.
-        width: most columns.
-
-    Returns:
-        uint8 [h, w, 3] with h <= height and w <= width, in the frame's proportions.
-
     Example:
         >>> shrink(np.zeros((128, 256, 3), np.uint8), 60, 60).shape
         (30, 60, 3)
@@ -84,11 +76,7 @@ def shrink(frame: Frame, height: int, width: int) -> Frame:
 
 
 def half_blocks(frame: Frame) -> list[str]:
-    """Lines that draw a frame, two rows of pixels each: upper half in the text's colour, lower in the background's.
-
-    Args:
-        frame: uint8 [H, W, 3].
-    """
+    """Lines that draw a frame, two rows of pixels each: upper half in the text's colour, lower in the background's."""
     if frame.shape[0] % 2:
         frame = np.concatenate([frame, np.zeros_like(frame[:1])])
     lines = []
@@ -104,24 +92,14 @@ def half_blocks(frame: Frame) -> list[str]:
 
 
 def screen(session: Session, columns: int, rows: int) -> str:
-    """What to write to the terminal to show a session.
-
-    Args:
-        session: what is played.
-        columns: width of the terminal.
-        rows: its height.
-    """
+    """What to write to the terminal to show a session."""
     picture = half_blocks(shrink(session.frame, 2 * max(1, rows - _TEXT_ROWS), columns))
     text = [words[:columns] for words in (session.caption, LEGEND)]
     return "\x1b[H" + "\r\n".join(f"{line}\x1b[K" for line in [*picture, *text]) + "\x1b[J"
 
 
 def play_in_terminal(session: Session) -> None:
-    """Show a session in this process's terminal and hand it the keys, until it is closed.
-
-    Raises:
-        ValueError: standard input or output is no terminal.
-    """
+    """Show a session in this process's terminal and hand it the keys, until it is closed."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise ValueError("playing needs a window or a terminal, and this is neither: standard input is redirected")
     with _raw_terminal() as source:

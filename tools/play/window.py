@@ -3,7 +3,7 @@
 import os
 import sys
 
-from arcade_torch.gym_window import Window
+from arcade_torch.gym.window import Window
 from arcade_torch.tools.optional import MissingPackage, need
 from arcade_torch.tools.play.session import NEXT, QUIT, RESTART, TOGGLE, Session
 
@@ -40,13 +40,7 @@ def why_no_window() -> str | None:
 
 
 def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> None:
-    """Show a session and hand it the keys, until it is closed.
-
-    Args:
-        session: what is played.
-        scale: width and height of a frame's pixel on the screen.
-        key_repeat_ms: a held key repeats every so many milliseconds; 0 for not at all.
-    """
+    """Show a session and hand it the keys, until it is closed."""
     window = Window(scale)
     pygame = window.pygame
     keys = {getattr(pygame, constant): name for name, constant in _KEY_OF.items()}

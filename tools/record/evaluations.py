@@ -20,15 +20,6 @@ class EvaluationVideos:
 
     Playing draws no random number of the training, so a run is the same to the bit with and without it. A film that
     fails is reported in a warning, and it was the last.
-
-    Args:
-        folder: gets one file per evaluation, ``frames-000040960.gif``.
-        suffix: ``.gif`` or ``.mp4``.
-        max_steps: the film stops when the episode gets longer.
-
-    Raises:
-        ValueError: another suffix.
-        MissingPackage: what writes such files is not installed.
     """
 
     def __init__(self, folder: Path, suffix: str = ".gif", max_steps: int = 500) -> None:
@@ -37,11 +28,7 @@ class EvaluationVideos:
         self._failed = False
 
     def __call__(self, agent: Any) -> None:
-        """Film an agent.
-
-        Args:
-            agent: as ``arcade_torch.agents.load`` gives it.
-        """
+        """Film an agent."""
         if self._failed:
             return
         path = self.folder / f"frames-{agent.frames:09d}{self.suffix}"

@@ -22,15 +22,7 @@ _PALETTE_SIZE = 256
 
 
 def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
-    """The writer that a file's name asks for.
-
-    Args:
-        path: ends in ``.gif`` or ``.mp4``.
-
-    Raises:
-        ValueError: another ending.
-        MissingPackage: what the writer needs is not installed.
-    """
+    """The writer that a file's name asks for."""
     if path.suffix not in FASTEST_FPS:
         raise ValueError(f"the file must end in .gif or .mp4, got {path}")
     if path.is_dir():
@@ -40,16 +32,7 @@ def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
 
 
 def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
-    """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel.
-
-    Args:
-        path: where.
-        frames: uint8 [H, W, 3], at least one.
-        fps: a GIF counts hundredths of a second, so this is rounded to 100 / n.
-
-    Returns:
-        ``path``.
-    """
+    """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel."""
     need("PIL.Image")
     pictures = _pictures(frames)
     buffer = io.BytesIO()
@@ -73,19 +56,7 @@ def _pictures(frames: Iterable[Frame]) -> Iterator[Any]:
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
-    """Write an H.264 film that browsers show; colours are subsampled, pixels are not exact.
-
-    Args:
-        path: where.
-        frames: uint8 [H, W, 3] with even sides, at least one.
-        fps: frames a second.
-
-    Returns:
-        ``path``.
-
-    Raises:
-        ValueError: ffmpeg refuses; says what it said.
-    """
+    """Write an H.264 film that browsers show; colours are subsampled, pixels are not exact."""
     program = need("imageio_ffmpeg").get_ffmpeg_exe()
     rest = iter(frames)
     first = next(rest)

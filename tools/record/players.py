@@ -19,12 +19,7 @@ class Chooser(Protocol):
 
 
 class Scripted:
-    """The random player or an oracle of the games.
-
-    Args:
-        player: who chooses.
-        sees: ``state``, ``frames`` (those of the POMDP twin), or ``nothing``.
-    """
+    """The random player or an oracle of the games."""
 
     def __init__(self, player: Player, sees: str) -> None:
         self._player, self._sees = player, sees
@@ -38,12 +33,7 @@ class Scripted:
 
 
 class Trained:
-    """A trained agent, greedy; it sees what it would see in an ``ArcadeEnv`` of one env.
-
-    Args:
-        agent: what ``arcade_torch.agents.load`` gives.
-        partial: whether it sees the POMDP twin.
-    """
+    """A trained agent, greedy; it sees what it would see in an ``ArcadeEnv`` of one env."""
 
     def __init__(self, agent: Any, partial: bool) -> None:
         self._agent, self._partial = agent, partial
@@ -73,16 +63,7 @@ class Trained:
 
 
 def scripted(name: str, game: Any, seed: int) -> Scripted:
-    """A player by its name.
-
-    Args:
-        name: one of ``SCRIPTED``.
-        game: what is played.
-        seed: of the random player.
-
-    Raises:
-        ValueError: the game has no such oracle.
-    """
+    """A player by its name."""
     if name == "random":
         return Scripted(RandomPlayer(seed), "nothing")
     kind = "state" if name == "state-oracle" else "frames"
@@ -90,15 +71,7 @@ def scripted(name: str, game: Any, seed: int) -> Scripted:
 
 
 def load_agent(player: str) -> Any:
-    """The agent in a run folder.
-
-    Args:
-        player: the folder, as it was typed.
-
-    Raises:
-        ValueError: neither the name of a scripted player nor a folder.
-        CheckpointError: the folder holds no agent.
-    """
+    """The agent in a run folder."""
     if not Path(player).is_dir():
         raise ValueError(f"--player is {player!r}, allowed: {', '.join(SCRIPTED)}, or a run folder")
     from arcade_torch.agents import load

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from arcade_torch.agents import Agent, preset
-from arcade_torch.agents.agent import build_network
+from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination, shuffled_beginning
 from arcade_torch.tools.analysis.contamination_examples import noise_examples, shuffle_example
-from arcade_torch.tools.analysis.replay import disturbed_frames, shuffle_order
+from arcade_torch.tools.analysis.perturbation import disturbed_frames, shuffle_order
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
@@ -33,7 +33,7 @@ def test_a_linear_memory_forgets_noise_at_its_own_rate() -> None:
 def test_the_relative_change_is_rho_to_the_delay_over_the_spread_of_values() -> None:
     rho, policy = 0.6, linear_policy(0.6, dtype=torch.float32)
     w = window(8)
-    from arcade_torch.tools.analysis.replay import replayed
+    from arcade_torch.tools.analysis.perturbation import replayed
 
     clean = policy.encode(w.frames)[None]
     noisy = clean.clone()

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from arcade_torch.agents import Agent, preset
-from arcade_torch.agents.agent import build_network
+from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy
 from arcade_torch.tools.analysis.policy import outputs, policy_of, read_plain, resolve
 from tests.tools.analysis.toys import Net, linear_policy

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.agents import Agent, preset
-from arcade_torch.agents.agent import build_network
+from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import recall_density, saliency
 from arcade_torch.tools.analysis.binning import binned, mean_points, no_memory, point_sampled, uniform_memory
 from arcade_torch.tools.analysis.recall_density import density_of_windows

@@ -1,0 +1,150 @@
+"""Benchmark files: what is written is read back, and two of them are compared number by number."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench.registry import BENCHES, TABLES, bench_all, compare, module_of, page, read_results
+from tests.tools.test_cli import one_error
+
+RESULTS: dict[str, Any] = {
+    "format": 1,
+    "machine": {"processor": "x86_64", "cores": 2},
+    "size": "tiny",
+    "tables": {
+        "envs": {
+            "rows": [
+                {"game": "G", "obs_size": 128, "num_envs": 16, "measure": "env", "frames_per_s": 1000.0},
+                {"game": "G", "obs_size": 128, "num_envs": 32, "measure": "env", "frames_per_s": 2000.0},
+            ]
+        },
+        "scans": {"rows": [{"form": "a|b", "steps": 8, "numbers": "real", "forward_ms": 2.0, "both_ms": 4.0}]},
+    },
+}
+
+
+def changed(**numbers: float) -> dict[str, Any]:
+    """The same results with other numbers in the first row that has them."""
+    results = copy.deepcopy(RESULTS)
+    for column, value in numbers.items():
+        next(row for table in results["tables"].values() for row in table["rows"] if column in row)[column] = value
+    return results
+
+
+def written(path: Path, value: Any) -> Path:
+    path.write_text(value if isinstance(value, str) else json.dumps(value))
+    return path
+
+
+def test_a_result_equals_itself() -> None:
+    assert {change.verdict(0.01) for change in compare(RESULTS, RESULTS)} == {"same"}
+    assert len(compare(RESULTS, RESULTS)) == 4
+
+
+@pytest.mark.parametrize(
+    ("numbers", "verdict"),
+    [
+        ({"frames_per_s": 790.0}, "worse"),  # more is better
+        ({"frames_per_s": 810.0}, "same"),
+        ({"frames_per_s": 1240.0}, "same"),
+        ({"frames_per_s": 1260.0}, "better"),
+        ({"frames_per_s": 0.0}, "worse"),
+        ({"forward_ms": 2.6}, "worse"),  # less is better
+        ({"forward_ms": 2.4}, "same"),
+        ({"forward_ms": 1.5}, "better"),
+        ({"forward_ms": 0.0}, "better"),
+    ],
+)
+def test_a_rate_that_falls_and_a_time_that_grows_are_worse(numbers: dict[str, float], verdict: str) -> None:
+    (found,) = [change for change in compare(RESULTS, changed(**numbers)) if change.old != change.new]
+    assert found.verdict(0.2) == verdict
+
+
+def test_comparing_backwards_turns_better_into_worse() -> None:
+    (forth,) = [c for c in compare(RESULTS, changed(both_ms=8.0)) if c.old != c.new]
+    (back,) = [c for c in compare(changed(both_ms=8.0), RESULTS) if c.old != c.new]
+    assert forth.ratio * back.ratio == pytest.approx(1.0)
+    assert (forth.verdict(0.2), back.verdict(0.2)) == ("worse", "better")
+
+
+def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = changed(frames_per_s=500.0)
+    new["machine"]["cores"] = 4
+    new["tables"]["scans"]["rows"][0]["steps"] = 16
+    old, other = written(tmp_path / "old.json", RESULTS), written(tmp_path / "new.json", new)
+    assert cli.main(["bench", "compare", str(old), str(other)]) == cli.EXIT_FAILED
+    said = capsys.readouterr().out
+    assert "not the same machine: cores 2 and 4" in said
+    assert "worse: envs: game G, obs_size 128, num_envs 16, measure env: frames_per_s 1,000 -> 500 frames/s" in said
+    assert said.count("missing: scans") == 2 and said.count("new: scans") == 2
+    assert said.endswith("1 same, 1 worse, 0 better, 2 missing, 2 new\n")
+    assert cli.main(["bench", "compare", str(old), str(other), "--tolerance", "0.6"]) == cli.EXIT_OK
+    assert cli.main(["bench", "compare", str(old), str(old)]) == cli.EXIT_OK
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("9" * 5000, "is not valid JSON"),
+        ([], "is no file of `arcade-torch bench all`"),
+        (RESULTS | {"format": 2}, "is no file of `arcade-torch bench all` in format 1"),
+        (RESULTS | {"machine": None}, "does not say on which machine"),
+        (RESULTS | {"tables": {"cooking": {"rows": []}}}, "unknown table 'cooking'"),
+        (RESULTS | {"tables": {"envs": []}}, "has no list of rows"),
+        (RESULTS | {"tables": {"envs": {"rows": [1]}}}, "has no list of rows"),
+        (RESULTS | {"tables": {"envs": {"rows": [{"game": "G"}]}}}, "a row of table envs has no obs_size"),
+        (changed(frames_per_s=float("nan")), "frames_per_s is nan, wanted a number"),
+        (changed(frames_per_s=-1.0), "frames_per_s is -1.0, wanted a number"),
+        (changed(num_envs=32), "has two rows for game G, obs_size 128, num_envs 32"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_in_one_line(
+    value: Any, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = written(tmp_path / "good.json", RESULTS), written(tmp_path / "bad.json", value)
+    for words in ([str(good), str(bad)], [str(bad), str(good)]):
+        assert message in one_error(capsys, ["bench", "compare", *words])
+    assert "does not exist" in one_error(capsys, ["bench", "compare", str(good), str(tmp_path / "none.json")])
+    assert "between 0 and 1" in one_error(capsys, ["bench", "compare", str(good), str(good), "--tolerance", "1.5"])
+
+
+def test_the_page_has_a_table_each_and_hostile_names_stay_in_their_cells() -> None:
+    text = page(RESULTS)
+    assert text.count("\n## ") == 2
+    rows = [line for line in text.splitlines() if line.startswith("|")]
+    assert any("a\\|b" in row for row in rows)
+    assert "| G | 128 | 16 | env | 1,000 |" in rows
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_every_benchmark_has_every_size(name: str) -> None:
+    module = module_of(name)
+    assert all(module.Options(**module.SIZES[size]) for size in ("tiny", "quick", "full"))
+
+
+def test_an_unknown_size_or_benchmark_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown size 'huge'"):
+        bench_all("huge")
+    with pytest.raises(ValueError, match="unknown benchmark 'cooking'"):
+        bench_all("tiny", ["cooking"])
+
+
+def test_a_tiny_benchmark_of_everything_is_written_read_and_equals_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "bench.json"
+    assert cli.main(["bench", "all", "--size", "tiny", "--out", str(out)]) == 0
+    results = read_results(out)
+    assert set(results["tables"]) == set(TABLES) - {"back_ends"} and results["machine"]["torch"]
+    assert page(results) == out.with_suffix(".md").read_text()
+    capsys.readouterr()
+    assert cli.main(["bench", "compare", str(out), str(out)]) == 0
+    assert " 0 worse" in capsys.readouterr().out

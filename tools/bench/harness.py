@@ -1,0 +1,175 @@
+"""What all benchmarks share: measures in turns, every result consumed, the machine, memory and kinds of operation.
+
+Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is torch's, which waits for
+the device.
+"""
+
+import os
+import platform
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many threads inside, and as many as before afterwards."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass
+class Measured:
+    """What one measure did over all repeats.
+
+    Attributes:
+        rates: units per second of each repeat, the check of the results left out.
+        rates_with_check: the same with the check inside the clock.
+        units: how many were made and consumed in all timed repeats.
+        checksum: sum over everything that was made, modulo 2**64.
+    """
+
+    rates: list[float]
+    rates_with_check: list[float]
+    units: int = 0
+    checksum: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Median units per second."""
+        return median(self.rates)
+
+    @property
+    def rate_with_check(self) -> float:
+        """Median units per second with the check inside the clock."""
+        return median(self.rates_with_check)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Something to time.
+
+    Attributes:
+        work: does it once and returns the result; JAX is waited for, torch's device is by the clock.
+        check: reads all of the result and returns a whole number.
+        units: how many units one ``work`` makes.
+    """
+
+    work: Callable[[], object]
+    check: Callable[[object], int]
+    units: int
+
+
+def no_check(_: object) -> int:
+    """The check of eager torch on a CPU, which computes all that it is asked for: there is nothing to consume."""
+    return 0
+
+
+def interleaved(
+    measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 2
+) -> dict[str, Measured]:
+    """Time several measures in turns."""
+    if seconds <= 0 or repeats < 1:
+        raise ValueError(f"seconds must be above 0 and repeats at least 1, got {seconds} and {repeats}")
+    for measure in measures.values():
+        for _ in range(warm_ups):
+            measure.check(measure.work())
+    found = {name: Measured([], []) for name in measures}
+    for _ in range(repeats):
+        for name, measure in measures.items():
+            _repeat(measure, found[name], seconds)
+    return found
+
+
+def _repeat(measure: Measure, into: Measured, seconds: float) -> None:
+    from torch.utils.benchmark import timer
+
+    units, working, checking = 0, 0.0, 0.0
+    while units == 0 or working + checking < seconds:
+        start = timer()
+        result = measure.work()
+        middle = timer()
+        into.checksum = (into.checksum + measure.check(result)) % 2**64
+        end = timer()
+        working, checking, units = working + middle - start, checking + end - middle, units + measure.units
+    into.units += units
+    into.rates.append(units / working)
+    into.rates_with_check.append(units / (working + checking))
+
+
+def machine() -> dict[str, Any]:
+    """Device, cores and versions that a result was measured with."""
+    import jax
+    import torch
+
+    from arcade_torch.tools.versions import versions
+
+    device = jax.devices()[0]
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "jax_device": f"{device.platform} ({device.device_kind})",
+        "torch_device": "cuda" if torch.cuda.is_available() else "cpu",
+        "processor": platform.processor() or platform.machine(),
+        "cores": cores,
+        "torch_threads": torch.get_num_threads(),
+        **versions(),
+    }
+
+
+def peak_bytes(work: Callable[[], object]) -> int:
+    """Most bytes that torch's CPU allocator handed out at a time while ``work`` ran, above what stood before.
+
+    Read from the memory events of torch's profiler: exact and the same on every machine, whatever else runs. Scratch
+    space inside a matrix library is not in it.
+    """
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
+        work()
+    events = [event for event in run.profiler.kineto_results.events() if event.name() == "[memory]"]
+    events.sort(key=lambda event: event.start_ns())
+    held = most = 0
+    for event in events:
+        held += event.nbytes()
+        most = max(most, held)
+    return most
+
+
+KINDS = {
+    "convolutions": ("convolution",),
+    "pooling": ("max_pool",),
+    "recurrence": ("linear_scan", "matrix_scan"),
+    "matrix products": ("addmm", "::mm", "bmm", "matmul"),
+    "activations": ("leaky_relu",),
+    "copies and casts": ("copy", "aten::cat", "clone", "index_select", "aten::fill_", "aten::zero_"),
+}
+"""Kinds of operation, by parts of their names; the rest is elementwise work."""
+REST = "the rest"
+
+
+def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
+    """Shares of the kinds of operation in the time of some work, by torch's profiler: CUDA kernels where there are any.
+
+    On a CPU the profiler's own memory makes copies look a little dearer than they are.
+    """
+    from torch.profiler import profile
+
+    work()
+    with profile() as run:
+        work()
+    events = list(run.key_averages())
+    on_card = sum(event.self_device_time_total for event in events)
+    seconds = dict.fromkeys([*KINDS, REST], 0.0)
+    for event in events:
+        kind = next((kind for kind, names in KINDS.items() if any(name in event.key for name in names)), REST)
+        seconds[kind] += event.self_device_time_total if on_card else event.self_cpu_time_total
+    total = sum(seconds.values())
+    return {kind: value / total for kind, value in seconds.items()}

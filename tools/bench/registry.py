@@ -1,0 +1,217 @@
+"""The benchmarks by name, the file that holds their tables, its page, and the comparison of two such files.
+
+::
+
+    {"format": 1, "machine": {...}, "size": "quick",
+     "tables": {"envs": {"rows": [{"game": ..., "num_envs": 128, "frames_per_s": 22000.0}, ...]}, ...}}
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from arcade_torch.tools.files import read_json
+
+FORMAT = 1
+
+
+BENCHES = {
+    "envs": "frames per second of the games, every frame consumed",
+    "train": "frames per second of training, and where the time goes",
+    "memory": "time and memory of the memory models, of the scans behind them, and of saliency",
+    "recall": "delayed recall: which model remembers one symbol for how long",
+}
+"""Name -> what it measures. A module of that name has ``Options``, ``SIZES`` and ``run(options, tell)``, which yields
+``(table, row)``."""
+
+
+class Number(NamedTuple):
+    """A measured column: its unit, and whether a larger number is the better one."""
+
+    unit: str
+    more_is_better: bool
+
+
+class Kind(NamedTuple):
+    """A table: what it measures, columns that say what a row is about, measured columns that are compared."""
+
+    title: str
+    key: tuple[str, ...]
+    numbers: dict[str, Number]
+
+
+_RATE, _MS, _MIB = Number("frames/s", True), Number("ms", False), Number("MiB", False)
+TABLES: dict[str, Kind] = {
+    "envs": Kind(
+        "Environments: frames per second, every frame consumed",
+        ("game", "obs_size", "num_envs", "measure"),
+        {"frames_per_s": _RATE},
+    ),
+    "train": Kind(
+        "Training with PQN: frames per second",
+        ("network", "memory", "form", "num_envs", "num_steps"),
+        {"collect_fps": _RATE, "learn_fps": _RATE, "train_fps": _RATE},
+    ),
+    "models": Kind(
+        "Memory models over whole sequences",
+        ("model", "form", "layers", "steps"),
+        {"forward_ms": _MS, "both_ms": _MS, "peak_mib": _MIB},
+    ),
+    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": _MS, "both_ms": _MS}),
+    "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": _MS, "peak_mib": _MIB}),
+    "back_ends": Kind(
+        "Back ends of the linear scan", ("back_end", "steps", "numbers"), {"forward_ms": _MS, "backward_ms": _MS}
+    ),
+    "recall": Kind(
+        "Delayed recall: right answers, and processor time until they were right",
+        ("model", "delay", "hidden_size", "seed"),
+        {"accuracy": Number("share", True), "seconds": Number("s", False)},
+    ),
+}
+"""What a file may hold; whoever adds a benchmark adds its tables here."""
+
+Tell = Callable[[str], None]
+
+
+def module_of(name: str) -> Any:
+    """The module of a benchmark."""
+    return import_module(f"arcade_torch.tools.bench.{name}")
+
+
+def gather(rows: Iterable[tuple[str, dict[str, Any]]], size: str) -> dict[str, Any]:
+    """Rows of benchmarks in the form of a file; numbers with four digits."""
+    from arcade_torch.tools.bench.harness import machine
+
+    tables: dict[str, Any] = {}
+    for name, row in rows:
+        plain = {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
+        tables.setdefault(name, {"rows": []})["rows"].append(plain)
+    return {"format": FORMAT, "machine": machine(), "size": size, "tables": tables}
+
+
+def bench_all(size: str = "quick", names: Sequence[str] = (), tell: Tell = lambda text: None) -> dict[str, Any]:
+    """Run benchmarks one after another."""
+    if size not in ("tiny", "quick", "full"):
+        raise ValueError(f"unknown size {size!r}: allowed are tiny, quick, full")
+    if unknown := [name for name in names if name not in BENCHES]:
+        raise ValueError(f"unknown benchmark {unknown[0]!r}: allowed are {', '.join(BENCHES)}")
+    rows: list[tuple[str, dict[str, Any]]] = []
+    for name in names or BENCHES:
+        module = module_of(name)
+        rows += module.run(module.Options(**module.SIZES[size], out=None), tell)
+    return gather(rows, size)
+
+
+@dataclass(frozen=True)
+class Change:
+    """One number in two files."""
+
+    table: str
+    row: str
+    column: str
+    unit: str
+    old: float | None
+    new: float | None
+    ratio: float
+
+    def verdict(self, tolerance: float) -> str:
+        """``better``, ``worse``, ``same``, ``missing`` or ``new``."""
+        if self.old is None or self.new is None:
+            return "new" if self.old is None else "missing"
+        if self.ratio < 1 - tolerance:
+            return "worse"
+        return "better" if self.ratio > 1 / (1 - tolerance) else "same"
+
+    def line(self) -> str:
+        """The change in words."""
+        values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (self.old, self.new))
+        return f"{self.table}: {self.row}: {self.column} {values} {self.unit} (x {self.ratio:.2f})"
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read a file of ``arcade-torch bench all``."""
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
+        raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
+    if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
+        raise ValueError(f"{path} does not say on which machine and at what size it was measured")
+    for name, table in values["tables"].items():
+        if name not in TABLES:
+            raise ValueError(f"{path} has an unknown table {name!r}; known are {', '.join(TABLES)}")
+        rows = table.get("rows") if isinstance(table, dict) else None
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"{path}: table {name} has no list of rows")
+        _check_rows(path, name, rows)
+    return values
+
+
+def _check_rows(path: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    kind, seen = TABLES[name], set[str]()
+    for row in rows:
+        if missing := [column for column in (*kind.key, *kind.numbers) if column not in row]:
+            raise ValueError(f"{path}: a row of table {name} has no {missing[0]}")
+        for column in kind.numbers:
+            value = row[column]
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e15:
+                raise ValueError(
+                    f"{path}: {name}, {about(name, row)}: {column} is {value!r}, wanted a number from 0 up"
+                )
+        if about(name, row) in seen:
+            raise ValueError(f"{path}: table {name} has two rows for {about(name, row)}")
+        seen.add(about(name, row))
+
+
+def about(name: str, row: Mapping[str, Any]) -> str:
+    """What a row is about, in one line."""
+    return " ".join(", ".join(f"{column} {row[column]}" for column in TABLES[name].key).split())
+
+
+def compare(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
+    """Number by number, what became of an old file in a new one."""
+    before, after = dict(_numbers(old)), dict(_numbers(new))
+    found = []
+    for key in dict.fromkeys((*before, *after)):
+        table, row, column = key
+        number = TABLES[table].numbers[column]
+        ratio = _ratio(before.get(key), after.get(key), number.more_is_better)
+        found.append(Change(table, row, column, number.unit, before.get(key), after.get(key), ratio))
+    return found
+
+
+def _numbers(results: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, str], float]]:
+    for name, table in results["tables"].items():
+        for row in table["rows"]:
+            for column in TABLES[name].numbers:
+                yield (name, about(name, row), column), float(row[column])
+
+
+def _ratio(old: float | None, new: float | None, more_is_better: bool) -> float:
+    if old is None or new is None or old == new:
+        return 1.0
+    better, worse = (new, old) if more_is_better else (old, new)
+    return better / worse if worse else math.inf
+
+
+def page(results: Mapping[str, Any]) -> str:
+    """All tables as one Markdown page."""
+    machine = ", ".join(f"{name} {value}" for name, value in results["machine"].items() if value)
+    lines = ["# Benchmarks", "", f"`make bench`, size {results['size']}. {machine}.", ""]
+    for name, table in results["tables"].items():
+        kind = TABLES[name]
+        lines += [f"## {kind.title}", ""]
+        heads = [*kind.key, *(f"{column} ({number.unit})" for column, number in kind.numbers.items())]
+        lines += ["| " + " | ".join(heads) + " |", "|---" * len(kind.key) + "|---:" * len(kind.numbers) + "|"]
+        for row in table["rows"]:
+            cells = [_cell(row[column]) for column in (*kind.key, *kind.numbers)]
+            lines.append("| " + " | ".join(cells) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value).replace("|", "\\|")

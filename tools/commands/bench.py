@@ -1,0 +1,174 @@
+"""``arcade-torch bench NAME``, ``bench all`` and ``bench compare``."""
+
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from arcade_torch.tools.bench import registry
+from arcade_torch.tools.files import write_csv, write_json, write_text
+from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.tables import Table
+
+
+@dataclass
+class Bench:
+    """One benchmark and its options."""
+
+    name: str
+    options: Any
+    argv: tuple[str, ...] = ()
+
+    def run(self) -> int:
+        """Measure, print, save."""
+        from arcade_torch.tools.keep_memory import keep_freed_memory
+
+        out, module = self.options.out, registry.module_of(self.name)
+        if out is not None and out.suffix not in (".csv", ".json"):
+            raise ValueError(f"--out must end in .csv or .json, got {out}")
+        keep_freed_memory()  # as in training
+        results = registry.gather(module.run(self.options, _tell), "one")
+        about = vars(self.options)
+        results["machine"] |= {name: about[name] for name in ("env", "device", "note") if name in about}
+        for name, table in results["tables"].items():
+            _show(registry.TABLES[name].title, table["rows"])
+        print(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
+        if out is not None and not hasattr(module, "KEEPS_ITS_FILE"):
+            for path in _save(out, results):
+                print(path)
+        return 0
+
+    def resume_hint(self) -> str:
+        """What an interruption left."""
+        kept = hasattr(registry.module_of(self.name), "KEEPS_ITS_FILE")
+        return f"finished rows are in {self.options.out}; the same command goes on" if kept else "nothing was kept"
+
+
+@dataclass
+class BenchAll:
+    """Every benchmark into one file with machine, versions and commit, and a page of its tables.
+
+    arcade-torch bench compare says what became of an older file.
+
+    Example: arcade-torch bench all --size quick --out results/bench.json --page results/bench.md
+    """
+
+    size: Literal["tiny", "quick", "full"] = "quick"
+    """How much: tiny takes half a minute and proves nothing, quick about ten minutes, full an hour or more."""
+    benches: tuple[str, ...] = ()
+    """Which of envs, train, memory, recall; all by default."""
+    out: Path = Path("results/bench.json")
+    """The file; overwritten."""
+    page: Path | None = None
+    """Markdown page of the tables; beside the file by default."""
+    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+    def run(self) -> int:
+        """Measure and save."""
+        from arcade_torch.tools.keep_memory import keep_freed_memory
+
+        if self.out.suffix != ".json":
+            raise ValueError(f"--out must end in .json, got {self.out}")
+        keep_freed_memory()
+        results = registry.bench_all(self.size, self.benches, _tell)
+        print(write_json(self.out, results))
+        print(write_text(self.page or self.out.with_suffix(".md"), registry.page(results)))
+        return 0
+
+
+@dataclass
+class BenchCompare:
+    """What became better or worse between two JSON files of bench, number by number; exit code 1 if something is worse.
+
+    Example: arcade-torch bench compare results/bench.json runs/bench.json --tolerance 0.2
+    """
+
+    old: tyro.conf.Positional[Path]
+    """The file to compare with."""
+    new: tyro.conf.Positional[Path]
+    """The file to judge."""
+    tolerance: float = 0.2
+    """Share by which a number may be worse; machines that are not quiet need more."""
+    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+    def run(self) -> int:
+        """Compare and print."""
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"--tolerance must lie between 0 and 1, got {self.tolerance}")
+        old, new = registry.read_results(self.old), registry.read_results(self.new)
+        differs = [
+            f"{name} {old['machine'].get(name)} and {new['machine'].get(name)}"
+            for name in ("processor", "cores", "jax_device", "torch_threads")
+            if old["machine"].get(name) != new["machine"].get(name)
+        ]
+        if differs:
+            print(f"not the same machine: {', '.join(differs)}")
+        changes = registry.compare(old, new)
+        count = Counter(change.verdict(self.tolerance) for change in changes)
+        for verdict in ("worse", "missing", "better", "new"):
+            for change in changes:
+                if change.verdict(self.tolerance) == verdict:
+                    print(f"{verdict}: {change.line()}")
+        print(", ".join(f"{count[name]} {name}" for name in ("same", "worse", "better", "missing", "new")))
+        return 1 if count["worse"] else 0
+
+
+COMMAND = Bench
+_OTHERS: dict[str, Any] = {"all": BenchAll, "compare": BenchCompare}
+
+
+def parse(words: Sequence[str], prog: str) -> Any:
+    """Read the options of one benchmark.
+
+    Args:
+        words: the options; what comes before the first flag are the memory models.
+        prog: the command, ``arcade-torch bench NAME``.
+
+    Raises:
+        ValueError: an option is unknown or malformed.
+    """
+    name = prog.split()[-1]
+    if name in _OTHERS:
+        return parse_options(_OTHERS[name], words, prog)
+    kind = registry.module_of(name).Options
+    first = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
+    if first and name in ("memory", "recall"):
+        words = ["--memories", *words]
+    return Bench(name, parse_options(kind, words, prog))
+
+
+def _tell(text: str) -> None:
+    print(f"measuring {text}", file=sys.stderr, flush=True)
+
+
+def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
+    """One JSON file, or a CSV file a table that repeats in every row what is known of the machine."""
+    if out.suffix == ".json":
+        return [write_json(out, results)]
+    paths = []
+    for name, table in results["tables"].items():
+        path = out if len(results["tables"]) == 1 else out.with_name(f"{out.stem}_{name}.csv")
+        rows = [{**row, **results["machine"]} for row in table["rows"]]
+        paths.append(write_csv(path, rows, list(rows[0])))
+    return paths
+
+
+def _show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print a table; one with few rows and many columns is turned round."""
+    columns, cells = list(rows[0]), [[_cell(value) for value in row.values()] for row in rows]
+    if len(columns) > 12 and len(rows) < 12:
+        columns, cells = (
+            ["", *(" ".join(row[:3]) for row in cells)],
+            [list(line) for line in zip(columns, *cells, strict=True)],
+        )
+    Table(title, columns, cells).show()
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value)

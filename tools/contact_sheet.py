@@ -1,0 +1,96 @@
+"""Pictures of games pixel by pixel: all of them at both sizes, or some moments of one, always both twins."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from arcade_torch.tools.files import write_bytes
+from arcade_torch.tools.optional import need
+
+Picture = npt.NDArray[np.uint8]
+Moment = Callable[[], tuple[Picture, Picture]]
+GAP = 8
+PAPER = 255
+
+
+def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> tuple[Picture, Picture]:
+    """Both twins of one moment in the middle of a game, played by the scripted player that sees the state."""
+    from arcade_torch.envs_jax import make
+
+    *_, last = _walk(id, obs_size, seed, min(steps, make(id, obs_size=obs_size).max_steps // 4))
+    return last()
+
+
+def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Picture:
+    """Some moments of one episode side by side, the MDP twin above the POMDP twin."""
+    if not steps or steps[0] < 0 or any(a >= b for a, b in pairwise(steps)):
+        raise ValueError(f"steps must be whole numbers that rise from 0 or more, got {list(steps)}")
+    moments = list(_walk(id, obs_size, seed, steps[-1]))
+    if len(moments) <= steps[-1]:
+        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay below")
+    columns = [np.concatenate(_spaced(moments[step](), 0)) for step in steps]
+    return np.concatenate(_spaced(columns, 1), 1)
+
+
+def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
+    """What draws both twins of each state of an episode, from the first to that after `steps` or before the end."""
+    import jax
+
+    from arcade_torch.envs_jax import BatchedGame, env_keys, make
+    from arcade_torch.envs_jax.oracles import make_oracle
+
+    game = make(id, obs_size=obs_size)
+    batched, player = BatchedGame(game), make_oracle(game)
+
+    def draw(batch: Any) -> tuple[Picture, Picture]:
+        twins = (batched.render(batch._replace(partial=np.array([hides]))) for hides in (False, True))
+        full, hidden = (np.asarray(frames)[0] for frames in twins)
+        return full, hidden
+
+    batch = batched.init(env_keys(seed, 1), np.zeros(1, bool))
+    yield partial(draw, batch)
+    for step in range(steps):
+        action = player.act(jax.tree.map(np.asarray, batch.state), np.array([step == 0]))
+        batch, outcome = batched.step(batch, action.astype(np.int32))
+        if outcome.done[0]:
+            return
+        yield partial(draw, batch)
+
+
+def _spaced(pictures: Sequence[Picture], axis: int) -> list[Picture]:
+    """The pictures with a gap between each two along an axis."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, PAPER, np.uint8)
+    return [part for picture in pictures for part in (gap, picture)][1:]
+
+
+def sheet(ids: Sequence[str], columns: int = 2) -> Picture:
+    """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
+    cells = []
+    for id in ids:
+        frames = [frame for size in (256, 128) for frame in scene(id, size)]
+        cell = np.full((256 + GAP, sum(f.shape[1] + GAP for f in frames), 3), PAPER, np.uint8)
+        x = 0
+        for frame in frames:
+            cell[: frame.shape[0], x : x + frame.shape[1]] = frame
+            x += frame.shape[1] + GAP
+        cells.append(cell)
+    cells += [np.full_like(cells[0], PAPER)] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[first : first + columns], 1) for first in range(0, len(cells), columns)]
+    return np.concatenate(rows)
+
+
+def write_png(picture: Picture, path: Path) -> Path:
+    """Write a picture as PNG, atomically and without loss."""
+    import io
+
+    image: Any = need("PIL.Image").fromarray(picture)
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG", optimize=True)
+    return write_bytes(path, buffer.getvalue())

@@ -1,0 +1,166 @@
+"""What random play and the scripted players earn in a game: the yardstick of tables and reports."""
+
+import math
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
+
+PLAYERS = ("random", "state", "frames")
+"""Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
+
+BEGIN, END = "<!-- baselines -->", "<!-- end of baselines -->"
+EPISODES = 256
+"""Of each player, for the reference lines of a report."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What one player earned in one game.
+
+    Attributes:
+        id: the game.
+        player: one of `PLAYERS`.
+        episodes: how many were played.
+        mean: mean undiscounted return.
+        half_width: of the 95 % interval around it (normal approximation).
+        steps: mean length of an episode.
+        seconds: what it took, compilation included.
+    """
+
+    id: str
+    player: str
+    episodes: int
+    mean: float
+    half_width: float
+    steps: float
+    seconds: float
+
+
+def measure(
+    id: str,
+    player: str,
+    episodes: int = EPISODES,
+    seconds: float = math.inf,
+    *,
+    seed: int = 0,
+    block: int = 250,
+    rules: str = "default",
+    **options: Any,
+) -> Baseline:
+    """Let one player play one game.
+
+    Args:
+        id: the game.
+        player: one of `PLAYERS`.
+        episodes: how many at most.
+        seconds: after this time no further block of episodes is begun.
+        seed: of the episodes.
+        block: episodes side by side.
+        rules: of the game.
+        **options: of the game.
+
+    Raises:
+        ValueError: unknown game or player, or the game has no such oracle.
+    """
+    from arcade_torch.envs_jax import make
+    from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
+
+    if player not in PLAYERS:
+        raise ValueError(f"player is {player!r}, allowed: {', '.join(PLAYERS)}")
+    started, game = time.monotonic(), make(id, rules=rules, **options)
+    who = RandomPlayer(seed) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
+    played = play(game, who, episodes, seed, frames=player == "frames", block=min(episodes, block), seconds=seconds)
+    returns = played.returns.astype(np.float64)
+    spread = float(returns.std(ddof=1)) if returns.size > 1 else math.nan
+    return Baseline(
+        game.id,
+        player,
+        returns.size,
+        round(float(returns.mean()), 5),
+        round(1.96 * spread / math.sqrt(returns.size), 5),
+        round(float(played.lengths.mean()), 5),
+        round(time.monotonic() - started, 1),
+    )
+
+
+def references(
+    game: str, folder: Path, rules: str = "default", options: Mapping[str, Any] | None = None, episodes: int = EPISODES
+) -> dict[str, Baseline]:
+    """What the players earn under the rules and options of a study, kept in ``folder/references-GAME-RULES.json``.
+
+    Args:
+        game: environment id.
+        folder: where the file goes.
+        rules: of the game.
+        options: of the game.
+        episodes: of each player.
+
+    Returns:
+        player -> result; a game without an oracle lacks that player.
+    """
+    file = folder / f"references-{game}-{rules}.json"
+    how: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
+    try:
+        kept = read_json(file)
+        if kept["how"] == how:
+            return {row["player"]: Baseline(**row) for row in kept["players"]}
+    except (FileNotFoundError, ValueError, KeyError, TypeError):
+        pass  # there is none, or it is damaged or older: it is made anew
+    found = {}
+    for player in PLAYERS:
+        try:
+            found[player] = measure(game, player, episodes, block=EPISODES, rules=rules, **how["options"])
+        except ValueError:
+            if player == "random":
+                raise
+    write_json(file, {"how": how, "players": [asdict(row) for row in found.values()]})
+    return found
+
+
+def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
+    """Every player in every game, one row after another; rows that ``out`` holds already are not measured again."""
+    known = {(row.id, row.player): row for row in read_baselines(out)} if out.exists() else {}
+    for id in ids:
+        for player in PLAYERS:
+            if (id, player) not in known:
+                known[id, player] = measure(id, player, episodes, seconds)
+                write_csv(out, map(asdict, known.values()), [field.name for field in fields(Baseline)])
+            yield known[id, player]
+
+
+def read_baselines(path: Path) -> list[Baseline]:
+    """The rows of a file that `measure_all` has written."""
+    numbers = ("mean", "half_width", "steps", "seconds")
+    try:
+        return [
+            Baseline(row["id"], row["player"], int(row["episodes"]), *(float(row[name]) for name in numbers))
+            for row in read_csv(path)
+        ]
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path} is no table of baselines ({error}); choose another --out") from None
+
+
+def markdown(rows: Iterable[Baseline]) -> str:
+    """The rows as a Markdown table, one line a game."""
+    from arcade_torch.envs_jax import make
+
+    games: dict[str, dict[str, Baseline]] = {}
+    for row in rows:
+        games.setdefault(row.id, {})[row.player] = row
+    lines = [
+        "| id | random | state oracle | frames oracle | highest | steps: random, state, frames | episodes |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for id, by_player in games.items():
+        found = [by_player.get(player) for player in PLAYERS]
+        returns = " | ".join(f"{r.mean:.3f} ± {r.half_width:.3f}" if r else "" for r in found)
+        steps = ", ".join(f"{r.steps:.0f}" if r else "" for r in found)
+        count = ", ".join(dict.fromkeys(f"{r.episodes}" for r in found if r))
+        lines.append(f"| `{id}` | {returns} | {make(id).return_range[1]:.4g} | {steps} | {count} |")
+    return "\n".join(lines)
