@@ -44,6 +44,19 @@ def test_the_loop_replays_every_window_as_it_was_acted() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
+def test_pqn_learns_on_torchrls_collector() -> None:
+    assert len((EXAMPLES / "pqn_torchrl.py").read_text(encoding="utf-8").splitlines()) <= 120
+    script = example("pqn_torchrl")
+    assert -1 <= script.main(frames=2 * script.NUM_ENVS * script.NUM_STEPS) <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_pqn_with_a_memory_reads_the_sign() -> None:
+    assert example("pqn_torchrl").main() > 0.8
+
+
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("theirs", [False, True], ids=["ours", "theirs"])
 def test_one_line_makes_our_environment_instead_of_theirs(theirs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if theirs:

@@ -99,6 +99,7 @@ def files_in(wheel: Path) -> set[str]:
 
 def test_the_wheel_holds_every_source_file_and_nothing_else(wheel: Path, source: Path) -> None:
     wanted = {path.relative_to(source).as_posix() for path in (source / "arcade_torch").glob("*.py")}
+    wanted |= {path.relative_to(source).as_posix() for path in (source / "arcade_torch" / "gym").glob("*.py")}
     wanted.add("arcade_torch/py.typed")
     for folder in LINKED:
         wanted |= {f"arcade_torch/{path.relative_to(source).as_posix()}" for path in (source / folder).rglob("*.py")}

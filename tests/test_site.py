@@ -18,7 +18,7 @@ import pytest
 from arcade_torch.envs_jax import probe_ids, registered_ids
 from arcade_torch.envs_jax.registry import option_names
 from arcade_torch.models import make_memory, memory_names
-from arcade_torch.tools.sheet import strip
+from arcade_torch.tools.contact_sheet import strip
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -144,7 +144,9 @@ def strips() -> list[object]:
     """The command that drew the picture of each game's page, as the page says it."""
     found = []
     for page in sorted((DOCS / "games").glob("*.md")):
-        words = shlex.split(re.search(r"^arcade-torch sheet (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)[1])  # type: ignore[index]
+        words = shlex.split(
+            re.search(r"^arcade-torch list sheet (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)[1]
+        )  # type: ignore[index]
         mark = [] if page.stem == "signpost" else [pytest.mark.slow]
         found.append(pytest.param(words, page.stem, marks=mark, id=page.stem))
     return found

@@ -101,7 +101,7 @@ def recall(name: str) -> str:
 def cost(name: str) -> str:
     """Parameters, state and arithmetic of one cell, counted while the site is built."""
     from arcade_torch.models import make_memory
-    from arcade_torch.models.networks import PRESETS
+    from arcade_torch.models.presets import PRESETS
     from arcade_torch.tools.bench.memories import memory_cost
 
     lines = [

@@ -70,4 +70,4 @@ for name, density in found.items():
 # Two cautions. A gradient is what a *small* change would do: a sign that decides everything can have a small one. And
 # the last action is an input too, but no pixel, so what is remembered through it does not show here.
 #
-# For whole studies: `arcade-torch recall-density RUNS ...` and `arcade-torch figure recall-density --runs STUDY`.
+# For whole studies: `arcade-torch analyze recall-density STUDY` (or run folders).

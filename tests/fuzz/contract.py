@@ -18,7 +18,7 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, settings
 
-from arcade_torch.tools.cli import BAD_INPUT
+from arcade_torch.tools.errors import BAD_INPUT
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = tuple(str(ROOT / name) + os.sep for name in ("arcade_torch", "envs_jax", "models", "agents", "tools"))

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 # Nobody's arguments can hold a zero byte, and lone surrogates stand for bytes that are no text.
 WORDS = tuple(name for name in NAMES if "\x00" not in name)
-CHEAP = ("list", "sheet", "report", "evaluate", "analyze gap-bias", "figure", "play", "record", "study")
+CHEAP = ("list", "report", "evaluate", "analyze gap-bias", "figure returns", "play", "record", "study")
 COSTLY = tuple(name for name in cli.COMMANDS if name not in CHEAP)
 
 

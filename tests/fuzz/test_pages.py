@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 
-from arcade_torch.tools.bench.results import compare, page, read_results
-from arcade_torch.tools.figures.registry import Request, make_figure
-from arcade_torch.tools.figures.runs import find_runs
+from arcade_torch.tools.bench.registry import compare, page, read_results
+from arcade_torch.tools.figures.registry import make_figure
 from arcade_torch.tools.reports.build import report
+from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.folder import StudyFolder
 from tests.fuzz.contract import attempt, content, fuzz
 from tests.fuzz.hostile import NAMES, json_bytes, mutated, mutated_value, seeds
 from tests.fuzz.test_runs import _repair, _rewrite_json
 from tests.tools.fabricated import small_study, write_study
-from tests.tools.test_bench_results import RESULTS
+from tests.tools.test_bench_registry import RESULTS
 
 pytestmark = pytest.mark.slow
 
@@ -140,7 +140,7 @@ def test_runs_for_a_figure_are_found_or_refused(study: StudyFolder, seed: int) -
 
         def look() -> None:
             for found in find_runs([study.root]).runs:
-                found.score("eval_final"), found.game, found.twin, found.agent, found.seed
+                found.value("eval_final"), found.game, found.twin, found.key, found.seed
 
         attempt("figure: finding runs", look)
     finally:
@@ -163,8 +163,7 @@ def test_hostile_names_are_drawn_as_they_are(
                 values["config"]["memory"] = evil
             config.write_text(json.dumps(values))
         out = tmp_path_factory.mktemp("drawn")
-        request = Request(runs=(study.root,), out=out)
-        attempt("figure: hostile names", lambda: make_figure("gap-bias", request))
+        attempt("figure: hostile names", lambda: make_figure("gap-bias", runs=(study.root,), out=out))
     finally:
         _repair(study.root, before)
 

@@ -13,14 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.agents import TrainConfig, load, preset, train
-from arcade_torch.agents.checkpoint import list_checkpoints, load_checkpoint, load_latest
-from arcade_torch.agents.files import CsvLog, checksum
-from arcade_torch.agents.loop import go_on_from
-from arcade_torch.agents.plain import to_plain
-from arcade_torch.agents.run_folder import METRIC_COLUMNS, RunFolder
-from arcade_torch.agents.trainer import Trainer
+from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_checkpoint, load_latest
+from arcade_torch.agents.runs.files import CsvLog, checksum
+from arcade_torch.agents.runs.folder import METRIC_COLUMNS, RunFolder
+from arcade_torch.agents.training import Trainer
 from tests.fuzz.contract import attempt, content, fuzz, unchanged
-from tests.fuzz.hostile import NAMES, OBJECTS, anything, json_bytes, mutated, mutated_value, nested, plain, seeds
+from tests.fuzz.hostile import NAMES, anything, json_bytes, mutated, mutated_value, seeds
 
 pytestmark = pytest.mark.slow
 
@@ -155,7 +153,7 @@ def test_a_forged_trainers_state_is_taken_or_refused(run: Path, trainer: Trainer
         with unchanged(run):
             attempt(
                 "resume: checkpoint",
-                lambda: load_latest(run / "checkpoints", CONFIG, use=lambda found: go_on_from(trainer, found)),
+                lambda: load_latest(run / "checkpoints", CONFIG, use=trainer.load),
             )
     finally:
         _repair(run, before)
@@ -223,12 +221,6 @@ CHANGES = st.dictionaries(st.sampled_from(tuple(CONFIG.to_dict())), anything, ma
 @given(PRESETS, CHANGES)
 def test_a_preset_takes_changes_or_refuses_them(name: str, changes: dict[str, Any]) -> None:
     attempt("preset", lambda: preset(name, **changes))
-
-
-@fuzz(1_500)
-@given(st.one_of(plain, st.sampled_from(OBJECTS), st.builds(nested, st.integers(1, 200))))
-def test_state_is_made_plain_or_refused(value: Any) -> None:
-    attempt("to_plain", lambda: to_plain(value))
 
 
 @fuzz(1_000)

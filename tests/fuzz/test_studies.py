@@ -1,4 +1,4 @@
-"""Studies: files with every field mutated, folders, locks and the queue."""
+"""Studies: files with every field mutated, folders."""
 
 import json
 import os
@@ -9,12 +9,10 @@ from typing import Any
 import pytest
 from hypothesis import given
 
-from arcade_torch.agents.lease import Lease
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
-from arcade_torch.tools.studies.queue import RunQueue
 from tests.fuzz.contract import attempt, content, fuzz
-from tests.fuzz.hostile import NAMES, NUMBERS, json_bytes, mutated, mutated_value, seeds
+from tests.fuzz.hostile import NAMES, NUMBERS, mutated, mutated_value, seeds
 from tests.fuzz.test_runs import _repair, _rewrite_json
 from tests.tools.fabricated import small_study, write_study
 
@@ -119,61 +117,6 @@ def test_a_damaged_studys_folder_gives_results_or_refuses(study: StudyFolder, se
                 file.write_bytes(mutated(file.read_bytes(), rng.randrange(2**32)))
         attempt("study folder", lambda: study.write_results(study.load()))
         attempt("study folder, claimed again", lambda: study.claim(small_study()))
-    finally:
-        _repair(study.root, before)
-
-
-@fuzz(3_000)
-@given(seed=seeds)
-def test_a_damaged_lock_is_free_held_or_waited_for(study: StudyFolder, seed: int) -> None:
-    rng = random.Random(seed)
-    lock = study.root / "locks" / "fuzz"
-    lock.mkdir(parents=True, exist_ok=True)
-    record = {"name": "here", "pid": os.getpid(), "host": "elsewhere", "started": "1", "token": "x"}
-    for _ in range(rng.choice((1, 1, 2))):
-        name = rng.choice(("owner-000001.json", "owner-000002.json", "owner-999999.json", "owner-x.json", "other"))
-        data = json_bytes(mutated_value(record, rng.randrange(2**32)))
-        (lock / name).write_bytes(data if rng.random() < 0.6 else mutated(data, rng.randrange(2**32)))
-    lease = Lease(lock, timeout_s=0.0 if rng.random() < 0.5 else 60.0)
-
-    def look() -> None:
-        lease.held(), lease.owner()
-        if lease.try_take():
-            lease.confirm()
-            lease.release()
-
-    try:
-        attempt("lock", look)
-    finally:
-        for file in lock.iterdir() if lock.exists() else ():
-            file.unlink()
-
-
-@fuzz(300)
-@given(seed=seeds)
-def test_the_queue_goes_through_a_damaged_study(study: StudyFolder, seed: int) -> None:
-    rng = random.Random(seed)
-    what = small_study()
-    before = content(study.root)
-    try:
-        for run in what.runs():
-            for file in (study.run(run).path / "eval.json", study.run(run).path / "progress.json"):
-                if rng.random() < 0.5:
-                    _rewrite_json(file, rng)
-            if rng.random() < 0.3:
-                failure = study.root / "failures" / f"{run.name}.json"
-                failure.parent.mkdir(exist_ok=True)
-                failure.write_bytes(mutated(b'{"error": "disk full"}', rng.randrange(2**32)))
-
-        def drain() -> None:
-            queue = RunQueue(what, study, lambda name, error: None)
-            for _ in range(6):
-                job = next(queue, None)
-                if job is not None:
-                    queue.done(job.name)
-            queue.close()
-
-        attempt("queue", drain)
     finally:
         _repair(study.root, before)
 
