@@ -165,8 +165,8 @@ class DQN(Learner):
             data = self.loss.prepare(drawn)
             frames_per_step = config.frames_per_update / config.grad_steps_per_update
             for _ in range(config.epochs):
-                for rows in self.minibatches(len(data)):
-                    self.gradient_step(data[rows], frames)
+                for minibatch in self.minibatches(data):
+                    self.gradient_step(minibatch, frames)
                     frames += frames_per_step
         return self.take_metrics() | {"replay_frames": self.replay.frames}
 

@@ -1,7 +1,7 @@
 """What PQN, PPO and DQN share: their numbers, the optimiser, the order of minibatches, the check for NaN."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args, get_origin, get_type_hints
@@ -242,10 +242,11 @@ class Learner:
         self._step = CudaGraphModule(self._plain_step) if training.cuda_graphs else self._plain_step
         self._metrics: list[TensorDictBase] = []
 
-    def minibatches(self, num_rows: int) -> Iterator[Tensor]:
-        """Row numbers int64 of the minibatches of one pass, in random order; they are on the device."""
-        order = torch.randperm(num_rows, generator=self.training.generator)
-        yield from order.to(self.training.device, non_blocking=True).chunk(self.config.minibatches)
+    def minibatches(self, data: TensorDictBase) -> tuple[TensorDictBase, ...]:
+        """The minibatches of one pass over the rows of ``data``, in random order."""
+        order = torch.randperm(len(data), generator=self.training.generator)
+        shuffled = data[order.to(self.training.device, non_blocking=True)]
+        return shuffled.split(-(-len(data) // self.config.minibatches))  # type: ignore[no-any-return]
 
     def gradient_step(self, minibatch: TensorDictBase, frames: float) -> None:
         """One step of the optimiser, with the step size after ``frames`` frames."""
@@ -327,8 +328,47 @@ def make_optimizer(
     cuda = bool(parameters) and parameters[0].device.type == "cuda"
     lr = torch.tensor(learning_rate, device=parameters[0].device) if cuda else learning_rate
     if kind == "adam":
-        return torch.optim.Adam(parameters, lr=lr, betas=(0.9, 0.999), eps=1e-5, foreach=True, capturable=cuda)
-    return torch.optim.RAdam(parameters, lr=lr, betas=(0.9, 0.999), eps=1e-8, foreach=True, capturable=cuda)
+        return torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True, capturable=cuda)
+    if not cuda:
+        return FusedRAdam(parameters, lr=learning_rate)
+    return torch.optim.RAdam(parameters, lr=lr, foreach=True, capturable=True)
+
+
+class FusedRAdam(torch.optim.Adam):
+    """RAdam by the fused kernel of Adam, one pass over the weights on a CPU instead of fourteen.
+
+    RAdam's step is Adam's with a step size that depends on the number of steps alone; in the first five steps, where
+    the variance is not yet known, it is one along the mean of the gradients.
+
+    Args:
+        parameters: float32 or float64, on a CPU.
+        lr: step size.
+
+    Source: Liu et al., arXiv 1908.03265, algorithm 2; equal to ``torch.optim.RAdam``.
+    """
+
+    def __init__(self, parameters: list[nn.Parameter], lr: float) -> None:
+        super().__init__(parameters, lr=lr, fused=True)
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        """One step, as :meth:`torch.optim.Optimizer.step`."""
+        group = self.param_groups[0]
+        lr, eps, (beta1, beta2) = group["lr"], group["eps"], group["betas"]
+        t = 1 + int(next((state["step"] for state in self.state.values()), 0))
+        largest, correction = 2 / (1 - beta2) - 1, 1 - beta2**t
+        length = largest - 2 * t * beta2**t / correction  # of the average of squares: what the variance is known by
+        factor = (length - 4) * (length - 2) * largest / ((largest - 4) * (largest - 2) * length)
+        group["lr"] = lr * math.sqrt(factor) if length > 5 else 0.0  # 0: only the averages move
+        group["eps"] = eps / math.sqrt(correction)
+        try:
+            result = super().step(closure)
+        finally:
+            group["lr"], group["eps"] = lr, eps
+        if length <= 5:
+            for parameter, state in self.state.items():
+                parameter.add_(state["exp_avg"], alpha=-lr / (1 - beta1**t))
+        return result
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:

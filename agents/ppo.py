@@ -304,8 +304,8 @@ class PPO(Learner):
         data = self.loss.value_estimator(batch)
         frames_per_step = config.frames_per_update / config.grad_steps_per_update
         for _ in range(config.epochs):
-            for rows in self.minibatches(len(data)):
-                self.gradient_step(data[rows], frames)
+            for minibatch in self.minibatches(data):
+                self.gradient_step(minibatch, frames)
                 frames += frames_per_step
         metrics = self.take_metrics()
         return metrics | {

@@ -196,11 +196,9 @@ class PQNLoss(LossModule):
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
         position, action = data["position"][:, :steps], data["action"][:, :steps]
-        q_here = q.gather(1, position.unsqueeze(-1).expand(-1, -1, q.shape[-1]))
-        if action.shape == q_here.shape:
-            chosen = (q_here * action).sum(-1)
-        else:
-            chosen = q_here.gather(-1, action.reshape(*position.shape, 1)).squeeze(-1)
+        if action.ndim == 3 and action.shape[-1] == q.shape[-1]:  # one-hot
+            action = action.int().argmax(-1)
+        chosen = q.flatten(1).gather(1, position * q.shape[-1] + action.reshape(position.shape))
         target = self.targets(data, q.detach(), steps)
         error = chosen - target
         loss = self._reduce_loss(0.5 * error.square(), tensordict, weights=self._maybe_get_priority_weight(tensordict))
@@ -226,12 +224,16 @@ class PQNLoss(LossModule):
             float [B, S].
         """
         next_value = self.next_values(data, q, steps)
-        keys = self.tensor_keys
+        keys, estimator = self.tensor_keys, self.value_estimator
+        if isinstance(estimator, QLambdaEstimator):  # the same without a TensorDict in between
+            parts = data["reward"], data["terminated"], data["cut"]
+            reward, terminated, cut = (part[:, :steps] for part in parts)
+            return estimator.returns(reward, next_value, terminated, cut & ~terminated)
         outcome = TensorDict(batch_size=next_value.shape)
         outcome["next", keys.reward] = data["reward"][:, :steps, None]
         outcome["next", keys.terminated] = data["terminated"][:, :steps, None]
         outcome["next", keys.done] = (data["cut"] | data["terminated"])[:, :steps, None]
-        estimate: Callable[..., Tensor] = self.value_estimator.value_estimate
+        estimate: Callable[..., Tensor] = estimator.value_estimate
         return estimate(outcome, next_value=next_value.unsqueeze(-1)).squeeze(-1)
 
     @torch.no_grad()
@@ -279,7 +281,7 @@ class PQN(Learner):
         data, config = self.loss.prepare(batch), self.config
         frames_per_step = config.frames_per_update / config.grad_steps_per_update
         for _ in range(config.epochs):
-            for rows in self.minibatches(len(data)):
-                self.gradient_step(data[rows], frames)
+            for minibatch in self.minibatches(data):
+                self.gradient_step(minibatch, frames)
                 frames += frames_per_step
         return self.take_metrics()

@@ -186,4 +186,8 @@ class QLambdaEstimator(TDLambdaEstimator):
             tensordict.get(("next", key)).squeeze(-1) for key in (keys.reward, keys.done, keys.terminated)
         )
         value = next_value.squeeze(-1)
-        return q_lambda_return(reward, value, terminated, done & ~terminated, *self._floats).unsqueeze(-1)
+        return self.returns(reward, value, terminated, done & ~terminated).unsqueeze(-1)
+
+    def returns(self, reward: Tensor, next_value: Tensor, terminated: Tensor, truncated: Tensor) -> Tensor:
+        """:func:`q_lambda_return` with the numbers of this estimator; everything [B, T]."""
+        return q_lambda_return(reward, next_value, terminated, truncated, *self._floats)

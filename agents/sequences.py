@@ -147,7 +147,10 @@ def unroll(network: TensorDictModuleBase, inputs: NetworkInputs, sequences: Tens
             for t in range(burn_in.shape[1]):
                 step = burn_in[:, t].copy() if state is None else burn_in[:, t].copy().update(state)
                 state = network(step).get("next").select(*inputs.state_keys)
-    extended = sequences["extended"].copy()
+    extended = sequences["extended"]
+    if isinstance(network, MemoryNetwork) and network.store == "sequence" and network.out_key == key:
+        return network.read_sequences(extended, state)  # the same without a TensorDict in between
+    extended = extended.copy()
     if state is not None:
         _begin_with(extended, state, inputs)
     with set_recurrent_mode(True):

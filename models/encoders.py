@@ -233,7 +233,8 @@ class SmallEncoder(Encoder):
 
     def features(self, frames: Tensor) -> Tensor:
         """[N, 32, 32, 3] -> [N, 128]."""
-        x = torch.sub(frames, self.mean.permute(1, 2, 0)).mul_(self.inverse_rms)  # colours stay last, as they arrive
-        x = F.leaky_relu_(self.conv1(x.permute(0, 3, 1, 2)))
+        x = torch.sub(frames, self.mean.permute(1, 2, 0)).permute(0, 3, 1, 2)  # colours stay last, as they arrive
+        weight = self.conv1.weight * self.inverse_rms  # rather the weights than every pixel
+        x = F.leaky_relu_(F.conv2d(x, weight, self.conv1.bias, stride=4))
         x = F.leaky_relu_(self.conv2(x))
         return F.leaky_relu_(F.layer_norm(self.linear(x).flatten(1), (self.feature_size,)))

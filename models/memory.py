@@ -323,12 +323,12 @@ class MemoryModule(TensorDictModuleBase):
         rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
         x, is_init = x.reshape(*rows, x.shape[-1]), is_init.reshape(rows)
         if not recurrent:
-            y, after = self.memory(x.unsqueeze(1), self._stored_state(tensordict, rows), is_init.unsqueeze(1))
+            y, after = self.memory(x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1))
         elif self.store == "step":
-            y, after = replay(self.memory, x, self._stored_state(tensordict, rows), is_init)
+            y, after = replay(self.memory, x, self.stored_state(tensordict, rows), is_init)
         else:
             firsts = tensordict.select(*self._state_keys, strict=False)[..., 0]
-            y, after = self.memory(x, self._stored_state(firsts, rows[:1]), is_init)
+            y, after = self.memory(x, self.stored_state(firsts, rows[:1]), is_init)
         if not (recurrent and self.store == "sequence"):
             for key, leaf in self._state_keys.items():
                 value = after.get(leaf)
@@ -359,7 +359,7 @@ class MemoryModule(TensorDictModuleBase):
             tensordict.set(key, value.unsqueeze(axis).expand(shape))
         return tensordict
 
-    def _stored_state(self, tensordict: TensorDictBase, rows: tuple[int, ...]) -> TensorDict:
+    def stored_state(self, tensordict: TensorDictBase, rows: tuple[int, ...]) -> TensorDict:
         """The states at hand, with the batch shape of ``rows``; where one is missing, the initial state."""
         initial = None
         state = TensorDict({}, batch_size=rows)

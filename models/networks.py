@@ -252,6 +252,23 @@ class MemoryNetwork(TensorDictModuleBase):
         y, state = self.block(features, state, is_init)
         return self.head(y), state
 
+    def read_sequences(self, sequences: TensorDictBase, state: TensorDictBase | None = None) -> Tensor:
+        """What :meth:`forward` writes in recurrent mode, for sequences whose first states stand apart.
+
+        Args:
+            sequences: [B, T] with the observations of ``in_keys``.
+            state: [B] with ``state_keys``, before index 0; None: every sequence begins with an episode.
+
+        Returns:
+            float [B, T, A].
+        """
+        recurrent = self._recurrent[0]
+        is_init = recurrent.start_flags(sequences)
+        last_action = sequences["last_action"] if self.num_actions else is_init
+        rows = sequences.shape[:1]
+        first = recurrent.stored_state(TensorDict({}, rows) if state is None else state, rows)
+        return self.remember(self.encode(sequences["pixels"]), last_action, is_init, first)[0]
+
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""
         return self.block.initial_state(batch_size)  # type: ignore[operator]

@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import nn
 
 from arcade_torch.agents.learner import linear, make_optimizer, set_learning_rate
 from arcade_torch.agents.metrics import EpisodeStats, confidence_95, ewm, paper_score
@@ -122,3 +123,22 @@ def test_ppo_has_plain_adam_with_a_larger_epsilon():
     x.grad = torch.ones(1)
     optimizer.step()
     assert x.item() == pytest.approx(-0.1 / (1 + 1e-5), rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_fused_radam_is_torchs_radam(dtype):
+    torch.manual_seed(0)
+    weights = [torch.randn(7, 5, 3, 3, dtype=dtype).to(memory_format=torch.channels_last), torch.randn(9, dtype=dtype)]
+    ours, theirs = ([nn.Parameter(x.clone()) for x in weights] for _ in range(2))
+    fused, plain = make_optimizer(ours, 1e-2), torch.optim.RAdam(theirs, lr=1e-2)
+    tolerance = {"rtol": 1e-5, "atol": 1e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-13}
+    for step in range(40):  # the first five know no variance yet
+        set_learning_rate(fused, 1e-2 / (1 + step))
+        set_learning_rate(plain, 1e-2 / (1 + step))
+        for x, y in zip(ours, theirs, strict=True):
+            x.grad = torch.randn_like(x) * 10 ** float(torch.randn(()))
+            y.grad = x.grad.clone()
+        fused.step()
+        plain.step()
+        for x, y in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(x, y, **tolerance)
