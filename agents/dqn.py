@@ -1,7 +1,6 @@
 """DQN with a replay of sequences; with memory or without."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -9,62 +8,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training
+from arcade_torch.agents.config import DQNConfig, TimeLimit
+from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.replay import SequenceReplay
 from arcade_torch.agents.sequences import unroll
-
-
-@dataclass(frozen=True)
-class DQNConfig(QConfig):
-    """Numbers of DQN, schedules in fractions of the run's frames.
-
-    The paper gives none; these are those of its published code, except for ``targets`` and ``time_limit``. An item of
-    the replay is one environment's window: ``overlap + num_steps`` frames with their actions, rewards and flags, the
-    recurrent state before the first of them, and the final frames that targets need.
-
-    Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski et al., "Recurrent
-    experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
-    """
-
-    GROUP: ClassVar[str] = "dqn"
-
-    lam: float = 0.0
-    """Lambda of the return, in [0, 1]; 0 is the one-step target."""
-    replay_frames: int = 132_000
-    """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
-    of all environments."""
-    batch_sequences: int = 32
-    """Sequences drawn in an update, without repetition; all epochs go over the same."""
-    learning_starts: int = 32
-    """Sequences that must be stored before learning starts."""
-    burn_in: int = 0
-    """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
-    targets: Literal["recompute", "stored"] = "recompute"
-    """``"recompute"``: from present Q-values, whenever a sequence is used; ``"stored"`` (the published form): once,
-    when it was collected."""
-    target_every: int = 0
-    """Updates between copies of the network to a target network, which then gives the next values; 0 for none."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._each(("batch_sequences", "learning_starts"), lambda x: x >= 1, "a whole number >= 1")
-        self._each(("burn_in", "target_every"), lambda x: x >= 0, "a whole number >= 0")
-        self._split_evenly("batch_sequences", self.batch_sequences)
-        length = self.overlap + self.num_steps
-        self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
-        stored = self.targets == "stored"
-        self._require(not (stored and self.target_every), "target_every", "0 with targets='stored'")
-        held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
-        frames = -(-needed // self.num_envs) * self.num_envs * length
-        self._require(held >= needed, "replay_frames", f">= {frames}, room for {needed} sequences of {length} frames")
-
-    @property
-    def replay_sequences(self) -> int:
-        """Capacity in sequences: whole windows of all environments."""
-        length = self.overlap + self.num_steps
-        return self.replay_frames // (self.num_envs * length) * self.num_envs
 
 
 class DQNLoss(PQNLoss):
@@ -163,11 +111,10 @@ class DQN(Learner):
             self.updates += 1
             drawn = self.replay.sample(config.batch_sequences, self.training.generator, self.training.device)
             data = self.loss.prepare(drawn)
-            frames_per_step = config.frames_per_update / config.grad_steps_per_update
             for _ in range(config.epochs):
                 for rows in self.minibatches(len(data)):
                     self.gradient_step(data[rows], frames)
-                    frames += frames_per_step
+                    frames += self.frames_per_step
         return self.take_metrics() | {"replay_frames": self.replay.frames}
 
     @torch.no_grad()

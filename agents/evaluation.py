@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import arcade_torch
-from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
-from arcade_torch.agents.learner import require
+from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
 from arcade_torch.agents.metrics import confidence_95
 
 

@@ -1,7 +1,6 @@
 """PPO with a memory in actor and critic, or in neither."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -12,42 +11,64 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
-from arcade_torch.agents.learner import Learner, LearnerConfig, TimeLimit, Training
-from arcade_torch.agents.returns import gae
-from arcade_torch.agents.sequences import NetworkInputs, as_steps, insert_final_observations, standard_names, unroll
+from arcade_torch.agents.config import PPOConfig, TimeLimit
+from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.sequences import (
+    NetworkInputs,
+    as_steps,
+    insert_final_observations,
+    solve_backward,
+    standard_names,
+    unroll,
+    values_and_traces,
+)
 
 
-@dataclass(frozen=True)
-class PPOConfig(LearnerConfig):
-    """Numbers of PPO; the defaults are the paper's, the step size falls over the whole run.
+def gae(
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit = "bootstrap",
+) -> Tensor:
+    r"""Generalised advantage estimate over a window.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
+    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``, in which the value
+    ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a termination::
+
+        A[t] = delta[t]                                at an end and at the last step
+        A[t] = delta[t] + gamma * lam * A[t + 1]       elsewhere
+
+    ``A + v`` is the value target: the lambda-return, where ``v'[t]`` and ``v[t + 1]`` agree.
+
+    Args:
+        reward: float [B, T], reward received on leaving observation ``t``.
+        value: float [B, T], value of observation ``t``.
+        next_value: float [B, T], value of the true next observation.
+        terminated: bool [B, T]; this and what follows as in :func:`q_lambda_return`.
+        truncated: bool [B, T].
+        gamma: discount per step, in [0, 1].
+        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the value.
+        time_limit: ``"bootstrap"`` or ``"terminal"``.
+
+    Returns:
+        float [B, T], in the dtype of ``reward``.
+
+    Raises:
+        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+
+    Source: Schulman et al., arXiv 1506.02438, equation 16.
+
+    Example:
+        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> gae(ones, ones, ones, no, no, gamma=0.5, lam=1.0)
+        tensor([[0.8750, 0.7500, 0.5000]])
     """
-
-    GROUP: ClassVar[str] = "ppo"
-
-    learning_rate: float = 1e-4
-    """Step size at the start."""
-    learning_rate_end: float = 1e-10
-    """Step size after the decay."""
-    lr_decay_fraction: float = 1.0
-    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
-    lam: float = 0.95
-    """Lambda of the generalised advantage estimate, in [0, 1]."""
-    clip: float = 0.2
-    """How far the probability ratio, and the value, may move in an update before the gradient stops."""
-    entropy_coeff: float = 0.01
-    """Weight of the entropy bonus."""
-    critic_coeff: float = 0.5
-    """Weight of the value loss (half the mean squared error)."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._split_evenly("num_envs", self.num_envs)
-        self._each(("lam",), lambda x: 0.0 <= x <= 1.0, "a number in [0, 1]")
-        self._each(("clip",), lambda x: x > 0.0, "a number > 0")
-        self._each(("entropy_coeff", "critic_coeff"), lambda x: x >= 0.0, "a number >= 0")
+    after, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit, value)
+    return solve_backward(reward + gamma * after - value, trace)
 
 
 class SequenceGAE(nn.Module):
@@ -302,11 +323,10 @@ class PPO(Learner):
         self.check_rewards(batch)
         config = self.config
         data = self.loss.value_estimator(batch)
-        frames_per_step = config.frames_per_update / config.grad_steps_per_update
         for _ in range(config.epochs):
             for rows in self.minibatches(len(data)):
                 self.gradient_step(data[rows], frames)
-                frames += frames_per_step
+                frames += self.frames_per_step
         metrics = self.take_metrics()
         return metrics | {
             "policy_loss": metrics["loss_objective"],

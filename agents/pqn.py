@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -11,38 +11,114 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.value import TDLambdaEstimator, ValueEstimatorBase
 
-from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training, require
-from arcade_torch.agents.returns import QLambdaEstimator
-from arcade_torch.agents.sequences import NetworkInputs, insert_final_observations, standard_names, unroll
+from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit, require
+from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.sequences import (
+    Key,
+    NetworkInputs,
+    insert_final_observations,
+    solve_backward,
+    standard_names,
+    unroll,
+    values_and_traces,
+)
 
-Key = str | tuple[str, ...]
-Bootstrap = Literal["next", "last"]
+
+def q_lambda_return(
+    reward: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit = "bootstrap",
+) -> Tensor:
+    r"""Backward Q(lambda) return over a window.
+
+    With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done = terminated | truncated``::
+
+        G[t] = r[t] + gamma * m[t]                                          at a truncation and at the last step
+        G[t] = r[t]                                                         at a termination
+        G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
+
+    Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by doubling, in
+    ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over time.
+
+    Args:
+        reward: float [B, T], reward received on leaving observation ``t``.
+        next_value: float [B, T], ``max_a Q`` of the true next observation: the final frame where an episode was cut.
+            Values at terminated steps are ignored, whatever they are.
+        terminated: bool [B, T], the task's own end; removes the bootstrap and cuts the recursion.
+        truncated: bool [B, T], cut by a limit; keeps the bootstrap, cuts the recursion.
+        gamma: discount per step, in [0, 1].
+        lam: trace decay in [0, 1]; 0 gives the one-step target, 1 the Monte-Carlo return.
+        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a termination, as the published
+            implementation does.
+
+    Returns:
+        float [B, T], in the dtype of ``reward``.
+
+    Raises:
+        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+
+    Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade (ICML 2026), PQN.
+
+    Example:
+        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> q_lambda_return(ones, ones, no, no, gamma=0.5, lam=1.0)
+        tensor([[1.8750, 1.7500, 1.5000]])
+    """
+    value, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit)
+    return solve_backward(reward + (gamma - trace) * value, trace)
 
 
-@dataclass(frozen=True)
-class PQNConfig(QConfig):
-    """Numbers of PQN; the defaults are the paper's, schedules in fractions of the run's frames.
+class QLambdaEstimator(TDLambdaEstimator):
+    """:func:`q_lambda_return` as a value estimator of TorchRL; needs no data-dependent shape, so a CUDA graph can hold
+    it.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
+    TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which waits for the device.
+
+    Args:
+        gamma: discount per step, in [0, 1].
+        lmbda: trace decay, in [0, 1].
+        value_network: see ``TDLambdaEstimator``; not needed where ``next_value`` is given, as our losses do.
+        **kwargs: see ``TDLambdaEstimator``.
     """
 
-    GROUP: ClassVar[str] = "pqn"
+    def __init__(self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any) -> None:
+        super().__init__(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
+        self._floats = float(gamma), float(lmbda)
 
-    bootstrap: Bootstrap = "next"
-    """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
-    last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None = None,
+        next_value: Tensor | None = None,
+        time_dim: int | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Lambda-returns of a batch [B, T].
 
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._split_evenly("num_envs", self.num_envs)
-        self._require(
-            self.bootstrap == "next" or self.overlap >= 1,
-            "overlap",
-            ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap of the next",
+        Args:
+            tensordict: with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
+            target_params: parameters of the value network, if it is to give the next values.
+            next_value: float [B, T, 1], values of the true next observations.
+            time_dim: ignored, time is the second dimension.
+            **kwargs: handed to the value network.
+
+        Returns:
+            float [B, T, 1].
+        """
+        keys = self.tensor_keys
+        if next_value is None:
+            next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
+        reward, done, terminated = (
+            tensordict.get(("next", key)).squeeze(-1) for key in (keys.reward, keys.done, keys.terminated)
         )
+        value = next_value.squeeze(-1)
+        return q_lambda_return(reward, value, terminated, done & ~terminated, *self._floats).unsqueeze(-1)
 
 
 class PQNLoss(LossModule):
@@ -276,10 +352,9 @@ class PQN(Learner):
             NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
         """
         self.check_rewards(batch)
-        data, config = self.loss.prepare(batch), self.config
-        frames_per_step = config.frames_per_update / config.grad_steps_per_update
-        for _ in range(config.epochs):
+        data = self.loss.prepare(batch)
+        for _ in range(self.config.epochs):
             for rows in self.minibatches(len(data)):
                 self.gradient_step(data[rows], frames)
-                frames += frames_per_step
+                frames += self.frames_per_step
         return self.take_metrics()

@@ -1,4 +1,5 @@
-"""Final observations put where they belong, so that one pass over a window gives the value of every next observation.
+"""Final observations put where they belong, so that one pass over a window gives the value of every next observation;
+and what returns and advantages share: the sum backward over a window.
 
 A memory model reads a window of ``L`` observations once. The value of the observation *after* a step is then the value
 at the following position, but for two cases: where an episode ended, the next position holds the first observation of
@@ -15,10 +16,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
+from arcade_torch.agents.config import TimeLimit
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
-
-__all__ = ["NetworkInputs", "as_steps", "insert_final_observations", "standard_names", "unroll"]
 
 Key = str | tuple[str, ...]
 
@@ -100,7 +100,10 @@ def insert_final_observations(
     if "is_init" in roots:
         roots["is_init"] = is_init.unsqueeze(-1)
     out["extended"] = TensorDict(
-        {key: _reorder(roots[key][:, burn_in:], places(key), order) for key in inputs.observation_keys},
+        {
+            key: _rows(torch.cat((roots[key][:, burn_in:], places(key)), dim=1), order)
+            for key in inputs.observation_keys
+        },
         batch_size=order.shape,
     )
     if burn_in:
@@ -175,6 +178,44 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     return out
 
 
+def values_and_traces(
+    reward: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit,
+    *others: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """What steps may count on: the next value, 0 behind a termination, and gamma times lambda, 0 at every end and at
+    the last step; both [B, T]. Arguments that do not fit are refused, ``others`` for their shape alone.
+    """
+    shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
+    if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
+        raise ValueError(f"rewards, values, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
+    if not 0.0 <= gamma <= 1.0 or not 0.0 <= lam <= 1.0:
+        raise ValueError(f"gamma and lambda must lie in [0, 1]; got gamma={gamma}, lambda={lam}")
+    if time_limit not in ("bootstrap", "terminal"):
+        raise ValueError(f"time_limit must be 'bootstrap' or 'terminal'; got {time_limit!r}")
+    done = terminated | truncated
+    trace = torch.full_like(reward, gamma * lam).masked_fill(done, 0.0)
+    trace[:, -1] = 0.0
+    return next_value.masked_fill(done if time_limit == "terminal" else terminated, 0.0), trace
+
+
+def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
+    """Solve ``G[t] = base[t] + trace[t] * G[t + 1]`` with ``G[T] = 0`` by doubling."""
+    steps, reach = base.shape[1], 1
+    while reach < steps:
+        head = torch.addcmul(base[:, :-reach], trace[:, : steps - reach], base[:, reach:])
+        base = torch.cat((head, base[:, -reach:]), dim=1)
+        if 2 * reach < steps:
+            trace = trace[:, : trace.shape[1] - reach] * trace[:, reach:]
+        reach *= 2
+    return base
+
+
 def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
     """Let sequences [B, T] begin with states [B]; states that are stored later on stay, others are zero."""
     for key in inputs.state_keys:
@@ -245,19 +286,13 @@ def _add_state(
     if not inputs.reads_first_state_only:
         for key, value in per_step.items():
             nothing = value.new_zeros(len(value), order.shape[1] - value.shape[1] + burn_in, *value.shape[2:])
-            out["extended"][key] = _reorder(value[:, burn_in:], nothing, order)
-
-
-def _reorder(roots: Tensor, places: Tensor, order: Tensor) -> Tensor:
-    """Roots [N, L, ...] and places [N, K, ...] in the order of time, [N, L + K, ...]."""
-    both = torch.cat((roots, places), dim=1)
-    row = torch.arange(len(order), device=order.device).unsqueeze(1) * order.shape[1]
-    return both.flatten(0, 1).index_select(0, (order + row).flatten()).view_as(both)
+            out["extended"][key] = _rows(torch.cat((value[:, burn_in:], nothing), 1), order)
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:
     """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
-    return value[torch.arange(len(index), device=index.device).unsqueeze(1), index]
+    first = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
+    return value.flatten(0, 1).index_select(0, (index + first).flatten()).unflatten(0, index.shape)
 
 
 def _get(batch: TensorDictBase, key: Key) -> Tensor:

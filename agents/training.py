@@ -19,7 +19,7 @@ import arcade_torch
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env, twins
-from arcade_torch.agents.learner import Learner, NonFiniteError, Training
+from arcade_torch.agents.learner import Learner, NonFiniteError, Training, epsilon_at
 from arcade_torch.agents.metrics import EpisodeStats, paper_score
 from arcade_torch.agents.policy import Agent, build_network, compile_network, make_policy
 from arcade_torch.agents.ppo import PPO
@@ -114,7 +114,7 @@ class Trainer:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
         """
         began, numbers = time.perf_counter(), self.config.learner
-        epsilon = numbers.epsilon_at(self.frames, self.total_frames)
+        epsilon = epsilon_at(numbers, self.frames, self.total_frames)
         for explorer in self.explorers:
             explorer.eps.fill_(epsilon)
         batch = self.collector.collect()
