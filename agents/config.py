@@ -84,7 +84,7 @@ class Checked:
             object.__setattr__(self, item.name, value)
 
     def _require(self, condition: bool, name: str, allowed: str) -> None:
-        require(condition, self.GROUP + name, getattr(self, name), allowed)
+        require(condition, self.GROUP + name, getattr(self, name, None), allowed)
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,7 @@ class LearnerConfig(Checked):
         rows = getattr(self, self.SPLIT)
         allowed = f"a divisor of {self.SPLIT}={rows}: whole sequences go into a minibatch"
         self._require(rows % self.minibatches == 0, "minibatches", allowed)
+        self._require(self.steps_before <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}")
 
     @property
     def steps_before(self) -> int:
@@ -159,10 +160,6 @@ class QConfig(LearnerConfig):
     """The same after the decay."""
     exploration_fraction: Fraction = 0.4
     """Fraction of the run's frames over which it falls linearly."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._require(self.overlap <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}")
 
 
 @dataclass(frozen=True)

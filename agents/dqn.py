@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from arcade_torch.agents.config import DQNConfig, TimeLimit
+from arcade_torch.agents.config import DQNConfig
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.replay import SequenceReplay
@@ -18,31 +18,9 @@ from arcade_torch.agents.sequences import unroll
 class DQNLoss(PQNLoss):
     """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without a target network.
 
-    Keys as in :class:`PQNLoss`; where a batch holds ``stored_target`` [N, L], these are the targets. Sequences start
-    from the recurrent state that was stored when they were acted; :meth:`make_value_estimator` takes ``lmbda`` 0 by
-    default.
-
-    Args:
-        value_network: writes ``action_value``.
-        time_limit: see :class:`PQNLoss`.
-        delay_value: keep target parameters.
-        burn_in: see :class:`DQNConfig`.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        functional: see :class:`PQNLoss`.
+    Keys and arguments as in :class:`PQNLoss`, but ``lmbda`` of :meth:`make_value_estimator` is 0 by default; where a
+    batch holds ``stored_target`` [N, L], these are the targets. Sequences start from their stored state.
     """
-
-    def __init__(
-        self,
-        value_network: TensorDictModuleBase,
-        *,
-        time_limit: TimeLimit = "bootstrap",
-        delay_value: bool = False,
-        burn_in: int = 0,
-        reduction: str = "mean",
-        functional: bool = True,
-    ) -> None:
-        options = {"delay_value": delay_value, "burn_in": burn_in, "reduction": reduction, "functional": functional}
-        super().__init__(value_network, time_limit=time_limit, **options)  # type: ignore[arg-type]
 
     def _default_value_estimator(self) -> None:
         self.make_value_estimator(lmbda=0.0)
@@ -61,45 +39,31 @@ class DQNLoss(PQNLoss):
 
 
 class DQN(Learner):
-    """Puts every window into the replay and learns from sequences drawn from it.
-
-    Args:
-        network: writes ``action_value``.
-        config: numbers of DQN.
-        training: of the run.
-    """
+    """Puts every window into the replay and learns from sequences drawn from it; arguments as in :class:`PQN`."""
 
     config: DQNConfig
     loss: DQNLoss
 
     def __init__(self, network: TensorDictModuleBase, config: DQNConfig, training: Training) -> None:
         has_target = config.target_every > 0
-        options = {"time_limit": config.time_limit, "delay_value": has_target, "functional": has_target}
-        loss = DQNLoss(network, burn_in=config.burn_in, **options)  # type: ignore[arg-type]
+        loss = DQNLoss(
+            network,
+            time_limit=config.time_limit,
+            burn_in=config.burn_in,
+            delay_value=has_target,
+            functional=has_target,
+        )
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
         if has_target:
-            HardUpdate(
-                loss
-            )  # says that the target parameters are taken care of; it leaves out buffers, so see update()
+            HardUpdate(loss)  # the target parameters are taken care of; it leaves out buffers, so see update()
         self.labels = DQNLoss(network, time_limit=config.time_limit, functional=False)
         self.labels.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         self.replay = SequenceReplay(config.replay_sequences, training.folder)
         self.updates = 0
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
-        """Store one window and learn from sequences drawn from the replay, once it holds enough.
-
-        Args:
-            batch: sequences [num_envs] of ``ArcadeCollector.collect()``.
-            frames: frames counted before this window.
-
-        Returns:
-            Means over the gradient steps, by column of ``metrics.csv``.
-
-        Raises:
-            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
-        """
+        """Store one window and learn from sequences drawn from the replay, once it holds enough; see `PQN.update`."""
         self.check_rewards(batch)
         config = self.config
         if config.targets == "stored":
@@ -130,17 +94,12 @@ class DQN(Learner):
         """Everything but the trained weights and the generator that the coming updates depend on."""
         more: dict[str, Any] = {"replay": self.replay.state_dict(), "learner_updates": self.updates}
         if self.config.target_every:
-            more["target"] = {
-                key: value.clone() for key, value in self.loss.target_value_network_params.flatten_keys(".").items()
-            }
+            target = self.loss.target_value_network_params.flatten_keys(".")
+            more["target"] = {key: value.clone() for key, value in target.items()}
         return super().state_dict() | more
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go back to a saved moment.
-
-        Raises:
-            CheckpointError: a file of the replay is missing or damaged.
-        """
+        """Go back to a saved moment; a ``CheckpointError`` if a file of the replay is missing or damaged."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)
         self.updates = state["learner_updates"]

@@ -20,12 +20,7 @@ class NonFiniteError(RuntimeError):
 
 
 def linear(start: float, end: float, frames: float, duration: float) -> float:
-    """Straight line from ``start`` at frame 0 to ``end`` at frame ``duration``, constant afterwards.
-
-    Example:
-        >>> [linear(1.0, 0.0, frames, 100) for frames in (0, 25, 100, 1000)]
-        [1.0, 0.75, 0.0, 0.0]
-    """
+    """Straight line from ``start`` at frame 0 to ``end`` at frame ``duration``, constant afterwards."""
     return end if frames >= duration else start + (end - start) * (frames / duration)
 
 
@@ -43,21 +38,13 @@ def epsilon_at(config: LearnerConfig, frames: float, total_frames: int) -> float
 
 @dataclass(frozen=True)
 class Training:
-    """What a learner needs to know of its run.
+    """What a learner needs to know of its run."""
 
-    Attributes:
-        total_frames: of the run, for the schedules.
-        generator: CPU generator of the minibatch order.
-        device: of the networks.
-        folder: where a replay may write; None for a temporary folder.
-        cuda_graphs: capture the gradient step as one CUDA graph.
-    """
-
-    total_frames: int
-    generator: torch.Generator
-    device: torch.device
-    folder: Path | None = None
-    cuda_graphs: bool = False
+    total_frames: int  # for the schedules
+    generator: torch.Generator  # CPU generator of the minibatch order
+    device: torch.device  # of the networks
+    folder: Path | None = None  # where a replay may write; None for a temporary folder
+    cuda_graphs: bool = False  # capture the gradient step as one CUDA graph
 
 
 class Learner:
@@ -126,17 +113,9 @@ class Learner:
         return means | {"lr": self.learning_rate}
 
     def check_rewards(self, batch: TensorDictBase) -> None:
-        """Refuse rewards that are not finite before anything is learned from them.
-
-        Raises:
-            NonFiniteError: one is not.
-        """
+        """Refuse rewards that are not finite, before anything is learned from them, by a NonFiniteError."""
         if not bool(batch.get(("next", "reward")).isfinite().all()):
             raise NonFiniteError("a reward is not finite")
-
-    def update(self, batch: TensorDictBase, frames: float) -> Any:
-        """Learn from one window of sequences; see the algorithms."""
-        raise NotImplementedError
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the trained weights and the generator that the coming updates depend on."""

@@ -20,7 +20,6 @@ from arcade_torch.agents.sequences import (
     NetworkInputs,
     insert_final_observations,
     solve_backward,
-    standard_names,
     unroll,
     values_and_traces,
 )
@@ -75,8 +74,7 @@ def q_lambda_return(
 
 
 class QLambdaEstimator(TDLambdaEstimator):
-    """:func:`q_lambda_return` as a value estimator of TorchRL; needs no data-dependent shape, so a CUDA graph can hold
-    it.
+    """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its shapes are static.
 
     TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which waits for the device.
 
@@ -99,26 +97,18 @@ class QLambdaEstimator(TDLambdaEstimator):
         time_dim: int | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """Lambda-returns of a batch [B, T].
+        """Lambda-returns, float [B, T, 1], of a batch with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
 
-        Args:
-            tensordict: with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
-            target_params: parameters of the value network, if it is to give the next values.
-            next_value: float [B, T, 1], values of the true next observations.
-            time_dim: ignored, time is the second dimension.
-            **kwargs: handed to the value network.
-
-        Returns:
-            float [B, T, 1].
+        The values of the true next observations are ``next_value`` [B, T, 1], or what the value network makes of the
+        batch, with ``target_params`` and ``kwargs``. Time is the second dimension, whatever ``time_dim``.
         """
         keys = self.tensor_keys
         if next_value is None:
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
-        reward, done, terminated = (
-            tensordict.get(("next", key)).squeeze(-1) for key in (keys.reward, keys.done, keys.terminated)
-        )
-        value = next_value.squeeze(-1)
-        return q_lambda_return(reward, value, terminated, done & ~terminated, *self._floats).unsqueeze(-1)
+        names = (keys.reward, keys.done, keys.terminated)
+        reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
+        truncated = done & ~terminated
+        return q_lambda_return(reward, next_value.squeeze(-1), terminated, truncated, *self._floats).unsqueeze(-1)
 
 
 class PQNLoss(LossModule):
@@ -133,16 +123,13 @@ class PQNLoss(LossModule):
     Out keys: ``loss`` (with gradient), ``q_mean``, ``target_mean``, ``td_error`` (mean absolute), detached.
 
     Args:
-        value_network: any TensorDict module that writes ``action_value`` [*, A]: a ``MemoryNetwork``, a ``QValueActor``
-            ...
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a
-            termination.
+        value_network: any TensorDict module that writes ``action_value`` [*, A], a ``QValueActor`` for one.
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
         bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its value.
         delay_value: keep target parameters, which then give the next values (``SoftUpdate``, ``HardUpdate``).
         burn_in: first steps of a sequence that only bring the memory up to date, without gradient.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        functional: hold the parameters apart from the network, as TorchRL's losses do; False uses the network as it is,
-            which saves a few hundred microseconds a call.
+        functional: hold the parameters apart from the network, as TorchRL's losses do; False saves that time.
 
     Source: Gallici et al., arXiv 2407.04811; POPGym Arcade (ICML 2026).
     """
@@ -243,15 +230,11 @@ class PQNLoss(LossModule):
     def prepare(self, batch: TensorDictBase) -> TensorDict:
         """Insert the final observations, once for all minibatches; rows of the result are what :meth:`forward` takes.
 
-        Args:
-            batch: sequences [N], or a stock batch [B, T].
-
-        Returns:
-            TensorDict [N], see :func:`insert_final_observations`.
+        See :func:`insert_final_observations`, whose result [N] it is.
         """
         names = ("action", "is_init", "reward", "terminated", "truncated")
-        batch = standard_names(batch, **{name: getattr(self.tensor_keys, name) for name in names})
-        return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in)
+        keys = {name: getattr(self.tensor_keys, name) for name in names}
+        return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in, **keys)
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -291,16 +274,7 @@ class PQNLoss(LossModule):
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
-        """Returns of the first ``steps`` steps.
-
-        Args:
-            data: from :meth:`prepare`.
-            q: float [B, L + K, A], Q-values along the extended sequence.
-            steps: S.
-
-        Returns:
-            float [B, S].
-        """
+        """Returns of the first S ``steps`` of what :meth:`prepare` gave, from Q-values [B, L + K, A]: float [B, S]."""
         next_value = self.next_values(data, q, steps)
         keys = self.tensor_keys
         outcome = TensorDict(batch_size=next_value.shape)
