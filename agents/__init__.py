@@ -12,17 +12,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _MODULES = {
-    "config": ("TrainConfig",),
-    "dqn": ("DQN", "DQNConfig", "DQNLoss"),
+    "config": ("DQNConfig", "PPOConfig", "PQNConfig", "TrainConfig"),
+    "dqn": ("DQN", "DQNLoss"),
     "evaluation": ("EvalResult", "evaluate", "held_out_seed"),
     "learner": ("NonFiniteError",),
     "metrics": ("paper_score",),
     "policy": ("Agent", "build_network", "load", "make_policy"),
-    "ppo": ("PPO", "PPOConfig", "PPOLoss", "SequenceGAE", "make_actor"),
-    "pqn": ("PQN", "PQNConfig", "PQNLoss"),
+    "ppo": ("PPO", "PPOLoss", "SequenceGAE", "gae", "make_actor"),
+    "pqn": ("PQN", "PQNLoss", "QLambdaEstimator", "q_lambda_return"),
     "presets": ("preset", "preset_names"),
     "replay": ("SequenceReplay",),
-    "returns": ("QLambdaEstimator", "gae", "q_lambda_return"),
     "runs.files": ("CheckpointError",),
     "runs.folder": ("RunFolderError",),
     "training": ("TrainResult", "Trainer", "train"),
@@ -30,54 +29,25 @@ _MODULES = {
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
 
 if TYPE_CHECKING:
-    from arcade_torch.agents.config import TrainConfig
-    from arcade_torch.agents.dqn import DQN, DQNConfig, DQNLoss
+    from arcade_torch.agents.config import DQNConfig, PPOConfig, PQNConfig, TrainConfig
+    from arcade_torch.agents.dqn import DQN, DQNLoss
     from arcade_torch.agents.evaluation import EvalResult, evaluate, held_out_seed
     from arcade_torch.agents.learner import NonFiniteError
     from arcade_torch.agents.metrics import paper_score
     from arcade_torch.agents.policy import Agent, build_network, load, make_policy
-    from arcade_torch.agents.ppo import PPO, PPOConfig, PPOLoss, SequenceGAE, make_actor
-    from arcade_torch.agents.pqn import PQN, PQNConfig, PQNLoss
+    from arcade_torch.agents.ppo import PPO, PPOLoss, SequenceGAE, gae, make_actor
+    from arcade_torch.agents.pqn import PQN, PQNLoss, QLambdaEstimator, q_lambda_return
     from arcade_torch.agents.presets import preset, preset_names
     from arcade_torch.agents.replay import SequenceReplay
-    from arcade_torch.agents.returns import QLambdaEstimator, gae, q_lambda_return
     from arcade_torch.agents.runs.files import CheckpointError
     from arcade_torch.agents.runs.folder import RunFolderError
     from arcade_torch.agents.training import Trainer, TrainResult, train
 
 __all__ = [
-    "DQN",
-    "PPO",
-    "PQN",
-    "Agent",
-    "CheckpointError",
-    "DQNConfig",
-    "DQNLoss",
-    "EvalResult",
-    "NonFiniteError",
-    "PPOConfig",
-    "PPOLoss",
-    "PQNConfig",
-    "PQNLoss",
-    "QLambdaEstimator",
-    "RunFolderError",
-    "SequenceGAE",
-    "SequenceReplay",
-    "TrainConfig",
-    "TrainResult",
-    "Trainer",
-    "build_network",
-    "evaluate",
-    "gae",
-    "held_out_seed",
-    "load",
-    "make_actor",
-    "make_policy",
-    "paper_score",
-    "preset",
-    "preset_names",
-    "q_lambda_return",
-    "train",
+    "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult", "NonFiniteError",
+    "PPOConfig", "PPOLoss", "PQNConfig", "PQNLoss", "QLambdaEstimator", "RunFolderError", "SequenceGAE",
+    "SequenceReplay", "TrainConfig", "TrainResult", "Trainer", "build_network", "evaluate", "gae", "held_out_seed",
+    "load", "make_actor", "make_policy", "paper_score", "preset", "preset_names", "q_lambda_return", "train",
 ]  # fmt: skip
 
 

@@ -1,20 +1,13 @@
-"""What a run is: one frozen dataclass, and its JSON form."""
+"""What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here imports torch."""
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
-
-from arcade_torch.agents.dqn import DQNConfig
-from arcade_torch.agents.learner import Checked, LearnerConfig, require
-from arcade_torch.agents.ppo import PPOConfig
-from arcade_torch.agents.pqn import PQNConfig
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
-GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
-"""The algorithms, and the class of the field with their numbers."""
 RENAMED = {
     "learning_rate_share": "lr_decay_fraction",
     "epsilon_share": "exploration_fraction",
@@ -25,6 +18,245 @@ RENAMED = {
 """Fields of version 0.1 and their names since 0.2; the old ones go in 0.3."""
 
 
+class Range(NamedTuple):
+    """Values that a field may hold: in words, and as a test."""
+
+    allowed: str
+    holds: Callable[[Any], bool]
+
+
+Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
+Count = Annotated[int, Range("a whole number >= 1", lambda x: x >= 1)]
+CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: x >= 0)]
+Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
+Positive = Annotated[float, Range("a number > 0", lambda x: x > 0.0)]
+PositiveOrZero = Annotated[float, Range("a number >= 0", lambda x: x >= 0.0)]
+Fraction = Annotated[float, Range("a number in [0, 1]", lambda x: 0.0 <= x <= 1.0)]
+Options = Mapping[str, Any]
+TimeLimit = Literal["bootstrap", "terminal"]
+Bootstrap = Literal["next", "last"]
+
+
+def require(condition: bool, name: str, value: Any, allowed: str) -> None:
+    """Unless a condition holds, refuse a value (ValueError) in one line that names it and says what is allowed."""
+    if not condition:
+        found = " ".join(line.strip() for line in repr(value).splitlines())
+        raise ValueError(f"{name} must be {allowed}; got {found}")
+
+
+def coerce(name: str, value: Any, kind: Any) -> Any:
+    """The value of a field, whole floats as ints; refused where its annotation, type or :class:`Range`, forbids it."""
+    if get_origin(kind) is Annotated:
+        kind, (allowed, holds) = get_args(kind)
+        value = coerce(name, value, kind)
+        require(holds(value), name, value, allowed)
+        return value
+    if get_origin(kind) is Literal:
+        choices = get_args(kind)
+        allowed = " or ".join(filter(None, (", ".join(map(repr, choices[:-1])), repr(choices[-1]))))
+        require(isinstance(value, str) and value in choices, name, value, allowed)
+        return value
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is int:
+        require(number and value == value // 1, name, value, "a whole number")
+        return int(value)
+    if kind is float:
+        require((number and abs(value) < 2.0**1000) or value != value, name, value, "a number")
+        return float(value)
+    if kind == Options:
+        require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
+        return dict(value)
+    words = {str: "a string", bool: "true or false"}
+    require(isinstance(value, kind), name, value, words.get(kind, f"a {kind.__name__}"))
+    return value
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A frozen dataclass whose fields are checked by their annotations, with one clear line for what does not fit."""
+
+    GROUP: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        kinds = get_type_hints(type(self), include_extras=True)
+        for item in dataclasses.fields(self):
+            value = coerce(self.GROUP + item.name, getattr(self, item.name), kinds[item.name])
+            object.__setattr__(self, item.name, value)
+
+    def _require(self, condition: bool, name: str, allowed: str) -> None:
+        require(condition, self.GROUP + name, getattr(self, name, None), allowed)
+
+
+@dataclass(frozen=True)
+class LearnerConfig(Checked):
+    """What PQN, PPO and DQN share; the defaults are the paper's, schedules in fractions of the run's frames.
+
+    A schedule over a fraction of the run keeps its shape when the run is shortened.
+    """
+
+    SPLIT: ClassVar[str] = "num_envs"  # the field with the number of sequences that an update goes over
+
+    num_envs: Count = 16
+    """Environments stepped together."""
+    num_steps: Count = 128
+    """New steps of each environment per update."""
+    epochs: Count = 4
+    """Passes over the data of an update."""
+    minibatches: Count = 16
+    """Parts a pass is split in, over sequences, never over time."""
+    gamma: Fraction = 0.99
+    """Discount per step."""
+    lam: Fraction = 0.95
+    """Lambda of the return (of PPO: of the generalised advantage estimate), in [0, 1]."""
+    learning_rate: Positive = 5e-5
+    """Step size at the start."""
+    learning_rate_end: PositiveOrZero = 5e-7
+    """Step size after the decay."""
+    lr_decay_fraction: Fraction = 0.1
+    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
+    max_grad_norm: Positive = 0.5
+    """Limit on the joint norm of the gradients."""
+    warmup_steps: CountOrZero = 0
+    """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
+    time_limit: TimeLimit = "bootstrap"
+    """``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a termination."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = getattr(self, self.SPLIT)
+        allowed = f"a divisor of {self.SPLIT}={rows}: whole sequences go into a minibatch"
+        self._require(rows % self.minibatches == 0, "minibatches", allowed)
+        self._require(self.steps_before <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}")
+
+    @property
+    def steps_before(self) -> int:
+        """Steps of the previous window that stand in front of the new ones."""
+        return int(getattr(self, "overlap", 0))
+
+    @property
+    def frames_per_update(self) -> int:
+        """New frames one update consumes."""
+        return self.num_envs * self.num_steps
+
+    @property
+    def grad_steps_per_update(self) -> int:
+        """Optimiser steps one update takes."""
+        return self.epochs * self.minibatches
+
+
+@dataclass(frozen=True)
+class QConfig(LearnerConfig):
+    """What the learners of Q-values share; at the paper's 20 M frames, the fractions 0.1 and 0.4 are its 2 M frames of
+    learning-rate decay and 8 M frames of exploration decay.
+    """
+
+    warmup_steps: CountOrZero = 132
+    """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
+    overlap: CountOrZero = 4
+    """Steps of the previous window repeated in front of the new ones; they take part in the loss again."""
+    epsilon_start: Fraction = 1.0
+    """Probability of a uniformly random action at the start."""
+    epsilon_end: Fraction = 0.05
+    """The same after the decay."""
+    exploration_fraction: Fraction = 0.4
+    """Fraction of the run's frames over which it falls linearly."""
+
+
+@dataclass(frozen=True)
+class PQNConfig(QConfig):
+    """Numbers of PQN; the defaults are the paper's, schedules in fractions of the run's frames.
+
+    Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
+    """
+
+    GROUP: ClassVar[str] = "pqn."
+
+    bootstrap: Bootstrap = "next"
+    """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
+    last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        allowed = ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap of the next"
+        self._require(self.bootstrap == "next" or self.overlap >= 1, "overlap", allowed)
+
+
+@dataclass(frozen=True)
+class PPOConfig(LearnerConfig):
+    """Numbers of PPO; the defaults are the paper's, the step size falls over the whole run.
+
+    Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
+    """
+
+    GROUP: ClassVar[str] = "ppo."
+
+    learning_rate: Positive = 1e-4
+    """Step size at the start."""
+    learning_rate_end: PositiveOrZero = 1e-10
+    """Step size after the decay."""
+    lr_decay_fraction: Fraction = 1.0
+    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
+    clip: Positive = 0.2
+    """How far the probability ratio, and the value, may move in an update before the gradient stops."""
+    entropy_coeff: PositiveOrZero = 0.01
+    """Weight of the entropy bonus."""
+    critic_coeff: PositiveOrZero = 0.5
+    """Weight of the value loss (half the mean squared error)."""
+
+
+@dataclass(frozen=True)
+class DQNConfig(QConfig):
+    """Numbers of DQN, schedules in fractions of the run's frames.
+
+    The paper gives none; these are those of its published code, except for ``targets`` and ``time_limit``. An item of
+    the replay is one environment's window: ``overlap + num_steps`` frames with their actions, rewards and flags, the
+    recurrent state before the first of them, and the final frames that targets need.
+
+    Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski et al., "Recurrent
+    experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
+    """
+
+    GROUP: ClassVar[str] = "dqn."
+    SPLIT: ClassVar[str] = "batch_sequences"
+
+    lam: Fraction = 0.0
+    """Lambda of the return, in [0, 1]; 0 is the one-step target."""
+    replay_frames: int = 132_000
+    """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
+    of all environments."""
+    batch_sequences: Count = 32
+    """Sequences drawn in an update, without repetition; all epochs go over the same."""
+    learning_starts: Count = 32
+    """Sequences that must be stored before learning starts."""
+    burn_in: CountOrZero = 0
+    """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
+    targets: Literal["recompute", "stored"] = "recompute"
+    """``"recompute"``: from present Q-values, whenever a sequence is used; ``"stored"`` (the published form): once,
+    when it was collected."""
+    target_every: CountOrZero = 0
+    """Updates between copies of the network to a target network, which then gives the next values; 0 for none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        length = self.overlap + self.num_steps
+        self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
+        stored = self.targets == "stored"
+        self._require(not (stored and self.target_every), "target_every", "0 with targets='stored'")
+        held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
+        frames = -(-needed // self.num_envs) * self.num_envs * length
+        self._require(held >= needed, "replay_frames", f">= {frames}, room for {needed} sequences of {length} frames")
+
+    @property
+    def replay_sequences(self) -> int:
+        """Capacity in sequences: whole windows of all environments."""
+        length = self.overlap + self.num_steps
+        return self.replay_frames // (self.num_envs * length) * self.num_envs
+
+
+GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
+"""The algorithms, and the class of the field with their numbers."""
+
+
 @dataclass(frozen=True)
 class TrainConfig(Checked):
     """Everything that decides a training run.
@@ -32,29 +264,29 @@ class TrainConfig(Checked):
     Counts of frames are environment steps summed over the environments: one environment, one action, one frame.
     """
 
-    env: str = "CartPoleEasy"
+    env: Text = "CartPoleEasy"
     """Game id, see ``arcade_torch.registered_ids()``; a run pins the version that a bare name means."""
     observability: Literal["full", "partial", "mixed"] = "full"
     """Which twin: ``"full"`` is the MDP, ``"partial"`` the POMDP, ``"mixed"`` half the environments each."""
-    obs_size: int = 128
+    obs_size: Count = 128
     """Height and width of the frames, pixels."""
     rules: Literal["default", "reference"] = "default"
     """Law of the games; ``"reference"`` is the one the published numbers were made with."""
-    env_options: Mapping[str, Any] = field(default_factory=dict)
+    env_options: Options = field(default_factory=dict)
     """Further options of the game."""
-    memory: str = "lru"
+    memory: Text = "lru"
     """Memory model, see ``arcade_torch.models.memory_names()``; ``"feedforward"``: the paper's network without any."""
-    network: str = "paper"
+    network: Text = "paper"
     """Network preset around the memory model: ``"paper"`` or ``"small"``."""
-    network_options: Mapping[str, Any] = field(default_factory=dict)
+    network_options: Options = field(default_factory=dict)
     """Further options of ``make_network``."""
     algorithm: Literal["pqn", "ppo", "dqn"] = "pqn"
     """Learner; its numbers are in the field of that name, those of the others are not looked at."""
     total_frames: int = 20_000_000
     """Frames of training; rounded down to whole updates."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of everything random in the run, in [0, 2**30)."""
-    device: str = "cpu"
+    device: Text = "cpu"
     """Torch device of the network and the learner."""
     amp: bool = False
     """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the rest stays float32.
@@ -65,13 +297,13 @@ class TrainConfig(Checked):
     cuda_graphs: bool = False
     """Replay acting, and every whole gradient step (loss, backward pass, clipping, optimiser), as one CUDA graph each,
     which saves launches; needs a CUDA device."""
-    threads: int = 0
+    threads: CountOrZero = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
-    eval_every: int = 1_000_000
+    eval_every: CountOrZero = 1_000_000
     """Frames between greedy evaluations; 0 evaluates only at the end."""
-    eval_episodes: int = 128
+    eval_episodes: Count = 128
     """Episodes of each evaluation, one in each of as many fresh environments."""
-    checkpoint_every: int = 500_000
+    checkpoint_every: CountOrZero = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""
     logger: Literal["none", "tensorboard", "wandb"] = "none"
     """Where the rows of ``metrics.csv`` and ``eval.csv`` go beside the files; needs the extra ``loggers``.
@@ -84,27 +316,16 @@ class TrainConfig(Checked):
     """Numbers of the DQN learner."""
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot work, one line each; names of games and models are checked when they are made."""
-        super().__post_init__()
-        for name in ("env", "memory", "network", "device"):
-            self._require(getattr(self, name) != "", name, "a non-empty string")
+        super().__post_init__()  # names of games and models are checked when they are made
         kind = self.device.partition(":")[0]
         self._require(kind in ("cpu", "cuda", "mps", "xpu"), "device", "a torch device such as 'cpu' or 'cuda:0'")
-        on_cuda = self.device.startswith("cuda") or not self.cuda_graphs
-        self._require(on_cuda, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device")
-        self._require(self.obs_size >= 1, "obs_size", "a number of pixels >= 1")
-        self._require(0 <= self.seed < SEED_LIMIT, "seed", f"in [0, {SEED_LIMIT})")
-        self._each(("threads", "eval_every", "checkpoint_every"), lambda x: x >= 0, "a whole number >= 0")
-        self._require(self.eval_episodes >= 1, "eval_episodes", "a whole number >= 1")
-        self._check_sizes()
-
-    def _check_sizes(self) -> None:
-        """Refuse numbers that do not fit those of the learner."""
-        envs, steps, per_update = self.learner.num_envs, self.learner.num_steps, self.learner.frames_per_update
-        allowed = f"at least one update of {envs} envs x {steps} steps = {per_update} frames"
-        self._require(self.total_frames >= per_update, "total_frames", allowed)
-        if self.observability == "mixed":
-            require(envs % 2 == 0, f"{self.algorithm}.num_envs", envs, "even with observability='mixed'")
+        graphs = kind == "cuda" or not self.cuda_graphs
+        self._require(graphs, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device")
+        envs, steps, frames = self.learner.num_envs, self.learner.num_steps, self.learner.frames_per_update
+        allowed = f"at least one update of {envs} envs x {steps} steps = {frames} frames"
+        self._require(self.total_frames >= frames, "total_frames", allowed)
+        even = envs % 2 == 0 or self.observability != "mixed"
+        require(even, f"{self.algorithm}.num_envs", envs, "even with observability='mixed'")
 
     @property
     def learner(self) -> LearnerConfig:
@@ -119,10 +340,7 @@ class TrainConfig(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, ready for JSON."""
-        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        plain.update({name: dataclasses.asdict(getattr(self, name)) for name in GROUPS})
-        plain.update(env_options=dict(self.env_options), network_options=dict(self.network_options))
-        return plain
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> "TrainConfig":
@@ -131,13 +349,9 @@ class TrainConfig(Checked):
         Raises:
             ValueError: a field is unknown, has the wrong type, or holds a value that is not allowed.
         """
-        require(isinstance(plain, Mapping), "a config", plain, "a table of fields")
-        values, groups = dict(plain), {}
-        for name, kind in GROUPS.items():
-            numbers = values.pop(name, {})
-            require(isinstance(numbers, Mapping), name, numbers, "a table of fields")
-            groups[name] = kind(**_checked(kind, numbers, f"{name}."))
-        return cls(**_checked(cls, values, ""), **groups)  # type: ignore[arg-type]
+        values = _fields_of(cls, plain, "")
+        groups = {name: kind(**_fields_of(kind, values.get(name, {}), f"{name}.")) for name, kind in GROUPS.items()}
+        return cls(**values | groups)
 
 
 def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
@@ -151,25 +365,23 @@ def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
     return [f"{n} ({mine.get(n)!r} != {theirs.get(n)!r})" for n in sorted(names) if mine.get(n) != theirs.get(n)]
 
 
-def _checked(cls: type, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     """Values for the fields of a dataclass, by today's names; unknown ones are refused."""
-    known = {f.name for f in dataclasses.fields(cls)}
-    for old in (set(values) - known) & set(RENAMED):
-        warnings.warn(
-            f"{prefix}{old} is called {RENAMED[old]} since 0.2; 0.3 drops the old name", FutureWarning, stacklevel=2
-        )
-    values = {name if name in known else RENAMED.get(name, name): value for name, value in values.items()}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise ValueError(f"unknown field {prefix + unknown[0]!r}; fields: {', '.join(sorted(known))}")
-    return values
+    require(isinstance(values, Mapping), prefix[:-1] or "a config", values, "a table of fields")
+    known, found = [item.name for item in dataclasses.fields(cls)], {}
+    for name, value in values.items():
+        new = name if name in known else RENAMED.get(name)
+        if new not in known:
+            raise ValueError(f"unknown field {prefix + str(name)!r}; fields: {', '.join(sorted(known))}")
+        if new != name:
+            said = f"{prefix}{name} is called {new} since 0.2; 0.3 drops the old name"
+            warnings.warn(said, FutureWarning, stacklevel=3)
+        found[new] = value
+    return found
 
 
 def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in plain.items():
-        if isinstance(value, Mapping):
-            flat |= _flatten(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
     return flat

@@ -1,7 +1,6 @@
 """DQN with a replay of sequences; with memory or without."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -9,92 +8,19 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training
+from arcade_torch.agents.config import DQNConfig
+from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.replay import SequenceReplay
 from arcade_torch.agents.sequences import unroll
 
 
-@dataclass(frozen=True)
-class DQNConfig(QConfig):
-    """Numbers of DQN, schedules in fractions of the run's frames.
-
-    The paper gives none; these are those of its published code, except for ``targets`` and ``time_limit``. An item of
-    the replay is one environment's window: ``overlap + num_steps`` frames with their actions, rewards and flags, the
-    recurrent state before the first of them, and the final frames that targets need.
-
-    Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski et al., "Recurrent
-    experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
-    """
-
-    GROUP: ClassVar[str] = "dqn"
-
-    lam: float = 0.0
-    """Lambda of the return, in [0, 1]; 0 is the one-step target."""
-    replay_frames: int = 132_000
-    """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
-    of all environments."""
-    batch_sequences: int = 32
-    """Sequences drawn in an update, without repetition; all epochs go over the same."""
-    learning_starts: int = 32
-    """Sequences that must be stored before learning starts."""
-    burn_in: int = 0
-    """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
-    targets: Literal["recompute", "stored"] = "recompute"
-    """``"recompute"``: from present Q-values, whenever a sequence is used; ``"stored"`` (the published form): once,
-    when it was collected."""
-    target_every: int = 0
-    """Updates between copies of the network to a target network, which then gives the next values; 0 for none."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._each(("batch_sequences", "learning_starts"), lambda x: x >= 1, "a whole number >= 1")
-        self._each(("burn_in", "target_every"), lambda x: x >= 0, "a whole number >= 0")
-        self._split_evenly("batch_sequences", self.batch_sequences)
-        length = self.overlap + self.num_steps
-        self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
-        stored = self.targets == "stored"
-        self._require(not (stored and self.target_every), "target_every", "0 with targets='stored'")
-        held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
-        frames = -(-needed // self.num_envs) * self.num_envs * length
-        self._require(held >= needed, "replay_frames", f">= {frames}, room for {needed} sequences of {length} frames")
-
-    @property
-    def replay_sequences(self) -> int:
-        """Capacity in sequences: whole windows of all environments."""
-        length = self.overlap + self.num_steps
-        return self.replay_frames // (self.num_envs * length) * self.num_envs
-
-
 class DQNLoss(PQNLoss):
     """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without a target network.
 
-    Keys as in :class:`PQNLoss`; where a batch holds ``stored_target`` [N, L], these are the targets. Sequences start
-    from the recurrent state that was stored when they were acted; :meth:`make_value_estimator` takes ``lmbda`` 0 by
-    default.
-
-    Args:
-        value_network: writes ``action_value``.
-        time_limit: see :class:`PQNLoss`.
-        delay_value: keep target parameters.
-        burn_in: see :class:`DQNConfig`.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        functional: see :class:`PQNLoss`.
+    Keys and arguments as in :class:`PQNLoss`, but ``lmbda`` of :meth:`make_value_estimator` is 0 by default; where a
+    batch holds ``stored_target`` [N, L], these are the targets. Sequences start from their stored state.
     """
-
-    def __init__(
-        self,
-        value_network: TensorDictModuleBase,
-        *,
-        time_limit: TimeLimit = "bootstrap",
-        delay_value: bool = False,
-        burn_in: int = 0,
-        reduction: str = "mean",
-        functional: bool = True,
-    ) -> None:
-        options = {"delay_value": delay_value, "burn_in": burn_in, "reduction": reduction, "functional": functional}
-        super().__init__(value_network, time_limit=time_limit, **options)  # type: ignore[arg-type]
 
     def _default_value_estimator(self) -> None:
         self.make_value_estimator(lmbda=0.0)
@@ -113,45 +39,31 @@ class DQNLoss(PQNLoss):
 
 
 class DQN(Learner):
-    """Puts every window into the replay and learns from sequences drawn from it.
-
-    Args:
-        network: writes ``action_value``.
-        config: numbers of DQN.
-        training: of the run.
-    """
+    """Puts every window into the replay and learns from sequences drawn from it; arguments as in :class:`PQN`."""
 
     config: DQNConfig
     loss: DQNLoss
 
     def __init__(self, network: TensorDictModuleBase, config: DQNConfig, training: Training) -> None:
         has_target = config.target_every > 0
-        options = {"time_limit": config.time_limit, "delay_value": has_target, "functional": has_target}
-        loss = DQNLoss(network, burn_in=config.burn_in, **options)  # type: ignore[arg-type]
+        loss = DQNLoss(
+            network,
+            time_limit=config.time_limit,
+            burn_in=config.burn_in,
+            delay_value=has_target,
+            functional=has_target,
+        )
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
         if has_target:
-            HardUpdate(
-                loss
-            )  # says that the target parameters are taken care of; it leaves out buffers, so see update()
+            HardUpdate(loss)  # the target parameters are taken care of; it leaves out buffers, so see update()
         self.labels = DQNLoss(network, time_limit=config.time_limit, functional=False)
         self.labels.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         self.replay = SequenceReplay(config.replay_sequences, training.folder)
         self.updates = 0
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
-        """Store one window and learn from sequences drawn from the replay, once it holds enough.
-
-        Args:
-            batch: sequences [num_envs] of ``ArcadeCollector.collect()``.
-            frames: frames counted before this window.
-
-        Returns:
-            Means over the gradient steps, by column of ``metrics.csv``.
-
-        Raises:
-            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
-        """
+        """Store one window and learn from sequences drawn from the replay, once it holds enough; see `PQN.update`."""
         self.check_rewards(batch)
         config = self.config
         if config.targets == "stored":
@@ -163,11 +75,10 @@ class DQN(Learner):
             self.updates += 1
             drawn = self.replay.sample(config.batch_sequences, self.training.generator, self.training.device)
             data = self.loss.prepare(drawn)
-            frames_per_step = config.frames_per_update / config.grad_steps_per_update
             for _ in range(config.epochs):
                 for minibatch in self.minibatches(data):
                     self.gradient_step(minibatch, frames)
-                    frames += frames_per_step
+                    frames += self.frames_per_step
         return self.take_metrics() | {"replay_frames": self.replay.frames}
 
     @torch.no_grad()
@@ -183,17 +94,12 @@ class DQN(Learner):
         """Everything but the trained weights and the generator that the coming updates depend on."""
         more: dict[str, Any] = {"replay": self.replay.state_dict(), "learner_updates": self.updates}
         if self.config.target_every:
-            more["target"] = {
-                key: value.clone() for key, value in self.loss.target_value_network_params.flatten_keys(".").items()
-            }
+            target = self.loss.target_value_network_params.flatten_keys(".")
+            more["target"] = {key: value.clone() for key, value in target.items()}
         return super().state_dict() | more
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go back to a saved moment.
-
-        Raises:
-            CheckpointError: a file of the replay is missing or damaged.
-        """
+        """Go back to a saved moment; a ``CheckpointError`` if a file of the replay is missing or damaged."""
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)
         self.updates = state["learner_updates"]

@@ -1,17 +1,15 @@
 """Greedy evaluation on seeds that training never sees."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 import arcade_torch
-from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
-from arcade_torch.agents.learner import require
-from arcade_torch.agents.metrics import confidence_95
+from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
 
 
 @dataclass(frozen=True)
@@ -39,59 +37,35 @@ class EvalResult:
     @property
     def ci(self) -> float:
         """Half width of the normal 95 % interval of the mean return."""
-        return confidence_95(self.returns.tolist())
+        return 1.96 * self.std / math.sqrt(len(self.returns))
 
 
 def held_out_seed(seed: int) -> int:
-    """The environment seed that stands for evaluation seed ``seed``.
-
-    Training uses environment seeds below 2**30, evaluation those from 2**30 on, so no environment is ever in both.
-
-    Raises:
-        ValueError: ``seed`` is not in [0, 2**30).
+    """The environment seed of evaluation seed ``seed``, in [0, 2**30) else ValueError: training uses environment seeds
+    below 2**30, evaluation those from 2**30 on, so no environment is ever in both.
     """
     require(0 <= seed < SEED_LIMIT, "seed", seed, f"in [0, {SEED_LIMIT})")
     return SEED_LIMIT + seed
 
 
-def twins(observability: Literal["full", "partial", "mixed"], num_envs: int) -> Literal["full", "partial"] | Tensor:
-    """What ``arcade_torch.make`` takes for an ``observability`` of :class:`TrainConfig`.
-
-    Args:
-        observability: ``"full"``, ``"partial"`` or ``"mixed"``.
-        num_envs: N.
-
-    Returns:
-        The word, or for ``"mixed"`` bool [N]: MDPs first, then (the larger half) POMDPs.
-
-    Example:
-        >>> twins("mixed", 4)
-        tensor([False, False,  True,  True])
-    """
-    return torch.arange(num_envs) >= num_envs // 2 if observability == "mixed" else observability
+def make_env(config: TrainConfig, num_envs: int, seed: int, observability: str | None = None) -> arcade_torch.ArcadeEnv:
+    """Environments of a run, of the twin it names (or another); of ``"mixed"`` the first half are MDPs."""
+    twin: Any = observability or config.observability
+    return arcade_torch.make(
+        config.env,
+        num_envs=num_envs,
+        observability=torch.arange(num_envs) >= num_envs // 2 if twin == "mixed" else twin,
+        obs_size=config.obs_size,
+        seed=seed,
+        device=config.device,
+        rules=config.rules,
+        **config.env_options,
+    )
 
 
 def make_eval_env(config: TrainConfig, episodes: int, observability: Literal["full", "partial"] | None = None) -> Any:
-    """The environments an evaluation of this config plays in, one an episode.
-
-    Args:
-        config: of the run.
-        episodes: number of environments.
-        observability: another twin than the one trained on.
-
-    Returns:
-        An ``ArcadeEnv`` of batch size [episodes].
-    """
-    return arcade_torch.make(
-        config.env,
-        num_envs=episodes,
-        observability=twins(observability or config.observability, episodes),
-        obs_size=config.obs_size,
-        seed=held_out_seed(0),
-        device=config.device,
-        rules=config.rules,
-        **dict(config.env_options),
-    )
+    """The environments an evaluation of this config plays in, one an episode; of another twin on request."""
+    return make_env(config, episodes, held_out_seed(0), observability)
 
 
 @torch.no_grad()
@@ -146,15 +120,9 @@ def _play(agent: Any, env: Any) -> EvalResult:
     while playing.any():
         action, _, state = agent.act(obs, state)
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        after = step.get("next")
-        ended = _numpy(after.get("done")) & playing
+        ended = step["next", "done"].view(-1).cpu().numpy() & playing
         if ended.any():
-            returns[ended] = _numpy(after.get("episode_reward"))[ended]
-            lengths[ended] = _numpy(after.get("step_count"))[ended]
+            returns[ended] = step["next", "episode_reward"].view(-1).cpu().numpy()[ended]
+            lengths[ended] = step["next", "step_count"].view(-1).cpu().numpy()[ended]
             playing &= ~ended
     return EvalResult(returns, lengths)
-
-
-def _numpy(entry: Tensor) -> NDArray[Any]:
-    """An entry [N, 1] as an array [N] on the host."""
-    return entry.view(-1).cpu().numpy()

@@ -1,7 +1,5 @@
 """Numbers about episodes: the paper's training score, and the bookkeeping behind it."""
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,16 +15,7 @@ EWM_SPAN = 100  # in points of the curve (paper score) or in updates (running av
 def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
     """Exponentially weighted mean without bias adjustment: ``y[0] = x[0]``, ``y[t] = y[t-1] + alpha (x[t] - y[t-1])``.
 
-    Args:
-        values: float [P].
-        span: ``alpha = 2 / (span + 1)``.
-
-    Returns:
-        float64 [P].
-
-    Example:
-        >>> ewm([0.0, 1.0], span=3).tolist()
-        [0.0, 0.5]
+    ``alpha = 2 / (span + 1)``; values and result are float [P].
     """
     smooth = np.array(values, dtype=np.float64)
     alpha = 2.0 / (span + 1.0)
@@ -55,10 +44,6 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
         ValueError: the history is empty, its two parts differ in length, or ``frames`` does not increase.
 
     Source: POPGym Arcade (ICML 2026), plotting of the reference implementation.
-
-    Example:
-        >>> paper_score([0, 1000], [0.5, 0.5])
-        0.5
     """
     x, y = np.asarray(frames, dtype=np.float64), np.asarray(returns, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape or len(x) == 0:
@@ -71,19 +56,12 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
 
 @dataclass
 class EpisodeStats:
-    """Returns of training episodes, followed from window to window.
+    """Returns of training episodes, followed from window to window."""
 
-    Attributes:
-        last: float64 [N], return of the last finished episode of each environment; 0 before the first.
-        episodes: episodes finished so far.
-        smooth: running average of the finished episodes' returns (span 100 windows); None before the first.
-        finished: float64 [E], returns of the episodes that ended in the last window.
-    """
-
-    last: NDArray[np.float64]
-    episodes: int = 0
-    smooth: float | None = None
-    finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    last: NDArray[np.float64]  # [N], return of the last finished episode of each environment; 0 before the first
+    episodes: int = 0  # finished so far
+    smooth: float | None = None  # running average of finished episodes (span 100 windows); None before the first
+    finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # [E], those of the last window
 
     def update(self, episode_reward: Tensor, done: Tensor) -> float:
         """Read one window of new steps.
@@ -114,10 +92,3 @@ class EpisodeStats:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment."""
         self.last, self.episodes, self.smooth = state["last"].numpy().copy(), state["episodes"], state["smooth"]
-
-
-def confidence_95(values: Sequence[float]) -> float:
-    """Half width of the normal 95 % interval of the mean; 0 for fewer than two values."""
-    if len(values) < 2:
-        return 0.0
-    return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values))

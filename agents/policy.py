@@ -15,14 +15,12 @@ from torchrl.modules import EGreedyModule, QValueModule
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.ppo import make_actor
-from arcade_torch.agents.runs.checkpoint import Checkpoint, load_checkpoint, load_latest
+from arcade_torch.agents.runs.checkpoint import find_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network
-
-__all__ = ["Agent", "Network", "build_network", "load", "make_policy"]
 
 Network = MemoryNetwork | ActorCriticNetwork
 
@@ -111,18 +109,10 @@ class Agent(TensorDictModuleBase):
         return out.argmax(-1), {"q_value": out}, state
 
     def outputs(self, out: Tensor, what: str) -> Tensor:
-        """Read what ``network.remember`` gave as one of :attr:`offers`.
+        """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else ValueError).
 
-        Args:
-            out: float [..., R].
-            what: ``"q"``: Q-values; ``"logits"``, ``"probs"``: of the actions; ``"value"``: of the state (for a network
-                of Q-values, the best of them).
-
-        Returns:
-            float [..., A], for ``"value"`` [..., 1].
-
-        Raises:
-            ValueError: this agent does not offer it.
+        ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``: of the state,
+        [..., 1], the best of its Q-values where it has these.
         """
         if what not in self.offers:
             raise ValueError(f"this {self.config.algorithm} agent offers {', '.join(self.offers)}, not {what!r}")
@@ -132,19 +122,14 @@ class Agent(TensorDictModuleBase):
 
 
 def build_network(config: TrainConfig) -> Network:
-    """The freshly initialised network of a config; the same seed gives the same weights, and no global draw moves.
-
-    Args:
-        config: of the run.
-
-    Returns:
-        The network, on ``config.device``.
+    """The freshly initialised network of a config, on its device; the same seed gives the same weights, and no global
+    draw moves.
     """
     make: Any = make_actor_critic if config.algorithm == "ppo" else make_network
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(config.seed)
         network: Network = make(
-            config.network, memory=config.memory, obs_size=config.obs_size, **dict(config.network_options)
+            config.network, memory=config.memory, obs_size=config.obs_size, **config.network_options
         )
     for module in network.modules():
         if isinstance(module, Encoder):
@@ -154,12 +139,7 @@ def build_network(config: TrainConfig) -> Network:
 
 
 def compile_network(network: nn.Module, backend: str = "inductor") -> None:
-    """Compile the parts of a network that compute, in place; weights and their names stay as they are.
-
-    Args:
-        network: whose encoders, memories and heads are compiled; a loss that holds its parameters uses the same code.
-        backend: of ``torch.compile``.
-    """
+    """Compile encoders, memories and heads in place, also for losses that hold them; weights keep their names."""
     for module in network.modules():
         if isinstance(module, MemoryNetwork):
             for part in (module.encoder, module.block, module.head):
@@ -179,7 +159,7 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     Raises:
         CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was found.
     """
-    checkpoint = _find(Path(path))
+    checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
     network = build_network(replace(config, device="cpu"))
     try:
@@ -192,19 +172,3 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     agent = Agent(config, network.to(device), checkpoint.frames)
     agent.eval()
     return agent
-
-
-def _find(path: Path) -> Checkpoint:
-    try:
-        there = path.is_dir()
-    except OSError as error:  # a name that is too long, or a folder nobody may enter
-        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
-    if not there:
-        raise CheckpointError(f"{path} is not a folder; give a run folder or one of its checkpoints")
-    if (path / "meta.json").is_file():
-        return load_checkpoint(path, weights_only=True)
-    if (path / "checkpoints").is_dir():
-        return load_latest(path / "checkpoints", weights_only=True)
-    if any(path.glob("frames-*")):
-        return load_latest(path, weights_only=True)
-    raise CheckpointError(f"{path} holds no checkpoint; give a run folder or one of its checkpoints")

@@ -1,10 +1,10 @@
 """PPO with a memory in actor and critic, or in neither."""
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from contextlib import nullcontext
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase, TensorDictParams
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.distributions import Categorical
@@ -12,42 +12,63 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
-from arcade_torch.agents.learner import Learner, LearnerConfig, TimeLimit, Training
-from arcade_torch.agents.returns import gae
-from arcade_torch.agents.sequences import NetworkInputs, as_steps, insert_final_observations, standard_names, unroll
+from arcade_torch.agents.config import PPOConfig, TimeLimit
+from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.sequences import (
+    NetworkInputs,
+    as_steps,
+    insert_final_observations,
+    solve_backward,
+    unroll,
+    values_and_traces,
+)
 
 
-@dataclass(frozen=True)
-class PPOConfig(LearnerConfig):
-    """Numbers of PPO; the defaults are the paper's, the step size falls over the whole run.
+def gae(
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit = "bootstrap",
+) -> Tensor:
+    r"""Generalised advantage estimate over a window.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
+    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``, in which the value
+    ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a termination::
+
+        A[t] = delta[t]                                at an end and at the last step
+        A[t] = delta[t] + gamma * lam * A[t + 1]       elsewhere
+
+    ``A + v`` is the value target: the lambda-return, where ``v'[t]`` and ``v[t + 1]`` agree.
+
+    Args:
+        reward: float [B, T], reward received on leaving observation ``t``.
+        value: float [B, T], value of observation ``t``.
+        next_value: float [B, T], value of the true next observation.
+        terminated: bool [B, T]; this and what follows as in :func:`q_lambda_return`.
+        truncated: bool [B, T].
+        gamma: discount per step, in [0, 1].
+        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the value.
+        time_limit: ``"bootstrap"`` or ``"terminal"``.
+
+    Returns:
+        float [B, T], in the dtype of ``reward``.
+
+    Raises:
+        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+
+    Source: Schulman et al., arXiv 1506.02438, equation 16.
+
+    Example:
+        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> gae(ones, ones, ones, no, no, gamma=0.5, lam=1.0)
+        tensor([[0.8750, 0.7500, 0.5000]])
     """
-
-    GROUP: ClassVar[str] = "ppo"
-
-    learning_rate: float = 1e-4
-    """Step size at the start."""
-    learning_rate_end: float = 1e-10
-    """Step size after the decay."""
-    lr_decay_fraction: float = 1.0
-    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
-    lam: float = 0.95
-    """Lambda of the generalised advantage estimate, in [0, 1]."""
-    clip: float = 0.2
-    """How far the probability ratio, and the value, may move in an update before the gradient stops."""
-    entropy_coeff: float = 0.01
-    """Weight of the entropy bonus."""
-    critic_coeff: float = 0.5
-    """Weight of the value loss (half the mean squared error)."""
-
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._split_evenly("num_envs", self.num_envs)
-        self._each(("lam",), lambda x: 0.0 <= x <= 1.0, "a number in [0, 1]")
-        self._each(("clip",), lambda x: x > 0.0, "a number > 0")
-        self._each(("entropy_coeff", "critic_coeff"), lambda x: x >= 0.0, "a number >= 0")
+    after, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit, value)
+    return solve_backward(reward + gamma * after - value, trace)
 
 
 class SequenceGAE(nn.Module):
@@ -59,8 +80,7 @@ class SequenceGAE(nn.Module):
         critic: any TensorDict module that writes ``state_value`` [*, 1].
         gamma: discount per step, in [0, 1].
         lmbda: lambda of the estimate, in [0, 1].
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a
-            termination.
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
         chunks: parts that the rows are read in, which bounds memory.
     """
 
@@ -76,7 +96,7 @@ class SequenceGAE(nn.Module):
         self.__dict__["critic"] = critic  # its parameters belong to the loss
         self.inputs = NetworkInputs(critic)
         self.gamma, self.lmbda, self.time_limit, self.chunks = gamma, lmbda, time_limit, chunks
-        self.reads = {"reward": "reward", "terminated": "terminated"}
+        self.reads: dict[str, Any] = {"reward": "reward", "terminated": "terminated"}
         self.writes = {"advantage": "advantage", "value_target": "value_target", "value": "state_value"}
 
     def set_keys(self, **names: Any) -> None:
@@ -96,16 +116,11 @@ class SequenceGAE(nn.Module):
         Returns:
             The same object, with the three entries.
         """
-        data = insert_final_observations(standard_names(batch, **self.reads), self.inputs, self.time_limit)
+        data = insert_final_observations(batch, self.inputs, self.time_limit, **self.reads)
         value_key = self.writes["value"]
-        values = []
-        for rows in data.chunk(self.chunks):
-            if params is None:
-                values.append(unroll(self.critic, self.inputs, rows, value_key).squeeze(-1))
-                continue
-            with params.to_module(self.critic, preserve_module_state=False):
-                values.append(unroll(self.critic, self.inputs, rows, value_key).squeeze(-1))
-        value, position = torch.cat(values), data["position"]
+        with nullcontext() if params is None else params.to_module(self.critic, preserve_module_state=False):
+            values = [unroll(self.critic, self.inputs, rows, value_key) for rows in data.chunk(self.chunks)]
+        value, position = torch.cat(values).squeeze(-1), data["position"]
         here, following = value.gather(1, position), value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
         ends = data["terminated"]
         advantage = gae(data["reward"], here, following, ends, data["cut"] & ~ends, gamma=self.gamma, lam=self.lmbda)
@@ -120,29 +135,19 @@ class PPOLoss(ClipPPOLoss):
     """TorchRL's ``ClipPPOLoss`` over whole sequences of a recurrent actor and critic.
 
     Differences: advantages come from :class:`SequenceGAE` before the first gradient step and are normalised in each
-        minibatch
-    by the population deviation plus 1e-8; the value loss is half the squared error, clipped like the ratio; the entropy
-    is not checked for NaN in every call, which would wait for the device. In keys and out keys are those of
+    minibatch by the population deviation plus 1e-8; the value loss is half the squared error, clipped like the ratio;
+    the entropy is not checked for NaN in every call, which would wait for the device. In keys and out keys are those of
     ``ClipPPOLoss``.
 
     Args:
         actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
         critic_network: any TensorDict module that writes ``state_value`` [*, 1].
         time_limit: see :class:`SequenceGAE`.
-        clip_epsilon: see :class:`PPOConfig`, ``clip``.
-        entropy_coeff: see :class:`PPOConfig`.
-        critic_coeff: see :class:`PPOConfig`.
-        **kwargs: see ``ClipPPOLoss``.
+        critic_coeff: weight of the value loss.
+        **kwargs: ``clip_epsilon`` (0.2), ``entropy_coeff`` (0.01) and the others of ``ClipPPOLoss``.
 
     Source: Schulman et al., arXiv 1707.06347, equations 7 and 9; value clipping as in the published implementation.
     """
-
-    actor_network: ProbabilisticTensorDictSequential
-    critic_network: TensorDictModuleBase
-    actor_network_params: TensorDictParams
-    critic_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    target_critic_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -150,20 +155,11 @@ class PPOLoss(ClipPPOLoss):
         critic_network: TensorDictModuleBase,
         *,
         time_limit: TimeLimit = "bootstrap",
-        clip_epsilon: float = 0.2,
-        entropy_coeff: float = 0.01,
         critic_coeff: float = 0.5,
         **kwargs: Any,
     ) -> None:
         options = {"loss_critic_type": "l2", "clip_value": True, "log_explained_variance": False} | kwargs
-        super().__init__(
-            actor_network,
-            critic_network,
-            clip_epsilon=clip_epsilon,
-            entropy_coeff=entropy_coeff,
-            critic_coeff=0.5 * critic_coeff,
-            **options,
-        )
+        super().__init__(actor_network, critic_network, critic_coeff=0.5 * critic_coeff, **options)
         self.time_limit = time_limit
         self.normalize_advantage = True
         self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
@@ -191,10 +187,10 @@ class PPOLoss(ClipPPOLoss):
             value_type: an estimator of TorchRL; None for :class:`SequenceGAE`.
             **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``.
         """
-        if value_type is not None:
+        if value_type is None:
+            self._value_estimator = SequenceGAE(self.critic_network, time_limit=self.time_limit, **hyperparams)
+        else:
             super().make_value_estimator(value_type, **hyperparams)
-            return
-        self._value_estimator = SequenceGAE(self.critic_network, time_limit=self.time_limit, **hyperparams)
 
     def _default_value_estimator(self) -> None:
         self.make_value_estimator()
@@ -213,12 +209,7 @@ class PPOLoss(ClipPPOLoss):
 
 
 def normalise(advantage: Tensor) -> Tensor:
-    """Mean 0 and population standard deviation 1, over all entries; 1e-8 keeps a constant finite.
-
-    Example:
-        >>> normalise(torch.tensor([[1.0, 3.0]]))
-        tensor([[-1.,  1.]])
-    """
+    """Mean 0 and population standard deviation 1, over all entries; 1e-8 keeps a constant finite."""
     centred = advantage - advantage.mean()
     return centred / (centred.square().mean().sqrt() + 1e-8)
 
@@ -287,26 +278,14 @@ class PPO(Learner):
         super().__init__(loss, config, training, optimizer="adam")
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
-        """Learn from one window.
-
-        Args:
-            batch: sequences [num_envs] of ``ArcadeCollector.collect()``, with ``action_log_prob``.
-            frames: frames counted before this window.
-
-        Returns:
-            Means over the gradient steps, by column of ``metrics.csv``.
-
-        Raises:
-            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
-        """
+        """Learn from one window, with ``action_log_prob``; see `PQN.update`."""
         self.check_rewards(batch)
         config = self.config
         data = self.loss.value_estimator(batch)
-        frames_per_step = config.frames_per_update / config.grad_steps_per_update
         for _ in range(config.epochs):
             for minibatch in self.minibatches(data):
                 self.gradient_step(minibatch, frames)
-                frames += frames_per_step
+                frames += self.frames_per_step
         metrics = self.take_metrics()
         return metrics | {
             "policy_loss": metrics["loss_objective"],

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -11,38 +11,104 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.value import TDLambdaEstimator, ValueEstimatorBase
 
-from arcade_torch.agents.learner import Learner, QConfig, TimeLimit, Training, require
-from arcade_torch.agents.returns import QLambdaEstimator
-from arcade_torch.agents.sequences import NetworkInputs, insert_final_observations, standard_names, unroll
+from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit, require
+from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.sequences import (
+    Key,
+    NetworkInputs,
+    insert_final_observations,
+    solve_backward,
+    unroll,
+    values_and_traces,
+)
 
-Key = str | tuple[str, ...]
-Bootstrap = Literal["next", "last"]
+
+def q_lambda_return(
+    reward: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit = "bootstrap",
+) -> Tensor:
+    r"""Backward Q(lambda) return over a window.
+
+    With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done = terminated | truncated``::
+
+        G[t] = r[t] + gamma * m[t]                                          at a truncation and at the last step
+        G[t] = r[t]                                                         at a termination
+        G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
+
+    Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by doubling, in
+    ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over time.
+
+    Args:
+        reward: float [B, T], reward received on leaving observation ``t``.
+        next_value: float [B, T], ``max_a Q`` of the true next observation: the final frame where an episode was cut.
+            Values at terminated steps are ignored, whatever they are.
+        terminated: bool [B, T], the task's own end; removes the bootstrap and cuts the recursion.
+        truncated: bool [B, T], cut by a limit; keeps the bootstrap, cuts the recursion.
+        gamma: discount per step, in [0, 1].
+        lam: trace decay in [0, 1]; 0 gives the one-step target, 1 the Monte-Carlo return.
+        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a termination, as the published
+            implementation does.
+
+    Returns:
+        float [B, T], in the dtype of ``reward``.
+
+    Raises:
+        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+
+    Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade (ICML 2026), PQN.
+
+    Example:
+        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> q_lambda_return(ones, ones, no, no, gamma=0.5, lam=1.0)
+        tensor([[1.8750, 1.7500, 1.5000]])
+    """
+    value, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit)
+    return solve_backward(reward + (gamma - trace) * value, trace)
 
 
-@dataclass(frozen=True)
-class PQNConfig(QConfig):
-    """Numbers of PQN; the defaults are the paper's, schedules in fractions of the run's frames.
+class QLambdaEstimator(TDLambdaEstimator):
+    """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its shapes are static.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
+    TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which waits for the device.
+
+    Args:
+        gamma: discount per step, in [0, 1].
+        lmbda: trace decay, in [0, 1].
+        value_network: see ``TDLambdaEstimator``; not needed where ``next_value`` is given, as our losses do.
+        **kwargs: see ``TDLambdaEstimator``.
     """
 
-    GROUP: ClassVar[str] = "pqn"
+    def __init__(self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any) -> None:
+        super().__init__(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
+        self._floats = float(gamma), float(lmbda)
 
-    bootstrap: Bootstrap = "next"
-    """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
-    last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None = None,
+        next_value: Tensor | None = None,
+        time_dim: int | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """Lambda-returns, float [B, T, 1], of a batch with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
 
-    def __post_init__(self) -> None:
-        """Refuse values that cannot work, one clear line each."""
-        super().__post_init__()
-        self._split_evenly("num_envs", self.num_envs)
-        self._require(
-            self.bootstrap == "next" or self.overlap >= 1,
-            "overlap",
-            ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap of the next",
-        )
+        The values of the true next observations are ``next_value`` [B, T, 1], or what the value network makes of the
+        batch, with ``target_params`` and ``kwargs``. Time is the second dimension, whatever ``time_dim``.
+        """
+        keys = self.tensor_keys
+        if next_value is None:
+            next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
+        names = (keys.reward, keys.done, keys.terminated)
+        reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
+        truncated = done & ~terminated
+        return q_lambda_return(reward, next_value.squeeze(-1), terminated, truncated, *self._floats).unsqueeze(-1)
 
 
 class PQNLoss(LossModule):
@@ -57,16 +123,13 @@ class PQNLoss(LossModule):
     Out keys: ``loss`` (with gradient), ``q_mean``, ``target_mean``, ``td_error`` (mean absolute), detached.
 
     Args:
-        value_network: any TensorDict module that writes ``action_value`` [*, A]: a ``MemoryNetwork``, a ``QValueActor``
-            ...
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a
-            termination.
+        value_network: any TensorDict module that writes ``action_value`` [*, A], a ``QValueActor`` for one.
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
         bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its value.
         delay_value: keep target parameters, which then give the next values (``SoftUpdate``, ``HardUpdate``).
         burn_in: first steps of a sequence that only bring the memory up to date, without gradient.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        functional: hold the parameters apart from the network, as TorchRL's losses do; False uses the network as it is,
-            which saves a few hundred microseconds a call.
+        functional: hold the parameters apart from the network, as TorchRL's losses do; False saves that time.
 
     Source: Gallici et al., arXiv 2407.04811; POPGym Arcade (ICML 2026).
     """
@@ -167,15 +230,11 @@ class PQNLoss(LossModule):
     def prepare(self, batch: TensorDictBase) -> TensorDict:
         """Insert the final observations, once for all minibatches; rows of the result are what :meth:`forward` takes.
 
-        Args:
-            batch: sequences [N], or a stock batch [B, T].
-
-        Returns:
-            TensorDict [N], see :func:`insert_final_observations`.
+        See :func:`insert_final_observations`, whose result [N] it is.
         """
         names = ("action", "is_init", "reward", "terminated", "truncated")
-        batch = standard_names(batch, **{name: getattr(self.tensor_keys, name) for name in names})
-        return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in)
+        keys = {name: getattr(self.tensor_keys, name) for name in names}
+        return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in, **keys)
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -213,27 +272,14 @@ class PQNLoss(LossModule):
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
-        """Returns of the first ``steps`` steps.
-
-        Args:
-            data: from :meth:`prepare`.
-            q: float [B, L + K, A], Q-values along the extended sequence.
-            steps: S.
-
-        Returns:
-            float [B, S].
-        """
+        """Returns of the first S ``steps`` of what :meth:`prepare` gave, from Q-values [B, L + K, A]: float [B, S]."""
         next_value = self.next_values(data, q, steps)
-        keys, estimator = self.tensor_keys, self.value_estimator
-        if isinstance(estimator, QLambdaEstimator):  # the same without a TensorDict in between
-            parts = data["reward"], data["terminated"], data["cut"]
-            reward, terminated, cut = (part[:, :steps] for part in parts)
-            return estimator.returns(reward, next_value, terminated, cut & ~terminated)
+        keys = self.tensor_keys
         outcome = TensorDict(batch_size=next_value.shape)
         outcome["next", keys.reward] = data["reward"][:, :steps, None]
         outcome["next", keys.terminated] = data["terminated"][:, :steps, None]
         outcome["next", keys.done] = (data["cut"] | data["terminated"])[:, :steps, None]
-        estimate: Callable[..., Tensor] = estimator.value_estimate
+        estimate: Callable[..., Tensor] = self.value_estimator.value_estimate
         return estimate(outcome, next_value=next_value.unsqueeze(-1)).squeeze(-1)
 
     @torch.no_grad()
@@ -278,10 +324,9 @@ class PQN(Learner):
             NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
         """
         self.check_rewards(batch)
-        data, config = self.loss.prepare(batch), self.config
-        frames_per_step = config.frames_per_update / config.grad_steps_per_update
-        for _ in range(config.epochs):
+        data = self.loss.prepare(batch)
+        for _ in range(self.config.epochs):
             for minibatch in self.minibatches(data):
                 self.gradient_step(minibatch, frames)
-                frames += frames_per_step
+                frames += self.frames_per_step
         return self.take_metrics()

@@ -4,11 +4,43 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from arcade_torch.agents.config import GROUPS, TrainConfig
-from arcade_torch.agents.dqn import DQNConfig
-from arcade_torch.agents.learner import coerce, require
-from arcade_torch.agents.ppo import PPOConfig
-from arcade_torch.agents.pqn import PQNConfig
+from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
+
+_SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
+_SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
+_SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
+_TINY = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
+_TINY_REPLAY = {"replay_frames": 192, "batch_sequences": 8, "learning_starts": 16, "burn_in": 2}
+_PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "reference": {
+        "rules": "reference",
+        "network_options": {"skip": "none"},
+        "pqn": {"time_limit": "terminal", "bootstrap": "last"},
+        "ppo": {"time_limit": "terminal"},
+        "dqn": {"time_limit": "terminal", "targets": "stored"},
+    },
+    "small": {
+        "memory": "mingru",
+        "network": "small",
+        "total_frames": 200_000,
+        "threads": 1,
+        "eval_every": 40_000,
+        "checkpoint_every": 20_000,
+        "pqn": _SMALL | _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6},
+        "ppo": _SMALL | {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5},
+        "dqn": _SMALL | _SMALL_Q | {"epochs": 1, "learning_rate": 1e-3, "learning_rate_end": 5e-5} | _SMALL_REPLAY,
+    },
+}
+_PRESETS["smoke"] = _PRESETS["small"] | {
+    "total_frames": 512,
+    "eval_every": 0,
+    "eval_episodes": 4,
+    "checkpoint_every": 128,
+    "pqn": _PRESETS["small"]["pqn"] | _TINY,
+    "ppo": _PRESETS["small"]["ppo"] | _TINY,
+    "dqn": _PRESETS["small"]["dqn"] | _TINY | _TINY_REPLAY,
+}
 
 
 def preset_names() -> list[str]:
@@ -47,125 +79,35 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     """
     if name not in _PRESETS:
         raise ValueError(f"unknown preset {name!r}; presets: {', '.join(preset_names())}")
-    base = _for_algorithm(name, _PRESETS[name], changes.get("algorithm", "pqn"))
-    if name in ("paper", "reference"):
-        base = _paper_budget(base, str(changes.get("env", base.env)))
-    merged = base.to_dict() | changes
-    for group, kind in GROUPS.items():
-        if group not in changes:
-            continue
-        given = changes[group]
-        require(isinstance(given, kind | Mapping), group, given, f"a {kind.__name__} or a table of its fields")
-        given = dataclasses.asdict(given) if isinstance(given, kind) else dict(given)
-        used = group == base.algorithm or not given
-        require(
-            used, group, given, f"left out: the algorithm is {base.algorithm!r}, its numbers are {base.algorithm}.*"
-        )
-        merged[group] = dataclasses.asdict(getattr(base, group)) | given
-    merged["total_frames"] = coerce("total_frames", merged["total_frames"], int)
-    if "total_frames" in changes:
-        for field_name, parts in (("eval_every", 5), ("checkpoint_every", 10)):
-            if field_name not in changes:
-                merged[field_name] = min(merged[field_name], max(1, merged["total_frames"] // parts))
-    return TrainConfig.from_dict(merged)
-
-
-def _for_algorithm(name: str, base: TrainConfig, algorithm: Any) -> TrainConfig:
-    """The preset as it is for an algorithm."""
-    options = dict(base.network_options)
+    algorithm, env = changes.get("algorithm", "pqn"), str(changes.get("env", TrainConfig.env))
+    values = dict(_PRESETS[name])
     if name == "reference" and algorithm == "ppo":
-        options["use_last_action"] = False
-    return dataclasses.replace(base, algorithm=algorithm, network_options=options)
+        values["network_options"] = {"skip": "none", "use_last_action": False}
+    if name in ("paper", "reference"):
+        values |= _paper_budget(values, env)
+    for group, kind in GROUPS.items():
+        if group in changes:
+            given = changes[group]
+            require(isinstance(given, kind | Mapping), group, given, f"a {kind.__name__} or a table of its fields")
+            given = dataclasses.asdict(given) if isinstance(given, kind) else dict(given)
+            allowed = f"left out: the algorithm is {algorithm!r}, its numbers are {algorithm}.*"
+            require(group == algorithm or not given, group, given, allowed)
+            changes[group] = values.get(group, {}) | given
+    values |= changes
+    if "total_frames" in changes:
+        frames = coerce("total_frames", changes["total_frames"], int)
+        for every, parts in (("eval_every", 5), ("checkpoint_every", 10)):
+            if every not in changes:
+                values[every] = min(values.get(every, getattr(TrainConfig, every)), max(1, frames // parts))
+    return TrainConfig.from_dict(values)
 
 
-def _paper_budget(base: TrainConfig, env: str) -> TrainConfig:
+def _paper_budget(values: Mapping[str, Any], env: str) -> dict[str, Any]:
     """The published number of frames of a game; AutoEncode explores for twice the usual share of it."""
+    if not env.startswith(("AutoEncode", "CartPole", "NoisyCartPole", "NoisyPole")):
+        return {}
+    budget: dict[str, Any] = {"total_frames": 10_000_000}
     if env.startswith("AutoEncode"):
-        shares: dict[str, Any] = {"exploration_fraction": 0.8, "lr_decay_fraction": 0.2}
-        pqn, dqn = dataclasses.replace(base.pqn, **shares), dataclasses.replace(base.dqn, **shares)
-        return dataclasses.replace(base, total_frames=10_000_000, pqn=pqn, dqn=dqn)
-    if env.startswith(("CartPole", "NoisyCartPole", "NoisyPole")):
-        return dataclasses.replace(base, total_frames=10_000_000)
-    return base
-
-
-_SMALL_PQN = PQNConfig(
-    num_envs=64,
-    num_steps=32,
-    overlap=0,
-    epochs=2,
-    minibatches=16,
-    lam=0.8,
-    learning_rate=5e-4,
-    learning_rate_end=5e-6,
-    lr_decay_fraction=1.0,
-    max_grad_norm=1.0,
-    exploration_fraction=0.4,
-    warmup_steps=150,
-    time_limit="terminal",
-)
-_SMALL_PPO = PPOConfig(
-    num_envs=64,
-    num_steps=32,
-    epochs=4,
-    minibatches=4,
-    learning_rate=1e-3,
-    learning_rate_end=5e-5,
-    max_grad_norm=1.0,
-    warmup_steps=150,
-    time_limit="terminal",
-)
-_SMALL_DQN = DQNConfig(
-    num_envs=64,
-    num_steps=32,
-    overlap=0,
-    epochs=1,
-    minibatches=16,
-    lam=0.8,
-    learning_rate=1e-3,
-    learning_rate_end=5e-5,
-    lr_decay_fraction=1.0,
-    max_grad_norm=1.0,
-    exploration_fraction=0.4,
-    warmup_steps=150,
-    time_limit="terminal",
-    replay_frames=100_000,
-    batch_sequences=128,
-    learning_starts=256,
-    burn_in=4,
-)
-_SMALL = TrainConfig(
-    memory="mingru",
-    network="small",
-    total_frames=200_000,
-    threads=1,
-    eval_every=40_000,
-    checkpoint_every=20_000,
-    pqn=_SMALL_PQN,
-    ppo=_SMALL_PPO,
-    dqn=_SMALL_DQN,
-)
-_TINY: dict[str, Any] = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
-_PRESETS: dict[str, TrainConfig] = {
-    "paper": TrainConfig(),
-    "reference": TrainConfig(
-        rules="reference",
-        network_options={"skip": "none"},
-        pqn=PQNConfig(time_limit="terminal", bootstrap="last"),
-        ppo=PPOConfig(time_limit="terminal"),
-        dqn=DQNConfig(time_limit="terminal", targets="stored"),
-    ),
-    "small": _SMALL,
-    "smoke": dataclasses.replace(
-        _SMALL,
-        total_frames=512,
-        eval_every=0,
-        eval_episodes=4,
-        checkpoint_every=128,
-        pqn=dataclasses.replace(_SMALL_PQN, **_TINY),
-        ppo=dataclasses.replace(_SMALL_PPO, **_TINY),
-        dqn=dataclasses.replace(
-            _SMALL_DQN, **_TINY, replay_frames=192, batch_sequences=8, learning_starts=16, burn_in=2
-        ),
-    ),
-}
+        shares = {"exploration_fraction": 0.8, "lr_decay_fraction": 0.2}
+        budget |= {group: values.get(group, {}) | shares for group in ("pqn", "dqn")}
+    return budget

@@ -17,96 +17,85 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from arcade_torch.agents.runs.files import CheckpointError, checksum
 
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
-_SEPARATOR = "/"
 
 
 @dataclass
 class _Segment:
-    """One window: a file, and its tensors [n, ...] by the text of their key."""
+    """One window: a file, and its tensors [n], mapped, by the text of their key."""
 
     file: Path
-    tensors: dict[str, Tensor]
+    data: TensorDict
     checksum: str | None = None
-
-    @property
-    def count(self) -> int:
-        return len(self.tensors["pixels"])
 
 
 class SequenceReplay:
     """Draws sequences uniformly, in the form in which they were added.
 
     Args:
-        capacity: most sequences to keep; whole segments are dropped to stay within.
-        folder: where segments are written, made when first needed; None for a temporary folder.
-
-    Raises:
-        ValueError: ``capacity`` is not positive.
+        capacity: most sequences to keep, at least 1 (else ValueError); whole windows are dropped to stay within.
+        folder: where windows are written, made when first needed; None for a temporary folder.
     """
 
     def __init__(self, capacity: int, folder: Path | None = None) -> None:
         if capacity < 1:
             raise ValueError(f"capacity must be at least 1 sequence, got {capacity}")
         self.capacity = capacity
-        self._temporary = None if folder is not None else tempfile.TemporaryDirectory()
-        self._folder = folder if folder is not None else Path(self._temporary.name)  # type: ignore[union-attr]
+        self._temporary = tempfile.TemporaryDirectory() if folder is None else None
+        self._folder = folder or Path(self._temporary.name)  # type: ignore[union-attr]
         self._segments: deque[_Segment] = deque()
         self._added = 0
         self._lists: deque[set[str]] = deque(maxlen=_OLD_LISTS)
 
     def __len__(self) -> int:
         """Sequences at hand."""
-        return sum(segment.count for segment in self._segments)
+        return sum(len(segment.data) for segment in self._segments)
 
     @property
     def frames(self) -> int:
         """Frames at hand, without final frames."""
-        return sum(segment.tensors["pixels"].shape[:2].numel() for segment in self._segments)
+        return sum(segment.data["pixels"].shape[:2].numel() for segment in self._segments)
 
     def add(self, batch: TensorDictBase) -> None:
-        """Store a window; everything is copied.
-
-        Args:
-            batch: sequences [n], tensors only.
+        """Store a window of sequences [n], tensors only; everything is copied.
 
         Raises:
             CheckpointError: the frames at hand, of a run that goes on, have another size.
         """
-        flat = batch.flatten_keys(_SEPARATOR)
+        flat = batch.flatten_keys("/")
         tensors = {key: value.detach().to("cpu", copy=True).contiguous() for key, value in flat.items()}
         size = tensors["pixels"].shape[2:]
-        if self._segments and (held := self._segments[-1].tensors["pixels"].shape[2:]) != size:
+        if self._segments and (held := self._segments[-1].data["pixels"].shape[2:]) != size:
             raise CheckpointError(f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}")
         self._folder.mkdir(parents=True, exist_ok=True)
         file = self._folder / f"window-{self._added:09d}.safetensors"
         draft = file.with_name(f".{file.name}.{os.getpid()}")
         save_file(tensors, draft)
         os.replace(draft, file)
-        self._segments.append(_Segment(file, load_file(file)))  # mapped
+        self._open(file)
         self._added += 1
         while len(self) > self.capacity and len(self._segments) > 1:
             gone = self._segments.popleft().file
             if gone.name not in set().union(*self._lists):
                 gone.unlink(missing_ok=True)
 
+    def _open(self, file: Path, digest: str | None = None) -> None:
+        tensors = load_file(file)
+        self._segments.append(_Segment(file, TensorDict(tensors, [len(tensors["pixels"])]), digest))
+
     def sample(self, count: int, generator: torch.Generator, device: torch.device | str = "cpu") -> TensorDict:
         """Draw sequences uniformly, each at most once.
 
         Args:
-            count: B, at most the number at hand.
+            count: B, at most the number at hand (else ValueError).
             generator: CPU generator of the draw.
             device: where to put them.
 
         Returns:
             Sequences [B], in the order of age.
-
-        Raises:
-            ValueError: there are fewer.
         """
         held = len(self)
         if not 1 <= count <= held:
@@ -114,12 +103,11 @@ class SequenceReplay:
         chosen = torch.randperm(held, generator=generator)[:count].sort().values
         first, parts = 0, []
         for segment in self._segments:
-            rows = chosen[(chosen >= first) & (chosen < first + segment.count)] - first
-            if len(rows):
-                parts.append({key: value.index_select(0, rows) for key, value in segment.tensors.items()})
-            first += segment.count
-        flat = {key: torch.cat([part[key] for part in parts]).to(device) for key in parts[0]}
-        return TensorDict(flat, batch_size=[count]).unflatten_keys(_SEPARATOR)
+            last = first + len(segment.data)
+            parts.append(segment.data[chosen[(chosen >= first) & (chosen < last)] - first])
+            first = last
+        drawn: TensorDict = TensorDict.cat(parts).to(device).unflatten_keys("/")
+        return drawn
 
     def state_dict(self) -> dict[str, Any]:
         """Name everything at hand, with checksums; call it when a checkpoint is made.
@@ -137,11 +125,7 @@ class SequenceReplay:
         return {"files": names, "added": self._added}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go back to a saved moment.
-
-        Raises:
-            CheckpointError: a file is missing or damaged.
-        """
+        """Go back to a saved moment; a ``CheckpointError`` if a file is missing or damaged."""
         self._added = state["added"]
         self._segments.clear()
         for name, digest in state["files"].items():
@@ -150,5 +134,5 @@ class SequenceReplay:
                 raise CheckpointError(f"{file} is missing: the replay of this checkpoint is not whole")
             if checksum(file) != digest:
                 raise CheckpointError(f"{file} is damaged: it does not have the checksum in the checkpoint")
-            self._segments.append(_Segment(file, load_file(file), digest))
+            self._open(file, digest)
         self._lists = deque([set(state["files"])], maxlen=_OLD_LISTS)

@@ -1,4 +1,5 @@
-"""Final observations put where they belong, so that one pass over a window gives the value of every next observation.
+"""Final observations put where they belong, so that one pass over a window gives the value of every next observation;
+and what returns and advantages share: the sum backward over a window.
 
 A memory model reads a window of ``L`` observations once. The value of the observation *after* a step is then the value
 at the following position, but for two cases: where an episode ended, the next position holds the first observation of
@@ -15,20 +16,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
+from arcade_torch.agents.config import TimeLimit
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
-
-__all__ = ["NetworkInputs", "as_steps", "insert_final_observations", "standard_names", "unroll"]
 
 Key = str | tuple[str, ...]
 
 
 class NetworkInputs:
-    """Which entries of a batch a network reads, and how its recurrent state begins.
-
-    Args:
-        network: a TensorDict module; a key that it also writes under "next" is recurrent state.
-    """
+    """Which entries of a batch a TensorDict module reads; a key that it also writes under "next" is recurrent state."""
 
     def __init__(self, network: TensorDictModuleBase) -> None:
         keys = [unravel_key(key) for key in network.in_keys]
@@ -40,7 +36,7 @@ class NetworkInputs:
 
 
 def insert_final_observations(
-    batch: TensorDictBase, inputs: NetworkInputs, time_limit: str = "bootstrap", burn_in: int = 0
+    batch: TensorDictBase, inputs: NetworkInputs, time_limit: str = "bootstrap", burn_in: int = 0, **names: Key
 ) -> TensorDict:
     """Lay out a batch for a pass that gives the values of all next observations.
 
@@ -52,6 +48,8 @@ def insert_final_observations(
         inputs: of the network.
         time_limit: ``"bootstrap"``: a truncated step needs its true next observation; ``"terminal"``: it does not.
         burn_in: first steps that only bring the recurrent state up to date; they are kept apart.
+        **names: where ``action``, ``is_init``, and under "next" ``reward``, ``terminated``, ``truncated`` stand, if not
+            under these names.
 
     Returns:
         TensorDict [N] with ``extended`` [N, L + K] (what the network reads), ``position`` int64 [N, L] (where each
@@ -63,6 +61,10 @@ def insert_final_observations(
         KeyError: an entry is missing; names it.
         ValueError: a next observation that a target needs was not stored, or the recurrent state at step 0 is unknown.
     """
+    batch = batch.copy()
+    for wanted, name in names.items():
+        after = wanted in ("reward", "terminated", "truncated")
+        batch[("next", wanted) if after else wanted] = _get(batch, unravel_key(("next", name)) if after else name)
     if batch.ndim == 1 and _get(batch, "is_init").ndim == 2:  # one sequence [L] of a stock batch
         batch = batch.unsqueeze(0)
     is_init = _flat(batch, "is_init")
@@ -73,20 +75,13 @@ def insert_final_observations(
         terminated = done
     needed = (done | seam) & ~terminated
     index, mask, places = _final_places(batch, needed)
-    _require_stored(needed, index, mask)
 
-    length, width = is_init.shape[1] - burn_in, index.shape[1]
     used = mask & needed.gather(1, index) & (index >= burn_in)
-    index_here = (index - burn_in).clamp_min(0)
-    steps = torch.arange(length, device=is_init.device)
-    before = (used.unsqueeze(1) & (index_here.unsqueeze(1) < steps[:, None])).sum(-1)
-    position = steps + before  # of each observation
-    slot = torch.where(
-        used, position.gather(1, index_here) + 1, length + used.sum(1, keepdim=True) + (~used).cumsum(1) - 1
-    )
-    order = torch.empty(len(is_init), length + width, dtype=torch.int64, device=is_init.device)
-    order.scatter_(1, position, steps.expand(len(is_init), -1))
-    order.scatter_(1, slot, length + torch.arange(width, device=is_init.device).expand(len(is_init), -1))
+    length = is_init.shape[1] - burn_in
+    steps = torch.arange(length, device=is_init.device).expand(len(is_init), -1)
+    times = torch.cat((2 * steps, torch.where(used, 2 * (index - burn_in) + 1, 2 * length)), dim=1)
+    order = times.argsort(dim=1, stable=True)  # a place stands right behind its step, unused ones at the end
+    position = order.argsort(dim=1)[:, :length]  # of each observation
 
     out = TensorDict(
         position=position,
@@ -99,33 +94,12 @@ def insert_final_observations(
     roots = {key: _get(batch, key) for key in inputs.observation_keys}
     if "is_init" in roots:
         roots["is_init"] = is_init.unsqueeze(-1)
-    out["extended"] = TensorDict(
-        {key: _reorder(roots[key][:, burn_in:], places(key), order) for key in inputs.observation_keys},
-        batch_size=order.shape,
-    )
+    both = {key: torch.cat((root[:, burn_in:], places(key)), dim=1) for key, root in roots.items()}
+    out["extended"] = TensorDict({key: _rows(value, order) for key, value in both.items()}, batch_size=order.shape)
     if burn_in:
         out["burn_in"] = TensorDict({key: root[:, :burn_in] for key, root in roots.items()}, [len(is_init), burn_in])
     _add_state(out, batch, inputs, is_init, order, burn_in)
     return out
-
-
-def standard_names(batch: TensorDictBase, **names: Key) -> TensorDictBase:
-    """A batch in which entries of other names also stand under those that :func:`insert_final_observations` reads.
-
-    Args:
-        batch: see there.
-        **names: where ``action``, ``is_init``, and under "next" ``reward``, ``terminated``, ``truncated`` stand.
-
-    Returns:
-        The batch, or a copy that shares its tensors.
-    """
-    other = {wanted: name for wanted, name in names.items() if name != wanted}
-    if other:
-        batch = batch.copy()
-    for wanted, name in other.items():
-        after = wanted in ("reward", "terminated", "truncated")
-        batch[("next", wanted) if after else wanted] = _get(batch, unravel_key(("next", name)) if after else name)
-    return batch
 
 
 def unroll(network: TensorDictModuleBase, inputs: NetworkInputs, sequences: TensorDictBase, key: Key) -> Tensor:
@@ -161,8 +135,7 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     """Sequences [N] as a batch [N, L] that recurrent modules and TorchRL's losses read.
 
     Args:
-        batch: sequences [N] of ``ArcadeCollector.collect()``, or rows of them; a stock batch [B, T] is given back as it
-            is.
+        batch: sequences [N] of ``ArcadeCollector.collect()``, or rows of them; a stock batch [B, T] is given back.
         inputs: of the networks that will read it.
         *keys: further entries to keep.
 
@@ -178,17 +151,53 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     return out
 
 
+def values_and_traces(
+    reward: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    truncated: Tensor,
+    gamma: float,
+    lam: float,
+    time_limit: TimeLimit,
+    *others: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """What a step may count on, both [B, T]: the next value, 0 behind a termination; gamma times lambda, 0 at every end
+    and at the last step. Arguments that do not fit are refused, ``others`` for their shape alone.
+    """
+    shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
+    if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
+        raise ValueError(f"rewards, values, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
+    if not 0.0 <= gamma <= 1.0 or not 0.0 <= lam <= 1.0:
+        raise ValueError(f"gamma and lambda must lie in [0, 1]; got gamma={gamma}, lambda={lam}")
+    if time_limit not in ("bootstrap", "terminal"):
+        raise ValueError(f"time_limit must be 'bootstrap' or 'terminal'; got {time_limit!r}")
+    done = terminated | truncated
+    trace = torch.full_like(reward, gamma * lam).masked_fill(done, 0.0)
+    trace[:, -1] = 0.0
+    return next_value.masked_fill(done if time_limit == "terminal" else terminated, 0.0), trace
+
+
+def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
+    """Solve ``G[t] = base[t] + trace[t] * G[t + 1]`` with ``G[T] = 0`` by doubling."""
+    steps, reach = base.shape[1], 1
+    while reach < steps:
+        head = torch.addcmul(base[:, :-reach], trace[:, : steps - reach], base[:, reach:])
+        base = torch.cat((head, base[:, -reach:]), dim=1)
+        if 2 * reach < steps:
+            trace = trace[:, : trace.shape[1] - reach] * trace[:, reach:]
+        reach *= 2
+    return base
+
+
 def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
     """Let sequences [B, T] begin with states [B]; states that are stored later on stay, others are zero."""
     for key in inputs.state_keys:
         first = state.get(key)
-        if inputs.reads_first_state_only:
-            sequences[key] = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
-            continue
-        stored = sequences.get(key, None)
-        if stored is None:
-            stored = first.new_zeros(*sequences.shape, *first.shape[1:])
-        sequences[key] = torch.cat((first.unsqueeze(1), stored[:, 1:]), dim=1)
+        every = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
+        if not inputs.reads_first_state_only:
+            stored = sequences.get(key, torch.zeros_like(every))
+            every = torch.cat((every[:, :1], stored[:, 1:]), dim=1)
+        sequences[key] = every
 
 
 def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor, Any]:
@@ -198,6 +207,12 @@ def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor
         count = max(int(needed.sum(1).max()), 1)  # a stock batch has as many places as it needs
         index = (~needed).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
         mask = needed.gather(1, index)
+    stored = torch.zeros_like(needed, dtype=torch.int8).scatter_add_(1, index, mask.to(torch.int8))
+    if missing := int((needed & (stored == 0)).sum()):
+        raise ValueError(
+            f"{missing} next observations are needed but were not stored: collect with final_frames='truncated' "
+            "or 'all', or use time_limit='terminal'"
+        )
     frames = batch.get("final_pixels", None)
 
     def places(key: Key) -> Tensor:
@@ -218,16 +233,6 @@ def _next(batch: TensorDictBase, key: Key) -> Tensor:
     return value  # type: ignore[no-any-return]
 
 
-def _require_stored(needed: Tensor, index: Tensor, mask: Tensor) -> None:
-    stored = torch.zeros_like(needed, dtype=torch.int8).scatter_add_(1, index, mask.to(torch.int8))
-    missing = int((needed & (stored == 0)).sum())
-    if missing:
-        raise ValueError(
-            f"{missing} next observations are needed but were not stored: collect with final_frames='truncated' "
-            "or 'all', or use time_limit='terminal'"
-        )
-
-
 def _add_state(
     out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, is_init: Tensor, order: Tensor, burn_in: int
 ) -> None:
@@ -239,28 +244,21 @@ def _add_state(
         out["initial_state"] = first.select(*inputs.state_keys)
         return
     per_step = {key: batch.get(key, None) for key in inputs.state_keys}
-    if any(value is None for value in per_step.values()):
+    if missing := [key for key, value in per_step.items() if value is None]:
         if not bool(is_init[:, 0].all()):
-            missing = next(key for key, value in per_step.items() if value is None)
-            raise ValueError(f"the batch begins in mid-episode but has neither 'initial_state' nor {missing!r}")
+            raise ValueError(f"the batch begins in mid-episode but has neither 'initial_state' nor {missing[0]!r}")
         return
     out["initial_state"] = TensorDict({key: value[:, 0] for key, value in per_step.items()}, batch_size=out.batch_size)
     if not inputs.reads_first_state_only:
         for key, value in per_step.items():
             nothing = value.new_zeros(len(value), order.shape[1] - value.shape[1] + burn_in, *value.shape[2:])
-            out["extended"][key] = _reorder(value[:, burn_in:], nothing, order)
-
-
-def _reorder(roots: Tensor, places: Tensor, order: Tensor) -> Tensor:
-    """Roots [N, L, ...] and places [N, K, ...] in the order of time, [N, L + K, ...]."""
-    both = torch.cat((roots, places), dim=1)
-    row = torch.arange(len(order), device=order.device).unsqueeze(1) * order.shape[1]
-    return both.flatten(0, 1).index_select(0, (order + row).flatten()).view_as(both)
+            out["extended"][key] = _rows(torch.cat((value[:, burn_in:], nothing), 1), order)
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:
     """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
-    return value[torch.arange(len(index), device=index.device).unsqueeze(1), index]
+    first = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
+    return value.flatten(0, 1).index_select(0, (index + first).flatten()).view(*index.shape, *value.shape[2:])
 
 
 def _get(batch: TensorDictBase, key: Key) -> Tensor:

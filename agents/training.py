@@ -1,10 +1,12 @@
 """Training: collect, update, then log, evaluate, save; the same for every algorithm and memory, and for none."""
 
-import contextlib
 import dataclasses
 import os
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,27 +14,25 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict.nn import CudaGraphModule
-from torch import Tensor
 from torchrl.modules import EGreedyModule
 
 import arcade_torch
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.dqn import DQN
-from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env, twins
-from arcade_torch.agents.learner import Learner, NonFiniteError, Training
+from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
+from arcade_torch.agents.learner import NonFiniteError, Training, epsilon_at
 from arcade_torch.agents.metrics import EpisodeStats, paper_score
 from arcade_torch.agents.policy import Agent, build_network, compile_network, make_policy
 from arcade_torch.agents.ppo import PPO
 from arcade_torch.agents.pqn import PQN
 from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, write_json
-from arcade_torch.agents.runs.folder import METRIC_COLUMNS, RunFolder
-from arcade_torch.agents.runs.loggers import RunLogger, check_logger, open_logger
-from arcade_torch.agents.runs.process import own_settings, stop_signals
+from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder
+from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.envs_jax import resolve_id
 
 Progress = Callable[[Mapping[str, Any]], None]
-LEARNERS: dict[str, Callable[..., Learner]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}
+LEARNERS: dict[str, Callable[..., PQN | PPO | DQN]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}
 COMPILE_BACKEND = "inductor"
 """Of ``torch.compile``; tests take one that needs no C++ compiler."""
 _CALIBRATION_FRAMES = 3200
@@ -83,8 +83,19 @@ class Trainer:
         self.policy = make_policy(self.network)
         self.explorers = [module for module in self.policy.modules() if isinstance(module, EGreedyModule)]
         self.policy.to(device)
-        self.collector = make_collector(config, self.policy, self.network)
-        self.env = self.collector.env
+        self.env = make_env(config, numbers.num_envs, config.seed)
+        self.collector = arcade_torch.ArcadeCollector(
+            self.env,
+            CudaGraphModule(self.policy) if config.cuda_graphs else self.policy,
+            frames_per_batch=numbers.frames_per_update,
+            total_frames=-1,
+            overlap=numbers.steps_before,
+            compress=self.network.compress,
+            final_frames="truncated" if numbers.time_limit == "bootstrap" else "none",
+            store=("action_log_prob",) if config.algorithm == "ppo" else (),
+            return_same_td=True,
+            store_states=False,
+        )
         self.stats = EpisodeStats(np.zeros(numbers.num_envs))
         self.frames = self.updates = 0
         self.seconds = 0.0
@@ -114,7 +125,7 @@ class Trainer:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
         """
         began, numbers = time.perf_counter(), self.config.learner
-        epsilon = numbers.epsilon_at(self.frames, self.total_frames)
+        epsilon = epsilon_at(numbers, self.frames, self.total_frames)
         for explorer in self.explorers:
             explorer.eps.fill_(epsilon)
         batch = self.collector.collect()
@@ -128,7 +139,6 @@ class Trainer:
         self.updates += 1
         took = time.perf_counter() - began
         self.seconds += took
-        finished = self.stats.finished
         row = {
             "frames": self.frames,
             "updates": self.updates,
@@ -137,7 +147,7 @@ class Trainer:
             "fps": numbers.frames_per_update / took,
             **metrics,
             "epsilon": epsilon,
-            "train_return": float(finished.mean()) if len(finished) else None,
+            "train_return": float(self.stats.finished.mean()) if len(self.stats.finished) else None,
             "train_return_ewm": self.stats.smooth,
             "train_return_last": last,
             "episodes": self.stats.episodes,
@@ -160,60 +170,26 @@ class Trainer:
         }
 
     def load(self, checkpoint: Checkpoint) -> None:
-        """Go back to where a checkpoint was made.
-
-        Raises:
-            CheckpointError: its state is not one of this trainer.
-        """
+        """Go back to where a checkpoint was made; a ``CheckpointError`` if its state is not one of this trainer."""
+        state = checkpoint.trainer or {}
         try:
-            self._load(checkpoint.weights, checkpoint.trainer or {})
+            self.learner.load_state_dict(state)
+            self.network.load_state_dict(checkpoint.weights)
+            self._random.set_rng_state(state["explore"].cpu())
+            self.shuffle.set_state(state["shuffle"])
+            self.collector.load_state_dict(state["collector"], strict=False)
+            self.stats.load_state_dict(state["stats"])
+            self.frames, self.updates, self.seconds = state["frames"], state["updates"], state["seconds"]
+            require(self.frames == checkpoint.frames, "frames", self.frames, f"{checkpoint.frames}, as in its name")
         except CheckpointError:
             raise
         except Exception as error:  # whatever a damaged state leads to, it is not to be used
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             raise CheckpointError(f"the state in {checkpoint.path} does not fit this run: {reason}") from error
-        if self.frames != checkpoint.frames:
-            raise CheckpointError(f"the state in {checkpoint.path} is not of frame {checkpoint.frames}")
-
-    def _load(self, weights: dict[str, Tensor], state: dict[str, Any]) -> None:
-        self.learner.load_state_dict(state)
-        self.network.load_state_dict(weights)
-        self._random.set_rng_state(state["explore"].cpu())
-        self.shuffle.set_state(state["shuffle"])
-        self.collector.load_state_dict(state["collector"], strict=False)
-        self.stats.load_state_dict(state["stats"])
-        self.frames, self.updates, self.seconds = state["frames"], state["updates"], state["seconds"]
 
     def close(self) -> None:
         """Let go of the environments."""
         self.collector.shutdown()
-
-
-def make_collector(config: TrainConfig, policy: Any, network: Any) -> arcade_torch.ArcadeCollector:
-    """The collector of a run: ``policy`` plays all environments, ``network`` says what of a frame is stored."""
-    numbers = config.learner
-    env = arcade_torch.make(
-        config.env,
-        num_envs=numbers.num_envs,
-        observability=twins(config.observability, numbers.num_envs),
-        obs_size=config.obs_size,
-        seed=config.seed,
-        device=config.device,
-        rules=config.rules,
-        **dict(config.env_options),
-    )
-    return arcade_torch.ArcadeCollector(
-        env,
-        CudaGraphModule(policy) if config.cuda_graphs else policy,
-        frames_per_batch=numbers.frames_per_update,
-        total_frames=-1,
-        overlap=numbers.steps_before,
-        compress=network.compress,
-        final_frames="truncated" if numbers.time_limit == "bootstrap" else "none",
-        store=("action_log_prob",) if config.algorithm == "ppo" else (),
-        return_same_td=True,
-        store_states=False,
-    )
 
 
 def train(
@@ -254,61 +230,40 @@ def train(
     check_logger(config.logger)
     if (result := folder.finished()) is not None:
         return result_from(folder.path, result)
-    with own_settings(config):
-        trainer = Trainer(config, folder.replay)
-        try:
-            with folder.claim(config):
-                if (result := folder.finished()) is not None:  # by another process, a moment ago
-                    return result_from(folder.path, result)
-                return _Run(config, folder, trainer, progress, on_evaluation).go()
-        finally:
-            trainer.close()
+    with own_settings(config), closing(Trainer(config, folder.replay)) as trainer, folder.claim(config):
+        if (result := folder.finished()) is not None:  # by another process, a moment ago
+            return result_from(folder.path, result)
+        return _Run(config, folder, trainer, progress, on_evaluation).go()
 
 
+@dataclass
 class _Run:
-    """The loop of one run, and what it writes into its folder; arguments as in :func:`train`."""
+    """The loop of one run, and what it writes into its folder; the first five as in :func:`train`."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        folder: RunFolder,
-        trainer: Trainer,
-        progress: Progress | None,
-        on_evaluation: Callable[[Agent], None] | None,
-    ) -> None:
-        self.config, self.folder, self.trainer = config, folder, trainer
-        self.progress, self.on_evaluation = progress, on_evaluation
-        self.eval_env: Any = None
-        self.metrics: CsvLog
-        self.evals: CsvLog
-        self.logger = RunLogger()
-        self.last_eval: float | None = None
-        self.saved_at = -1
+    config: TrainConfig
+    folder: RunFolder
+    trainer: Trainer
+    progress: Progress | None
+    on_evaluation: Callable[[Agent], None] | None
+    eval_env: Any = None
+    last_eval: float | None = None
+    saved_at: int = -1
 
     def go(self) -> TrainResult:
-        """Run to the end, or to the first signal."""
-        self._start()
-        trainer, config = self.trainer, self.config
-        with self._logs():
+        """Run from the newest whole checkpoint, or the beginning, to the end, or to the first signal."""
+        if list_checkpoints(self.folder.checkpoints):
+            self.saved_at = load_latest(self.folder.checkpoints, self.config, use=self.trainer.load).frames
+        else:
+            self.trainer.warm_up()
+        path, frames = self.folder.path, self.trainer.frames
+        with (
+            closing(CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)) as self.metrics,
+            closing(CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames)) as self.evals,
+            closing(RunLogger(self.config, path, frames)) as self.logger,
+        ):
             try:
-                with stop_signals() as stopped:
-                    while not trainer.done and not stopped():
-                        row = trainer.update()
-                        self.metrics.append(row)
-                        self.logger.log("train", row)
-                        if self._crossed(config.eval_every) and not trainer.done:
-                            self._evaluate()
-                        if self._crossed(config.checkpoint_every):
-                            self._save()
-                        self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
-                        if self.progress is not None:
-                            more = {"total_frames": trainer.total_frames, "eval_return": self.last_eval}
-                            self.progress(row | more)
-                self._save()
-                if trainer.done:
-                    return self._finish()
-                self._report("interrupted")
-                return TrainResult(self.folder.path, "interrupted", trainer.frames, trainer.seconds)
+                self._report("running")
+                return self._loop()
             except NonFiniteError as error:
                 self._report("failed", error=str(error))
                 newest = list_checkpoints(self.folder.checkpoints)[:1]
@@ -319,26 +274,25 @@ class _Run:
                 self._report(status, error=f"{type(error).__name__}: {error}")
                 raise
 
-    def _start(self) -> None:
-        """From the newest whole checkpoint, or from the beginning."""
-        if list_checkpoints(self.folder.checkpoints):
-            self.saved_at = load_latest(self.folder.checkpoints, self.config, use=self.trainer.load).frames
-        else:
-            self.trainer.warm_up()
-
-    @contextlib.contextmanager
-    def _logs(self) -> Iterator[None]:
-        """Hold the logs open, cut back to where the trainer is."""
-        frames = self.trainer.frames
-        self.metrics, self.evals = self.folder.open_logs(frames)
-        try:
-            self.logger = open_logger(self.config, self.folder.path, frames)
-            self._report("running")
-            yield
-        finally:
-            self.metrics.close()
-            self.evals.close()
-            self.logger.close()
+    def _loop(self) -> TrainResult:
+        trainer, config = self.trainer, self.config
+        with stop_signals() as stopped:
+            while not trainer.done and not stopped():
+                row = trainer.update()
+                self.metrics.append(row)
+                self.logger.log("train", row)
+                if self._crossed(config.eval_every) and not trainer.done:
+                    self._evaluate()
+                if self._crossed(config.checkpoint_every):
+                    self._save()
+                self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
+                if self.progress is not None:
+                    self.progress(row | {"total_frames": trainer.total_frames, "eval_return": self.last_eval})
+        self._save()
+        if trainer.done:
+            return self._finish()
+        self._report("interrupted")
+        return TrainResult(self.folder.path, "interrupted", trainer.frames, trainer.seconds)
 
     def _crossed(self, every: int) -> bool:
         """Whether the last update passed a multiple of ``every`` frames."""
@@ -395,3 +349,35 @@ def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
     """How a finished run ended, from its ``eval.json``."""
     evaluation = EvalResult(np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64))
     return TrainResult(path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"])
+
+
+@contextmanager
+def own_settings(config: TrainConfig) -> Iterator[None]:
+    """Seed torch's global generators and set its threads for the duration of a run."""
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(config.threads or threads)
+        with torch.random.fork_rng():
+            torch.manual_seed(config.seed)
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def stop_signals() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a request to stop; outside the main thread, signals stay as they are."""
+    asked = threading.Event()
+
+    def ask(number: int, frame: object) -> None:
+        if asked.is_set() and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked.set()
+
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM) if main}
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -179,6 +179,8 @@ def loaded_after(statement: str) -> set[str]:
         ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl"}),
         ("import arcade_torch; arcade_torch.registered_ids()", {"torch", "tensordict", "torchrl"}),
         ("import arcade_torch.models", {"jax", "jaxlib"}),
+        ("import arcade_torch.agents.presets", {"torch", "tensordict", "torchrl", "jax"}),
+        ("import arcade_torch.tools.commands.train", {"torch", "tensordict", "torchrl", "jax"}),
     ],
 )
 def test_importing_a_layer_loads_nothing_that_it_does_not_need(statement: str, absent: set[str]) -> None:

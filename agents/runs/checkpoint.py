@@ -17,21 +17,22 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig, differing_fields, require
 from arcade_torch.agents.runs.files import CheckpointError, checksum, read_json, write_atomic, write_json
 
 FORMAT = 2
 """Format of checkpoints and run folders; 1 is that of arcade-torch 0.1, which is refused."""
 KEEP = 2
 _WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.json", "latest"
+_load_tensors: Callable[[Path], dict[str, Any]] = partial(torch.load, map_location="cpu", weights_only=True)
 
 
 class _OtherRunError(CheckpointError):
@@ -40,20 +41,12 @@ class _OtherRunError(CheckpointError):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One loaded checkpoint.
-
-    Attributes:
-        config: of the run it belongs to.
-        frames: training frames it was saved at.
-        weights: the network's ``state_dict``, on the CPU.
-        trainer: the rest of the training state; None if only the weights were asked for.
-        path: its folder.
-    """
+    """One loaded checkpoint, of the folder ``path``."""
 
     config: TrainConfig
     frames: int
-    weights: dict[str, Tensor]
-    trainer: dict[str, Any] | None
+    weights: dict[str, Tensor]  # the network's state_dict, on the CPU
+    trainer: dict[str, Any] | None  # the rest of the training state; None if only the weights were asked for
     path: Path
 
 
@@ -65,15 +58,7 @@ def save_checkpoint(
     The folder is written under a temporary name and renamed, then ``latest`` is replaced: a process killed at any
     moment leaves at least the previous checkpoint whole.
 
-    Args:
-        folder: ``checkpoints/`` of a run.
-        config: of the run.
-        frames: training frames so far.
-        weights: the network's ``state_dict``.
-        trainer: nested state of tensors, numbers, text, dictionaries and lists.
-
-    Returns:
-        Path of the new checkpoint.
+    The weights are the network's ``state_dict``, the trainer's state nests tensors, numbers, text, dicts and lists.
     """
     final = folder / f"frames-{frames:012d}"
     draft = folder / f".{final.name}.{os.getpid()}"
@@ -101,38 +86,22 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only: bool = False) -> Checkpoint:
-    """Load one checkpoint folder.
-
-    Args:
-        path: folder of the checkpoint.
-        expect: config of the run that wants to go on; a checkpoint of another run is refused.
-        weights_only: leave the trainer's state on disk.
-
-    Returns:
-        The checkpoint.
+    """Load one checkpoint folder; with ``weights_only`` the trainer's state is left on disk.
 
     Raises:
-        CheckpointError: a part is missing or damaged, the format is another, or ``expect`` differs.
+        CheckpointError: a part is missing or damaged, the format is another, or the config is not ``expect``.
     """
     meta = _read_meta(path)
     try:
         config, frames, sums = TrainConfig.from_dict(meta["config"]), meta["frames"], dict(meta["sha256"])
-        if not isinstance(frames, int) or isinstance(frames, bool):
-            raise ValueError(f"frames must be a whole number; got {frames!r}")
+        require(type(frames) is int, "frames", frames, "a whole number")
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error
-    for part in (_WEIGHTS,) if weights_only else (_WEIGHTS, _TRAINER):
-        if not (path / part).is_file():
-            raise CheckpointError(f"checkpoint {path} is damaged: {part} is missing")
-        if checksum(path / part) != sums.get(part):
-            raise CheckpointError(f"checkpoint {path} is damaged: {part} does not have the checksum in {_META}")
-    try:
-        weights = load_file(path / _WEIGHTS)
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise CheckpointError(f"checkpoint {path} is damaged: {_WEIGHTS} holds no tensors ({error})") from error
+    weights = _read_part(path / _WEIGHTS, sums, load_file)
     if expect is not None and (fields := differing_fields(config, expect)):
         raise _OtherRunError(f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}")
-    return Checkpoint(config, frames, weights, None if weights_only else _load_trainer(path), path)
+    trainer = None if weights_only else _read_part(path / _TRAINER, sums, _load_tensors)
+    return Checkpoint(config, frames, weights, trainer, path)
 
 
 def load_latest(
@@ -145,12 +114,9 @@ def load_latest(
 
     Args:
         folder: ``checkpoints/`` of a run.
-        expect: see :func:`load_checkpoint`; a checkpoint of another run is an error, never skipped.
-        weights_only: see :func:`load_checkpoint`.
+        expect: config of the run that wants to go on; a checkpoint of another run is an error, never skipped.
+        weights_only: leave the trainer's state on disk.
         use: called with the checkpoint; one for which it raises ``CheckpointError`` counts as damaged.
-
-    Returns:
-        The checkpoint.
 
     Raises:
         CheckpointError: there is none, none is whole, or it belongs to another run or to version 0.1.
@@ -169,9 +135,9 @@ def load_latest(
         if problems:
             warnings.warn(f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2)
         return found
-    raise CheckpointError(
-        f"no whole checkpoint in {folder}: {'; '.join(problems)}" if problems else f"no checkpoint in {folder}"
-    )
+    if problems:
+        raise CheckpointError(f"no whole checkpoint in {folder}: {'; '.join(problems)}")
+    raise CheckpointError(f"no checkpoint in {folder}")
 
 
 def refuse_format(what: object, found: Any) -> str | None:
@@ -182,16 +148,30 @@ def refuse_format(what: object, found: Any) -> str | None:
     return f"{what} {origin}; this version reads format {FORMAT}: train it again, or use the version that made it"
 
 
-def _read_meta(path: Path) -> dict[str, Any]:
-    file = path / _META
+def find_checkpoint(path: Path) -> Checkpoint:
+    """The weights of one checkpoint, or of a run or its ``checkpoints`` folder: the newest that is whole."""
+    hint = "give a run folder or one of its checkpoints"
     try:
-        there = file.is_file()
-    except OSError as error:  # a name that is too long, or a folder nobody may enter
+        names = os.listdir(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError) as error:  # the last for names that no file can have
+        raise CheckpointError(f"{path} is not a folder; {hint}") from error
+    except OSError as error:
         raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
-    if not there:
-        raise CheckpointError(f"{path} is not a checkpoint: {_META} is missing")
+    if _META in names:
+        return load_checkpoint(path, weights_only=True)
+    for folder in (path / "checkpoints", path):
+        if list_checkpoints(folder):
+            return load_latest(folder, weights_only=True)
+    raise CheckpointError(f"{path} holds no checkpoint; {hint}")
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
     try:
-        meta: Any = read_json(file)
+        meta: Any = read_json(path / _META)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} is not a checkpoint: {_META} is missing") from error
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
     except ValueError as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} is not JSON ({error})") from error
     if not isinstance(meta, dict):
@@ -201,12 +181,16 @@ def _read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _load_trainer(path: Path) -> dict[str, Any]:
+def _read_part(file: Path, sums: dict[str, str], read: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    """What a part of a checkpoint holds, if it is the one that was saved."""
     try:
-        state: dict[str, Any] = torch.load(path / _TRAINER, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise CheckpointError(f"{_TRAINER} in {path} holds more than tensors, numbers and text; not loaded") from error
-    except Exception as error:  # torch and zipfile name damage in many ways
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise CheckpointError(f"{_TRAINER} in {path} is damaged; not loaded ({reason})") from error
-    return state
+        if checksum(file) == sums.get(file.name):
+            return read(file)
+        damage = f"does not have the checksum in {_META}"
+    except FileNotFoundError:
+        damage = "is missing"
+    except pickle.UnpicklingError:
+        damage = "holds more than tensors, numbers and text; not loaded"
+    except Exception as error:  # torch, zipfile and safetensors name damage in many ways
+        damage = f"cannot be read ({type(error).__name__}: {error})"[:300]
+    raise CheckpointError(f"checkpoint {file.parent} is damaged: {file.name} {damage}")

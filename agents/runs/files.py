@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,11 +34,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        ValueError: it does not hold JSON.
-    """
+    """Read a JSON file; a ``ValueError`` if it does not hold JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # no text, no JSON, too many digits, nested too deeply
@@ -51,12 +48,7 @@ def checksum(path: Path) -> str:
 
 
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
-    """Whether ``values`` is what the ``eval.json`` of a finished run holds.
-
-    Args:
-        values: content of the file.
-        needed: keys that have to be there.
-    """
+    """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run holds."""
     if not isinstance(values, dict) or values.get("status", "finished") != "finished" or not set(needed) <= set(values):
         return False
     returns, lengths = values.get("returns", []), values.get("lengths", [])
@@ -74,21 +66,13 @@ def _is_number(value: Any) -> bool:
 
 
 class CsvLog:
-    """A table that grows by whole rows and can be cut back to a frame count.
+    """A table, first column ``frames``, that grows by whole rows; on opening, what is beyond ``keep_frames`` is dropped."""
 
-    Args:
-        path: file; created with a header if it does not exist.
-        columns: names, the first is ``frames``.
-        keep_frames: on opening, drop every row beyond this many frames, and every unfinished row; None keeps all.
-    """
-
-    def __init__(self, path: Path, columns: Sequence[str], keep_frames: int | None = None) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], keep_frames: int = 0) -> None:
         self.path, self.columns = path, list(columns)
-        if keep_frames is not None or not path.exists():
-            rows = read_csv(path) if path.exists() else []
-            kept = [row for row in rows if keep_frames is not None and int(row["frames"]) <= keep_frames]
-            lines = [self.columns, *([row.get(name, "") for name in self.columns] for row in kept)]
-            write_atomic(path, "".join(",".join(cells) + "\n" for cells in lines))
+        rows = read_csv(path) if path.exists() else []
+        kept = [[row.get(name, "") for name in columns] for row in rows if int(row["frames"]) <= keep_frames]
+        write_atomic(path, "".join(",".join(cells) + "\n" for cells in [columns, *kept]))
         self._stream = path.open("a", newline="", encoding="utf-8")
 
     def append(self, row: Mapping[str, Any]) -> None:
@@ -102,11 +86,7 @@ class CsvLog:
 
 
 def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a table whose first column is ``frames``, without an unfinished or damaged last one.
-
-    Raises:
-        ValueError: it is no such table.
-    """
+    """Rows of a table (else ``ValueError``) whose first column is ``frames``, without unfinished or damaged ones."""
     try:
         text = path.read_text(encoding="utf-8")
         rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
@@ -117,12 +97,8 @@ def read_csv(path: Path) -> list[dict[str, str]]:
     header = rows[0]
     if header.count("frames") != 1 or header[0] != "frames":
         raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
-    return [dict(zip(header, row, strict=True)) for row in rows[1:] if len(row) == len(header) and _is_count(row[0])]
-
-
-def _is_count(cell: str) -> bool:
-    """Whether a cell is a number of frames; 15 digits are more than anybody trains."""
-    return cell.isascii() and cell.isdigit() and len(cell) <= 15
+    whole = [row for row in rows[1:] if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])]
+    return [dict(zip(header, row, strict=True)) for row in whole]
 
 
 def _cell(value: Any) -> str:

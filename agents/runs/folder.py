@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 import arcade_torch
 from arcade_torch.agents.config import TrainConfig, differing_fields
 from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format
-from arcade_torch.agents.runs.files import CsvLog, is_final, read_json, write_json
+from arcade_torch.agents.runs.files import is_final, read_json, write_json
 
 METRIC_COLUMNS = (
     "frames", "updates", "grad_steps", "seconds", "fps",
@@ -33,7 +33,6 @@ EVAL_COLUMNS = ("frames", "mean", "std", "n")
 LOCK = "lock"
 """File in a run folder that the process which trains there holds locked. The file itself stays; a killed process
 loses the lock at once."""
-_PACKAGES = ("torch", "torchrl", "tensordict", "jax", "numpy")
 
 
 class RunFolderError(RuntimeError):
@@ -41,11 +40,7 @@ class RunFolderError(RuntimeError):
 
 
 class RunFolder:
-    """Paths and small files of one run.
-
-    Args:
-        path: the folder; looked at by :meth:`check`, created by :meth:`claim`.
-    """
+    """Paths and small files of one run, in a folder that :meth:`check` looks at and :meth:`claim` creates."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -55,14 +50,8 @@ class RunFolder:
         self._reported = 0.0
 
     def check(self, config: TrainConfig, resume: bool) -> None:
-        """Refuse a folder that this run may not use; writes nothing.
-
-        Args:
-            config: of the run.
-            resume: whether a folder that holds this run already may be used.
-
-        Raises:
-            RunFolderError: the folder holds something and ``resume`` is off, holds another run, or cannot be written.
+        """Refuse, by a ``RunFolderError``, a folder that holds something (with ``resume``: another run) or that cannot be
+        written; change nothing.
         """
         if self._config.is_file() and resume:
             self._check_same(config)
@@ -75,10 +64,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def claim(self, config: TrainConfig) -> Iterator[None]:
-        """Hold the folder for this process alone, and make it ready.
-
-        Creates the folder, takes its lock, removes what a killed process left half written, and writes
-        ``config.json`` unless it is there already.
+        """Hold the folder for this process alone; what a killed process left half written is removed.
 
         Raises:
             RunFolderError: another process trains here, the folder holds another run, or it cannot be written.
@@ -125,13 +111,6 @@ class RunFolder:
         needed = ("status", "frames", "seconds", "returns", "lengths", "train_max_ewm")
         return result if is_final(result, needed) and result["frames"] is not None else None
 
-    def open_logs(self, frames: int) -> tuple[CsvLog, CsvLog]:
-        """``metrics.csv`` and ``eval.csv``, cut back to ``frames``."""
-        return (
-            CsvLog(self.path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames),
-            CsvLog(self.path / "eval.csv", EVAL_COLUMNS, keep_frames=frames),
-        )
-
     def report(self, frames: int, total_frames: int, status: str, **more: Any) -> None:
         """Replace ``progress.json``; while running at most about once a second."""
         now = time.monotonic()
@@ -151,10 +130,5 @@ def wait_until_free(path: Path, limit_s: float) -> None:
 
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
-    found = {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__}
-    for name in _PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    others = {name: importlib.metadata.version(name) for name in ("torch", "torchrl", "tensordict", "jax", "numpy")}
+    return {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__, **others}

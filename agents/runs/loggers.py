@@ -7,13 +7,10 @@ import uuid
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import write_atomic
-
-LoggerName = Literal["none", "tensorboard", "wandb"]
-TIME_COLUMNS = ("seconds", "fps")
 
 
 class LoggerError(RuntimeError):
@@ -21,39 +18,29 @@ class LoggerError(RuntimeError):
 
 
 def check_logger(name: str) -> None:
-    """Refuse a logger whose package is missing.
-
-    Args:
-        name: see ``TrainConfig.logger``.
-
-    Raises:
-        LoggerError: its package is not installed.
-    """
+    """Refuse a logger (see ``TrainConfig.logger``) whose package is missing, by a ``LoggerError``."""
     if name != "none" and importlib.util.find_spec(name) is None:
         raise LoggerError(f"logger={name!r} needs a package that is missing: pip install 'arcade-torch[loggers]'")
 
 
 class RunLogger:
-    """Hands rows to one of TorchRL's loggers, with the frame count as step; after its first error it stays silent.
+    """Hands rows to the logger of TorchRL that a run names, at their frame count; after its first error it stays silent.
 
     Args:
-        open_logger: makes a logger of TorchRL; None logs nothing.
+        config: of the run.
+        folder: of the run, which exists; TensorBoard writes to ``tensorboard`` in it, Weights & Biases to ``wandb``.
+        frames: where the run goes on; what TensorBoard shows beyond is dropped, as in the CSV files.
     """
 
-    def __init__(self, open_logger: Callable[[], Any] | None = None) -> None:
-        self._logger = self._try(open_logger) if open_logger is not None else None
+    def __init__(self, config: TrainConfig, folder: Path, frames: int) -> None:
+        open_logger = {"none": None, "tensorboard": _tensorboard, "wandb": _wandb}[config.logger]
+        self._logger = open_logger and self._try(lambda: open_logger(config, folder, frames))
 
     def log(self, group: str, row: Mapping[str, Any]) -> None:
-        """Log the numbers of a row of ``metrics.csv`` or ``eval.csv`` at step ``frames``; empty cells are left out.
-
-        Args:
-            group: ``"train"`` or ``"eval"``; stands before the name, except that times stand under ``"time"``.
-            row: what to log.
-        """
-        if self._logger is not None:
-            names = {key: "time" if key in TIME_COLUMNS else group for key in row if key != "frames"}
+        """Log a row of ``metrics.csv`` or ``eval.csv``, without empty cells, as ``group/name``, of times ``time/name``."""
+        if (logger := self._logger) is not None:
+            names = {key: "time" if key in ("seconds", "fps") else group for key in row if key != "frames"}
             found = {f"{name}/{key}": float(row[key]) for key, name in names.items() if row[key] is not None}
-            logger = self._logger
             self._try(lambda: logger.log_metrics(found, step=int(row["frames"])))
 
     def close(self) -> None:
@@ -69,25 +56,8 @@ class RunLogger:
             return call()
         except Exception as error:
             self._logger = None
-            warnings.warn(
-                f"logging ends here, the run and its CSV files go on: {type(error).__name__}: {error}", stacklevel=3
-            )
-
-
-def open_logger(config: TrainConfig, folder: Path, frames: int) -> RunLogger:
-    """Open the logger of a run, or go on with it.
-
-    Args:
-        config: of the run.
-        folder: of the run, which exists; TensorBoard writes to ``tensorboard`` in it, Weights & Biases to ``wandb``.
-        frames: where the run goes on; what TensorBoard shows beyond is dropped, as in the CSV files.
-
-    Returns:
-        The logger; a silent one if it could not be opened.
-    """
-    makers = {"tensorboard": _tensorboard, "wandb": _wandb}
-    make = makers.get(config.logger)
-    return RunLogger(None if make is None else lambda: make(config, folder, frames))
+            said = f"logging ends here, the run and its CSV files go on: {type(error).__name__}: {error}"
+            warnings.warn(said, stacklevel=3)
 
 
 def _tensorboard(config: TrainConfig, folder: Path, frames: int) -> Any:

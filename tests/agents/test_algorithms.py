@@ -1,6 +1,8 @@
 """Every algorithm in its trainer: acting is learning, updates work, a saved moment goes on to the bit."""
 
 import io
+import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -176,3 +178,25 @@ def test_the_target_network_is_renewed_every_so_many_updates():
         target = trainer.learner.loss.target_value_network_params["head", "weight"].data
         seen.append(torch.equal(target, before))
     assert seen == [True, False, True, False]
+
+
+@pytest.mark.parametrize("memory", ["lru", "mingru", "gru"])
+def test_an_update_opens_at_most_eight_files_which_the_architecture_page_names(memory):
+    root, opened = Path(__file__).resolve().parents[2], {}
+    trainer = Trainer(config("pqn", memory))
+    batch = trainer.collector.collect()
+
+    def look(frame, event, argument):
+        file = Path(frame.f_code.co_filename).resolve()
+        if event == "call" and file.parent in (root / "agents", root / "models"):
+            opened[str(file.relative_to(root))] = None
+
+    sys.setprofile(look)
+    try:
+        trainer.learner.update(batch, 0)
+    finally:
+        sys.setprofile(None)
+    page = (root / "docs" / "architecture.md").read_text().partition("What an update of PQN reads")[2]
+    table = page.partition("\n\n|")[2].partition("\n\n")[0].replace("models/lru.py", f"models/{memory}.py")
+    named = re.findall(r"^\| `(\w+/\w+\.py)`", table, flags=re.MULTILINE)
+    assert list(opened) == [file for file in named if file in opened] and 5 < len(opened) <= 8

@@ -5,9 +5,8 @@ import json
 
 import pytest
 
-from arcade_torch.agents.config import GROUPS, TrainConfig, differing_fields
-from arcade_torch.agents.dqn import DQNConfig
-from arcade_torch.agents.pqn import PQNConfig
+from arcade_torch.agents.config import GROUPS, DQNConfig, PQNConfig, TrainConfig, differing_fields
+from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
 
 
@@ -194,9 +193,9 @@ def test_a_schedule_is_counted_in_frames(algorithm):
     start, end = numbers.learning_rate, numbers.learning_rate_end
     for frames in (0, fall // 2, fall, total):
         expected = end if frames >= fall else start + (end - start) * frames / fall
-        assert numbers.learning_rate_at(frames, total) == pytest.approx(expected)
+        assert learning_rate_at(numbers, frames, total) == pytest.approx(expected)
     if algorithm != "ppo":
-        found = [numbers.epsilon_at(frames, total) for frames in (0, 4_000_000, 8_000_000, total)]
+        found = [epsilon_at(numbers, frames, total) for frames in (0, 4_000_000, 8_000_000, total)]
         assert found == pytest.approx([1.0, 0.525, 0.05, 0.05])
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from arcade_torch.agents import DQNConfig, DQNLoss
+from arcade_torch.agents.learner import epsilon_at
 from tests.agents.fakes import GAMMA, chosen, look_into, play, stream, toy_network
 
 
@@ -81,7 +82,7 @@ def test_the_defaults_are_those_of_the_published_code_but_for_fresh_targets():
     assert (c.lam, c.batch_sequences, c.learning_starts, c.minibatches, c.epochs) == (0.0, 32, 32, 16, 4)
     assert (c.targets, c.target_every, c.burn_in, c.time_limit) == ("recompute", 0, 0, "bootstrap")
     assert c.replay_sequences == 992  # of 1,000: whole windows of 16 environments
-    assert c.epsilon_at(0, 10**7) == 1.0 and c.epsilon_at(4 * 10**6, 10**7) == 0.05
+    assert epsilon_at(c, 0, 10**7) == 1.0 and epsilon_at(c, 4 * 10**6, 10**7) == 0.05
 
 
 @pytest.mark.parametrize("bad", [{"replay_frames": 4000}, {"replay_frames": 0}, {"learning_starts": 2000}])

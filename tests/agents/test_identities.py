@@ -16,10 +16,10 @@ from torchrl.objectives import DQNLoss as TorchRLDQNLoss
 from torchrl.objectives.value import GAE, TDLambdaEstimator
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate, vec_td_lambda_return_estimate
 
+from arcade_torch.agents import gae, q_lambda_return
 from arcade_torch.agents.dqn import DQNLoss
 from arcade_torch.agents.ppo import PPOLoss, make_actor
 from arcade_torch.agents.pqn import PQNLoss
-from arcade_torch.agents.returns import gae, q_lambda_return
 from tests.contracts.pomdp import ENVS, HIDDEN, STEPS, Eye, collected, explorer, network
 
 GAMMA, LAM = 0.9, 0.7

@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
+from arcade_torch.agents import EvalResult
 from arcade_torch.agents.learner import linear, make_optimizer, set_learning_rate
-from arcade_torch.agents.metrics import EpisodeStats, confidence_95, ewm, paper_score
+from arcade_torch.agents.metrics import EpisodeStats, ewm, paper_score
 
 
 def test_the_ewm_is_the_explicit_weighted_sum():
@@ -80,8 +81,8 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
 
 
 def test_the_interval_is_that_of_the_normal_mean():
-    assert confidence_95([1.0, 3.0]) == pytest.approx(1.96)
-    assert confidence_95([1.0]) == 0.0
+    assert EvalResult(np.array([1.0, 3.0]), np.ones(2)).ci == pytest.approx(1.96)
+    assert EvalResult(np.array([1.0]), np.ones(1)).ci == 0.0
 
 
 def test_linear_meets_both_ends_and_stays():

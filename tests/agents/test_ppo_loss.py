@@ -7,6 +7,7 @@ import torch
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
+from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.ppo import normalise
 from tests.agents.fakes import GAMMA, LAM, chosen, play, stream, summed_errors, toy_actor_critic, with_two_states
 
@@ -148,6 +149,6 @@ def test_the_defaults_are_the_papers():
     c = PPOConfig()
     assert (c.num_envs, c.num_steps, c.epochs, c.minibatches, c.gamma, c.lam) == (16, 128, 4, 16, 0.99, 0.95)
     assert (c.clip, c.entropy_coeff, c.critic_coeff, c.max_grad_norm) == (0.2, 0.01, 0.5, 0.5)
-    assert c.learning_rate_at(0, 10**7) == 1e-4 and c.learning_rate_at(10**7, 10**7) == 1e-10
-    assert c.learning_rate_at(5 * 10**6, 10**7) == pytest.approx((1e-4 + 1e-10) / 2)
-    assert c.epsilon_at(0, 10**7) is None and c.steps_before == 0
+    assert learning_rate_at(c, 0, 10**7) == 1e-4 and learning_rate_at(c, 10**7, 10**7) == 1e-10
+    assert learning_rate_at(c, 5 * 10**6, 10**7) == pytest.approx((1e-4 + 1e-10) / 2)
+    assert epsilon_at(c, 0, 10**7) is None and c.steps_before == 0

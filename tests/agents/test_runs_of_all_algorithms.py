@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import random
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from arcade_torch.agents import CheckpointError, NonFiniteError, evaluate, load,
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import read_csv
-from tests.agents.test_training import assert_same_run, stop_after, weights
+from tests.agents.test_training import assert_same_run, kill_and_resume, stop_after, weights
 
 ALGORITHMS = ("ppo", "dqn")  # PQN: test_training
 CHANGES = {"env": "CartPoleEasy-v0", "memory": "gru", "total_frames": 256, "checkpoint_every": 128, "eval_episodes": 4}
@@ -39,6 +40,12 @@ def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(who
     with pytest.raises(ZeroDivisionError):
         train(what, tmp_path / "run", progress=stop_after(updates, crash))
     assert train(what, tmp_path / "run", resume=True).status == "finished"
+    assert_same_run(tmp_path / "run", folder)
+
+
+def test_a_killed_run_goes_on_to_the_bit_in_another_process(whole, tmp_path):
+    what, folder, _ = whole
+    kill_and_resume(tmp_path / "run", random.Random(5), what)  # three updates, the checkpoint is of two
     assert_same_run(tmp_path / "run", folder)
 
 

@@ -227,11 +227,11 @@ train(TrainConfig.from_dict(json.loads(sys.argv[1])), sys.argv[2])
 """
 
 
-def kill_and_resume(folder: Path, rng: random.Random) -> int:
+def kill_and_resume(folder: Path, rng: random.Random, config: TrainConfig = CONFIG) -> int:
     """Start a run in another process, kill it at a random moment, go on here; returns how many rows it had left."""
-    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(CONFIG.to_dict()), str(folder)])
+    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(config.to_dict()), str(folder)])
     try:
-        rows, deadline = rng.randint(1, 9), time.monotonic() + 120
+        rows, deadline = rng.randint(1, config.num_updates - 1), time.monotonic() + 120
         log = folder / "metrics.csv"
         while process.poll() is None and not (log.is_file() and log.read_text().count("\n") > rows):
             assert time.monotonic() < deadline, "the run does not get on"
@@ -241,7 +241,7 @@ def kill_and_resume(folder: Path, rng: random.Random) -> int:
         process.kill()
         process.wait()
     left = len(read_csv(log))
-    assert train(CONFIG, folder, resume=True).status == "finished"
+    assert train(config, folder, resume=True).status == "finished"
     return left
 
 
