@@ -1,4 +1,4 @@
-"""How a value that is refused stands in a message: on one line, and not longer than a line."""
+"""What a refusal says: the value that arrived, on one line, and what is allowed."""
 
 from typing import Any
 
@@ -15,3 +15,19 @@ def shown(value: Any) -> str:
     """
     text = " ".join(repr(value).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
+
+
+def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    """Refuse a value outside a closed set.
+
+    Args:
+        what: Name of the option, for the message.
+        value: What arrived.
+        allowed: All values that are allowed.
+
+    Raises:
+        ValueError: ``value`` is not one of ``allowed``.
+    """
+    kinds = tuple({type(one) for one in allowed})
+    if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
+        raise ValueError(f"{what} is {shown(value)}, allowed: {', '.join(map(repr, allowed))}")

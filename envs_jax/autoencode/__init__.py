@@ -1,13 +1,11 @@
 """AutoEncode: watch a row of cards, then name their suits in reverse order."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.autoencode import rules as law
 from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
+from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.autoencode.picture import Screen
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 
 
 class AutoEncode(Game[AutoEncodeState]):
@@ -37,6 +35,8 @@ class AutoEncode(Game[AutoEncodeState]):
         ValueError: ``mdp_marker`` is not a bool.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
         if mdp_marker is not None and not isinstance(mdp_marker, bool):
             raise ValueError(f"mdp_marker is {mdp_marker!r}, allowed: True, False, or None for what the rules say")
@@ -58,16 +58,3 @@ class AutoEncode(Game[AutoEncodeState]):
     def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> AutoEncode:
-        return AutoEncode(level, id=id, obs_size=obs_size, rules=rules, mdp_marker=mdp_marker)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -16,7 +16,7 @@ def turn(selected: npt.NDArray[Any], wanted: npt.NDArray[Any]) -> npt.NDArray[np
     return np.select([ahead == 0, ahead == SUITS - 1], [FIRE, RIGHT], LEFT).astype(np.int32)
 
 
-class AutoEncodeState:
+class StateOracle:
     """Sees the cards; answers every one of them in at most three steps, and always reaches the highest return.
 
     It turns the selector to the last card during the watch, which the reference's forced first answer needs.
@@ -33,7 +33,7 @@ class AutoEncodeState:
         return np.where((action == FIRE) & (seen.timestep < self.cards), UP, action).astype(np.int32)
 
 
-class AutoEncodeFrames:
+class FramesOracle:
     """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing.
 
     Args:

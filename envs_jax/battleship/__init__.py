@@ -1,13 +1,11 @@
 """BattleShip: hunt hidden ships with a cursor."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.battleship import rules as law
 from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
+from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.battleship.picture import Screen
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 
 
 class BattleShip(Game[BattleShipState]):
@@ -32,6 +30,8 @@ class BattleShip(Game[BattleShipState]):
     cursor starts on any cell, a mark has one colour in both twins and at all times.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
         self.max_steps = level.max_steps
@@ -49,16 +49,3 @@ class BattleShip(Game[BattleShipState]):
     def render(self, state: BattleShipState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> BattleShip:
-        return BattleShip(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

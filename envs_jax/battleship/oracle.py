@@ -20,7 +20,7 @@ def distances(x: Board, y: Board, side: int) -> npt.NDArray[np.int64]:
     return away
 
 
-class BattleShipState:
+class StateOracle:
     """Sees the ships: goes to the nearest ship cell that is not hit yet and fires. The return is always 1."""
 
     def __init__(self, game: Any) -> None:
@@ -34,7 +34,7 @@ class BattleShipState:
         return towards(seen.x, seen.y, goal // self.side, goal % self.side)
 
 
-class BattleShipFrames:
+class FramesOracle:
     """Sees the POMDP's frames: remembers every mark and fires where a ship is likely and near.
 
     The score of a cell counts the straight places of every ship that hold the cell and no known water; places that hold

@@ -1,13 +1,12 @@
 """Breakout: clear a wall with a ball that the POMDP shows only on its way up."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.breakout import rules as law
 from arcade_torch.envs_jax.breakout.numbers import LEVELS, MAX_STEPS, Level
+from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
-from arcade_torch.envs_jax.game import Array, Game, Rules, check_choice
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.shown import check_choice
 
 
 class Breakout(Game[BreakoutState]):
@@ -37,6 +36,8 @@ class Breakout(Game[BreakoutState]):
         ValueError: Unknown ``tail``.
         TypeError: ``random_start`` is not a bool.
     """
+
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
         self,
@@ -68,18 +69,3 @@ class Breakout(Game[BreakoutState]):
     def render(self, state: BreakoutState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(
-        *, id: str, obs_size: int, rules: Rules, tail: Tail = "direction", random_start: bool = False
-    ) -> Breakout:
-        return Breakout(level, id=id, obs_size=obs_size, rules=rules, tail=tail, random_start=random_start)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

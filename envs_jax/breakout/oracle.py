@@ -19,7 +19,7 @@ def follow(ball_x: Any, pos: Any, level: Level) -> npt.NDArray[np.int32]:
     return np.where(goal > pos, RIGHT, np.where(goal < pos, LEFT, UP)).astype(np.int32)
 
 
-class BreakoutState:
+class StateOracle:
     """Sees the ball and keeps the paddle under it, which clears the wall."""
 
     def __init__(self, game: Any) -> None:
@@ -30,7 +30,7 @@ class BreakoutState:
         return follow(seen.ball_x, seen.pos, self.level)
 
 
-class BreakoutFrames:
+class FramesOracle:
     """Sees the POMDP's frames: carries the ball on by the known law while it is hidden.
 
     Bricks and paddle are always seen. The ball is seen on its way up, the first of it in the first frame, so that two

@@ -1,13 +1,12 @@
 """CartPole and NoisyCartPole: keep the pole up, seen as a picture with velocity arrows."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.cartpole import rules as law
 from arcade_torch.envs_jax.cartpole.numbers import LEVELS, Level
+from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.cartpole.picture import ARROWS, Arrow, Screen
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
-from arcade_torch.envs_jax.game import Array, Game, Rules, check_choice
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.shown import check_choice
 
 
 class CartPole(Game[CartPoleState]):
@@ -35,6 +34,8 @@ class CartPole(Game[CartPoleState]):
         ValueError: Unknown ``arrow``.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
         check_choice("arrow", arrow, ARROWS)
         self.level, self.id, self.obs_size, self.rules, self.arrow = level, id, obs_size, rules, arrow
@@ -53,16 +54,3 @@ class CartPole(Game[CartPoleState]):
     def render(self, state: CartPoleState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> CartPole:
-        return CartPole(level, id=id, obs_size=obs_size, rules=rules, arrow=arrow)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level), aliases=[_name.replace("Cart", "")] if "Noisy" in _name else [])

@@ -21,7 +21,7 @@ def feedback(pose: Any) -> Any:
     return sum(gain * pose[..., i] for i, gain in enumerate(GAINS))
 
 
-class CartPoleState:
+class StateOracle:
     """Sees the state; keeps the pole up for as long as the episode lasts."""
 
     def __init__(self, game: Any) -> None:
@@ -41,7 +41,7 @@ class Belief(NamedTuple):
     key: Array  # uint32 [2]
 
 
-class CartPoleFrames:
+class FramesOracle:
     """Sees the POMDP's frames: reads the two arrows, and keeps a belief over poses.
 
     The dynamics are known and deterministic, the start is known to 0.05, and every picture tells in which of eight

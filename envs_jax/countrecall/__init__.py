@@ -1,13 +1,11 @@
 """CountRecall: say how often the queried suit has been dealt."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.countrecall import rules as law
 from arcade_torch.envs_jax.countrecall.numbers import LEVELS, MOVE_BUDGET, Level
+from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.countrecall.picture import Screen
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 
 LARGEST_BUDGET = 800  # the counter of the reference, which is not held, then stays within three digits
 
@@ -37,6 +35,8 @@ class CountRecall(Game[CountRecallState]):
         ValueError: ``move_budget`` is not an integer from 0 to 800.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
         if isinstance(move_budget, bool) or not isinstance(move_budget, int) or not 0 <= move_budget <= LARGEST_BUDGET:
             raise ValueError(f"move_budget is {move_budget!r}, allowed: an integer from 0 to {LARGEST_BUDGET}")
@@ -59,16 +59,3 @@ class CountRecall(Game[CountRecallState]):
     def render(self, state: CountRecallState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> CountRecall:
-        return CountRecall(level, id=id, obs_size=obs_size, rules=rules, move_budget=move_budget)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -1,13 +1,11 @@
 """Navigator: find the treasure, avoid TNT, on a map that the POMDP shows only once."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.game import Array, Game, Rules
 from arcade_torch.envs_jax.navigator import rules as law
 from arcade_torch.envs_jax.navigator.numbers import LEVELS, Level
+from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.navigator.picture import Screen
 from arcade_torch.envs_jax.navigator.rules import NavigatorState
-from arcade_torch.envs_jax.registry import register
 
 
 class Navigator(Game[NavigatorState]):
@@ -32,6 +30,8 @@ class Navigator(Game[NavigatorState]):
     colours are blended.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
         self.max_steps = level.max_steps
@@ -51,16 +51,3 @@ class Navigator(Game[NavigatorState]):
     def render(self, state: NavigatorState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Navigator:
-        return Navigator(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -1,11 +1,9 @@
 """Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten games."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 from arcade_torch.envs_jax.signpost import rules as law
 from arcade_torch.envs_jax.signpost.numbers import LEVELS, Level
+from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.signpost.picture import Screen
 from arcade_torch.envs_jax.signpost.rules import SignpostState
 
@@ -29,6 +27,8 @@ class Signpost(Game[SignpostState]):
     Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory") with four ways on.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
         self.max_steps = level.max_steps
@@ -46,16 +46,3 @@ class Signpost(Game[SignpostState]):
     def render(self, state: SignpostState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Signpost:
-        return Signpost(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level), probe=True)

@@ -1,11 +1,9 @@
 """Skittles: dodge blocks that fall, and flicker in the POMDP."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 from arcade_torch.envs_jax.skittles import rules as law
 from arcade_torch.envs_jax.skittles.numbers import LEVELS, MAX_STEPS, Level
+from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.skittles.picture import Screen
 from arcade_torch.envs_jax.skittles.rules import SkittlesState
 
@@ -34,6 +32,8 @@ class Skittles(Game[SkittlesState]):
         ValueError: ``hit_reward`` is positive or beyond -1.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
         if not -1 <= hit_reward <= 0:
             raise ValueError(f"hit_reward is {hit_reward!r}, allowed: -1 to 0")
@@ -54,16 +54,3 @@ class Skittles(Game[SkittlesState]):
     def render(self, state: SkittlesState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> Skittles:
-        return Skittles(level, id=id, obs_size=obs_size, rules=rules, hit_reward=hit_reward)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

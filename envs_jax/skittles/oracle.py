@@ -82,7 +82,7 @@ class Planner:
         return moves
 
 
-class SkittlesState:
+class StateOracle:
     """Sees all blocks."""
 
     def __init__(self, game: Any) -> None:
@@ -93,7 +93,7 @@ class SkittlesState:
         return self.planner.plan(seen.x, seen.column)
 
 
-class SkittlesFrames:
+class FramesOracle:
     """Sees the POMDP's frames: every block seen once is remembered while it falls.
 
     A block has nine looks before it can hit; the one in 512 that is never seen is what the player cannot avoid but by

@@ -1,11 +1,9 @@
 """Tetris: clear ten lines; the POMDP twin hides the pile."""
 
-from typing import Any
-
 from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
 from arcade_torch.envs_jax.tetris import rules as law
 from arcade_torch.envs_jax.tetris.numbers import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Level
+from arcade_torch.envs_jax.tetris.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.tetris.picture import Screen
 from arcade_torch.envs_jax.tetris.rules import TetrisState
 
@@ -33,6 +31,8 @@ class Tetris(Game[TetrisState]):
     return never exceeds 1, topping out always costs 1, the time limit does not terminate.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
         self.max_steps = MAX_STEPS
@@ -51,16 +51,3 @@ class Tetris(Game[TetrisState]):
     def render(self, state: TetrisState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Tetris:
-        return Tetris(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -154,7 +154,7 @@ class Planner:
         return action.astype(np.int32)
 
 
-class TetrisState:
+class StateOracle:
     """Sees the pile: looks where the coming piece can be brought, and takes the place that leaves the best pile."""
 
     def __init__(self, game: Any) -> None:
@@ -168,7 +168,7 @@ class TetrisState:
         return self.planner.act(pile, piece, is_init | seen.just_locked)
 
 
-class TetrisFrames:
+class FramesOracle:
     """Sees the POMDP's frames: adds every piece to a remembered pile when it comes to lie, and plays as if it saw it.
 
     Nothing is lost: a piece lies when its cells have the floor or the remembered pile below them, or when a band
