@@ -100,3 +100,25 @@ class Game(abc.ABC, Generic[State]):
     def __repr__(self) -> str:
         """The call that makes this game again."""
         return f"make({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
+
+
+class ScreenGame(Game[State]):
+    """What the games of this package have alike: numbers of each difficulty, ``levels``, and a ``screen`` that draws.
+
+    Args:
+        level: Numbers of the difficulty.
+        id: Versioned id.
+        obs_size: 128 or 256.
+        rules: ``"default"`` or ``"reference"``; each game says what the reference does otherwise.
+    """
+
+    levels: ClassVar[Mapping[str, Any]]
+    screen: Any
+
+    def __init__(self, level: Any, *, id: str, obs_size: int, rules: Rules) -> None:
+        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+
+    def render(self, state: State, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        frame: Array = self.screen.draw(state, partial)
+        return frame

@@ -17,6 +17,8 @@ from arcade_torch.envs_jax import registry
 from arcade_torch.envs_jax.game import Array, Game
 from arcade_torch.envs_jax.shown import check_choice
 
+Stepped = tuple[Array, Any, Array, Array, dict[str, Array]]
+
 
 class EnvParams(NamedTuple):
     """What may differ from call to call: a pytree to trace, and hashable as it stands, so that it may be static too."""
@@ -99,9 +101,7 @@ class GymnaxEnv:
         state = self.game.reset(key)
         return self.get_obs(state, params), state
 
-    def step(
-        self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None
-    ) -> tuple[Array, Any, Array, Array, dict[str, Array]]:
+    def step(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
         """Take one action; where that ends the episode, go on with the first observation of a new one.
 
         Args:
@@ -117,14 +117,12 @@ class GymnaxEnv:
         following, _, outcome = self.game.step_autoreset(key, state, jnp.asarray(action, jnp.int32))
         return self._stepped(following, outcome, params)
 
-    def step_env(
-        self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None
-    ) -> tuple[Array, Any, Array, Array, dict[str, Array]]:
+    def step_env(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
         """``step`` without the new episode: an end shows the final observation."""
         following, *outcome = self.game.step(key, state, jnp.asarray(action, jnp.int32))
         return self._stepped(following, outcome, params)
 
-    def _stepped(self, state: Any, outcome: Any, params: EnvParams | None) -> Any:
+    def _stepped(self, state: Any, outcome: Any, params: EnvParams | None) -> Stepped:
         reward, terminated, truncated = outcome
         info = {"discount": 1.0 - terminated, "terminated": terminated, "truncated": truncated}
         return self.get_obs(state, params), state, reward, terminated | truncated, info

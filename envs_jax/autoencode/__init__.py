@@ -5,10 +5,10 @@ from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
 from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.autoencode.picture import Screen
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 
 
-class AutoEncode(Game[AutoEncodeState]):
+class AutoEncode(ScreenGame[AutoEncodeState]):
     """Watch N cards of four suits, one a step, then give the suits back, the last one first.
 
     For the first N steps the card of the step is on the table, whatever the player does. From then on action 4 answers
@@ -20,9 +20,6 @@ class AutoEncode(Game[AutoEncodeState]):
     the table, the selector and the number of right answers.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` makes the first step after the watch an answer whatever the action, judges both ends one
             step late (returns up to 1 + 1 / N), and leaves the stack of the MDP twin whole.
         mdp_marker: Whether answered cards leave the stack of the MDP twin. Unless given, they do by default and do not
@@ -40,7 +37,7 @@ class AutoEncode(Game[AutoEncodeState]):
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
         if mdp_marker is not None and not isinstance(mdp_marker, bool):
             raise ValueError(f"mdp_marker is {mdp_marker!r}, allowed: True, False, or None for what the rules say")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.mdp_marker = rules == "default" if mdp_marker is None else mdp_marker
         self.max_steps = level.max_steps
         self.return_range = (0.0, 1.0 + (rules == "reference") / level.cards)
@@ -54,7 +51,3 @@ class AutoEncode(Game[AutoEncodeState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return law.step(state, action, self.level, self.rules)
-
-    def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

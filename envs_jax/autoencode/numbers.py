@@ -21,8 +21,4 @@ class Level:
         return 10 * self.cards
 
 
-LEVELS = {
-    "AutoEncodeEasy": Level(26),
-    "AutoEncodeMedium": Level(52),
-    "AutoEncodeHard": Level(78),
-}
+LEVELS = {"AutoEncodeEasy": Level(26), "AutoEncodeMedium": Level(52), "AutoEncodeHard": Level(78)}

@@ -51,17 +51,7 @@ def step(
         asked = jnp.where(state.given == level.cards, 0, asked)
     right = answers & ((jnp.arange(level.cards) == asked) & (state.cards == selected)).any()
 
-    new = AutoEncodeState(
-        state.cards,
-        state.timestep + 1,
-        state.given + answers,
-        selected,
-        state.score + right,
-    )
+    new = AutoEncodeState(state.cards, state.timestep + 1, state.given + answers, selected, state.score + right)
     judged = state if late else new
-    return (
-        new,
-        jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0)),
-        judged.given >= level.cards,
-        judged.timestep >= level.max_steps,
-    )
+    reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
+    return new, reward, judged.given >= level.cards, judged.timestep >= level.max_steps

@@ -5,10 +5,10 @@ from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
 from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.battleship.picture import Screen
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 
 
-class BattleShip(Game[BattleShipState]):
+class BattleShip(ScreenGame[BattleShipState]):
     """Hit every cell of four hidden ships, of lengths 2, 3, 3 and 4, in a square sea.
 
     Actions 0 to 3 move the cursor by one cell, 4 fires at the cell under it: a ship cell pays ``1 / 12``, water pays
@@ -20,9 +20,6 @@ class BattleShip(Game[BattleShipState]):
     cursor alone. The number of hits is shown in both.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` judges the repeats one shot late (the lowest return is then one repeat lower) and never
             starts the cursor in the last row or column.
 
@@ -33,7 +30,7 @@ class BattleShip(Game[BattleShipState]):
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-2 / level.cells * (level.max_repeats + (rules == "reference")), 1.0)
         self.screen = Screen(obs_size, level)
@@ -45,7 +42,3 @@ class BattleShip(Game[BattleShipState]):
     def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return law.step(state, action, self.level, self.rules)
-
-    def render(self, state: BattleShipState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -32,8 +32,4 @@ class Level:
         return self.cells // 2
 
 
-LEVELS = {
-    "BattleShipEasy": Level(8),
-    "BattleShipMedium": Level(10),
-    "BattleShipHard": Level(12),
-}
+LEVELS = {"BattleShipEasy": Level(8), "BattleShipMedium": Level(10), "BattleShipHard": Level(12)}

@@ -111,15 +111,9 @@ def step(
     hit = fire & ~shot_before & jnp.any(here & (state.board == 1))
     again = fire & shot_before
 
-    new = BattleShipState(
-        x,
-        y,
-        state.board,
-        jnp.where(here & fire, jnp.int8(1), state.guesses),
-        state.hits + hit,
-        state.repeats + again,
-        state.timestep + 1,
-    )
+    guesses = jnp.where(here & fire, jnp.int8(1), state.guesses)
+    hits, repeats = state.hits + hit, state.repeats + again
+    new = BattleShipState(x, y, state.board, guesses, hits, repeats, state.timestep + 1)
     reward = jnp.where(hit, 1.0 / SHIP_CELLS, jnp.where(again, -2.0 / level.cells, 0.0))
     late = fire & (state.repeats >= level.max_repeats)
     bored = late if rules == "reference" else new.repeats >= level.max_repeats

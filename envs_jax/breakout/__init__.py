@@ -5,11 +5,11 @@ from arcade_torch.envs_jax.breakout.numbers import LEVELS, MAX_STEPS, Level
 from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 from arcade_torch.envs_jax.shown import check_choice
 
 
-class Breakout(Game[BreakoutState]):
+class Breakout(ScreenGame[BreakoutState]):
     """Keep a ball in play on a board of 20 x 10 cells until it has cleared a wall of 60 bricks.
 
     Actions 2 and 3 move the paddle to the left and right by one column, the others wait. Each brick pays by its row,
@@ -20,9 +20,6 @@ class Breakout(Game[BreakoutState]):
     downwards.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` pays nothing for a brick touched right after another, and lets the widest paddle begin
             partly beyond the board.
         tail: ``"direction"`` puts the tail opposite to where the ball goes next; ``"previous"`` where it was one step
@@ -52,7 +49,7 @@ class Breakout(Game[BreakoutState]):
         check_choice("tail", tail, TAILS)
         if not isinstance(random_start, bool):
             raise TypeError(f"random_start is {random_start!r}, allowed: True or False")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.tail, self.random_start = tail, random_start
         self.max_steps = MAX_STEPS
         self.return_range = (-1.0, 1.0)
@@ -65,7 +62,3 @@ class Breakout(Game[BreakoutState]):
     def step(self, key: Array, state: BreakoutState, action: Array) -> tuple[BreakoutState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return law.step(state, action, self.level, self.rules)
-
-    def render(self, state: BreakoutState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

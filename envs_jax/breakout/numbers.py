@@ -31,8 +31,4 @@ class Level:
         return COLUMNS - self.paddle
 
 
-LEVELS = {
-    "BreakoutEasy": Level(6),
-    "BreakoutMedium": Level(5),
-    "BreakoutHard": Level(4),
-}
+LEVELS = {"BreakoutEasy": Level(6), "BreakoutMedium": Level(5), "BreakoutHard": Level(4)}

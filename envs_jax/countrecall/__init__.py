@@ -5,12 +5,12 @@ from arcade_torch.envs_jax.countrecall.numbers import LEVELS, MOVE_BUDGET, Level
 from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.countrecall.picture import Screen
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 
 LARGEST_BUDGET = 800  # the counter of the reference, which is not held, then stays within three digits
 
 
-class CountRecall(Game[CountRecallState]):
+class CountRecall(ScreenGame[CountRecallState]):
     """In each of N turns a card is dealt and a suit asked for: how many cards of that suit were dealt before?
 
     Actions 0 and 1 move the counter up and down, 4 confirms what it shows: ``1 / N`` if that is right, else 0; then the
@@ -22,9 +22,6 @@ class CountRecall(Game[CountRecallState]):
     counter and the number of right answers.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` lets the counter leave the range of possible answers.
         move_budget: Counter moves that the step limit leaves, 0 to 800; 100 is the published number.
 
@@ -40,7 +37,8 @@ class CountRecall(Game[CountRecallState]):
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
         if isinstance(move_budget, bool) or not isinstance(move_budget, int) or not 0 <= move_budget <= LARGEST_BUDGET:
             raise ValueError(f"move_budget is {move_budget!r}, allowed: an integer from 0 to {LARGEST_BUDGET}")
-        self.level, self.id, self.obs_size, self.rules, self.move_budget = level, id, obs_size, rules, move_budget
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
+        self.move_budget = move_budget
         self.max_steps = level.cards + move_budget
         self.return_range = (0.0, 1.0)
         # A counter that is not held shows what it reaches, except that it stops at two digits below 0.
@@ -55,7 +53,3 @@ class CountRecall(Game[CountRecallState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return law.step(state, action, self.level, self.max_steps, self.rules)
-
-    def render(self, state: CountRecallState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

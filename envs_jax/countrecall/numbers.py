@@ -23,8 +23,4 @@ class Level:
         return -(-self.cards // self.suits)
 
 
-LEVELS = {
-    "CountRecallEasy": Level(26, 2),
-    "CountRecallMedium": Level(52, 2),
-    "CountRecallHard": Level(78, 4),
-}
+LEVELS = {"CountRecallEasy": Level(26, 2), "CountRecallMedium": Level(52, 2), "CountRecallHard": Level(78, 4)}

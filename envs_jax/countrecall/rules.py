@@ -52,13 +52,7 @@ def step(
     dealt = ((index < state.timestep) & (state.cards == query)).sum()
     right = confirm & now.any() & (answer == dealt)
 
-    new = CountRecallState(
-        state.cards,
-        state.queries,
-        state.timestep + confirm,
-        answer,
-        state.score + right,
-        state.moves + 1,
-    )
+    turn, score = state.timestep + confirm, state.score + right
+    new = CountRecallState(state.cards, state.queries, turn, answer, score, state.moves + 1)
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, new.timestep >= level.cards, new.moves >= max_steps

@@ -1,6 +1,6 @@
 """MineSweeper: sweep all safe cells with a cursor."""
 
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 from arcade_torch.envs_jax.minesweeper import rules as law
 from arcade_torch.envs_jax.minesweeper.numbers import LEVELS, Level
 from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
@@ -8,7 +8,7 @@ from arcade_torch.envs_jax.minesweeper.picture import Screen
 from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
 
 
-class MineSweeper(Game[MineSweeperState]):
+class MineSweeper(ScreenGame[MineSweeperState]):
     """Sweep every safe cell of a square board, one cell at a time.
 
     Actions 0 to 3 move the cursor by one cell, 4 sweeps the cell under it: a covered safe cell pays ``1 / safe``, a
@@ -20,9 +20,6 @@ class MineSweeper(Game[MineSweeperState]):
     cursor.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` judges repeats and time one sweep late, and never starts the cursor in the last row or
             column.
         mine_reward: Reward for hitting a mine. The published scale has 0; the paper's words ask for a negative number.
@@ -39,7 +36,7 @@ class MineSweeper(Game[MineSweeperState]):
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
         if not -1 <= mine_reward <= 0:
             raise ValueError(f"mine_reward is {mine_reward!r}, allowed: -1 to 0")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.mine_reward = float(mine_reward)
         self.max_steps = level.max_steps
         repeats = level.max_repeats + (rules == "reference")
@@ -54,7 +51,3 @@ class MineSweeper(Game[MineSweeperState]):
     def step(self, key: Array, state: MineSweeperState, action: Array) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return law.step(state, action, self.level, self.rules, self.mine_reward)
-
-    def render(self, state: MineSweeperState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -36,8 +36,4 @@ class Level:
         return self.cells // 2
 
 
-LEVELS = {
-    "MineSweeperEasy": Level(4, 2),
-    "MineSweeperMedium": Level(6, 6),
-    "MineSweeperHard": Level(8, 10),
-}
+LEVELS = {"MineSweeperEasy": Level(4, 2), "MineSweeperMedium": Level(6, 6), "MineSweeperHard": Level(8, 10)}

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
 from arcade_torch.envs_jax.minesweeper.numbers import Level
@@ -36,14 +37,8 @@ def count_neighbours(mines: Array) -> Array:
 
 
 def draw_mines(key: Array, level: Level) -> Array:
-    """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies.
-
-    The cells that drew the lowest numbers; ranking by comparison is several times faster than a sort of so few.
-    """
-    draw = jax.random.bits(key, (level.cells,))
-    index = jnp.arange(level.cells)
-    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
-    return (lower.sum(1) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
+    """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies."""
+    return (random_ranks(key, level.cells) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
 
 
 def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
@@ -78,15 +73,9 @@ def step(
     cell = jnp.sum(jnp.where(here, state.grid, 0))
     safe, mine, again = fire & (cell == COVERED_SAFE), fire & (cell == COVERED_MINE), fire & (cell == SWEPT)
 
-    new = MineSweeperState(
-        x,
-        y,
-        jnp.where(here & fire, jnp.int8(SWEPT), state.grid),
-        state.neighbours,
-        state.score + safe,
-        state.repeats + again,
-        state.timestep + 1,
-    )
+    grid = jnp.where(here & fire, jnp.int8(SWEPT), state.grid)
+    score, repeats = state.score + safe, state.repeats + again
+    new = MineSweeperState(x, y, grid, state.neighbours, score, repeats, state.timestep + 1)
     reward = jnp.where(safe, 1.0 / level.safe, jnp.where(mine, mine_reward, jnp.where(again, -2.0 / level.cells, 0.0)))
     cleared = new.score >= level.safe
     if rules == "default":

@@ -1,6 +1,6 @@
 """Navigator: find the treasure, avoid TNT, on a map that the POMDP shows only once."""
 
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 from arcade_torch.envs_jax.navigator import rules as law
 from arcade_torch.envs_jax.navigator.numbers import LEVELS, Level
 from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
@@ -8,7 +8,7 @@ from arcade_torch.envs_jax.navigator.picture import Screen
 from arcade_torch.envs_jax.navigator.rules import NavigatorState
 
 
-class Navigator(Game[NavigatorState]):
+class Navigator(ScreenGame[NavigatorState]):
     """Walk to the treasure and open it; seven blocks of TNT lie about.
 
     Actions 0 to 3 move the agent by one cell, 4 opens what it stands on. Opening the treasure pays 1 and ends the game,
@@ -19,9 +19,6 @@ class Navigator(Game[NavigatorState]):
     (3, 0.5 and 0.3 in a thousand) TNT walls off treasure or agent.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` puts the treasure almost always on the same few cells, may put it or the agent onto TNT,
             and pays nothing for the step that reaches the time limit. Returns then lie in [1 / cells - 1, 1].
 
@@ -33,7 +30,7 @@ class Navigator(Game[NavigatorState]):
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1 - level.step_reward, 1 + level.step_reward)
         if rules == "reference":
@@ -47,7 +44,3 @@ class Navigator(Game[NavigatorState]):
     def step(self, key: Array, state: NavigatorState, action: Array) -> tuple[NavigatorState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return law.step(state, action, self.level, self.rules)
-
-    def render(self, state: NavigatorState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

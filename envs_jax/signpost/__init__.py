@@ -1,6 +1,6 @@
 """Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten games."""
 
-from arcade_torch.envs_jax.game import Array, Game, Rules
+from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
 from arcade_torch.envs_jax.signpost import rules as law
 from arcade_torch.envs_jax.signpost.numbers import LEVELS, Level
 from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
@@ -8,7 +8,7 @@ from arcade_torch.envs_jax.signpost.picture import Screen
 from arcade_torch.envs_jax.signpost.rules import SignpostState
 
 
-class Signpost(Game[SignpostState]):
+class Signpost(ScreenGame[SignpostState]):
     """Read the sign, walk to the gate, press the direction that the sign showed.
 
     Every action walks one cell along the corridor, and every one but 3 (right) stumbles and costs ``1 / corridor``. At
@@ -19,9 +19,6 @@ class Signpost(Game[SignpostState]):
     The MDP twin shows the sign all the time; the POMDP twin shows it in the first frame alone.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"default"`` and ``"reference"`` are the same here: there is no published law.
 
     Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory") with four ways on.
@@ -30,7 +27,7 @@ class Signpost(Game[SignpostState]):
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1.0, 1.0)
         self.screen = Screen(obs_size, level)
@@ -42,7 +39,3 @@ class Signpost(Game[SignpostState]):
     def step(self, key: Array, state: SignpostState, action: Array) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return law.step(state, action, self.level)
-
-    def render(self, state: SignpostState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

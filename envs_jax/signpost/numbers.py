@@ -24,8 +24,4 @@ class Level:
         return self.cells
 
 
-LEVELS = {
-    "SignpostEasy": Level(4),
-    "SignpostMedium": Level(6),
-    "SignpostHard": Level(9),
-}
+LEVELS = {"SignpostEasy": Level(4), "SignpostMedium": Level(6), "SignpostHard": Level(9)}

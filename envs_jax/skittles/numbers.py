@@ -25,8 +25,4 @@ class Level:
         return self.first + self.width - 1
 
 
-LEVELS = {
-    "SkittlesEasy": Level(8, 1),
-    "SkittlesMedium": Level(7, 2),
-    "SkittlesHard": Level(6, 2),
-}
+LEVELS = {"SkittlesEasy": Level(8, 1), "SkittlesMedium": Level(7, 2), "SkittlesHard": Level(6, 2)}

@@ -31,14 +31,8 @@ def reset(key: Array, level: Level, rules: Rules) -> SkittlesState:
     if rules == "reference":
         flicker_key = jnp.zeros_like(flicker_key)
     x = level.first + jax.random.randint(for_agent, (), 0, level.width, dtype=jnp.int32)
-    return SkittlesState(
-        jnp.full(CELLS, NO_BLOCK, jnp.int32),
-        jnp.zeros(CELLS, jnp.int32),
-        x,
-        jnp.ones(level.width, bool),
-        flicker_key,
-        jnp.int32(0),
-    )
+    empty, zeros = jnp.full(CELLS, NO_BLOCK, jnp.int32), jnp.zeros(CELLS, jnp.int32)
+    return SkittlesState(empty, zeros, x, jnp.ones(level.width, bool), flicker_key, jnp.int32(0))
 
 
 def reachable(safe: Array, newest: Array, level: Level) -> Array:
@@ -88,14 +82,10 @@ def step(
     reach = reachable(state.safe, state.column[0], level)
     block = draw_block(key, reach, level, rules)
     time = state.time + 1
-    new = SkittlesState(
-        jnp.concatenate([block[None], state.column[:-1]]),
-        jnp.concatenate([(state.colour[:1] + 1) % COLOURS, state.colour[:-1]]),
-        x,
-        reach & (level.first + jnp.arange(level.width) != block),
-        state.flicker_key,
-        time,
-    )
+    column = jnp.concatenate([block[None], state.column[:-1]])
+    colour = jnp.concatenate([(state.colour[:1] + 1) % COLOURS, state.colour[:-1]])
+    safe = reach & (level.first + jnp.arange(level.width) != block)
+    new = SkittlesState(column, colour, x, safe, state.flicker_key, time)
     reward = 1.0 / MAX_STEPS + jnp.where(hit, jnp.float32(hit_reward), 0.0)
     return new, reward, hit, time >= MAX_STEPS
 

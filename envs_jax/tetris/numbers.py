@@ -55,8 +55,4 @@ class Level:
     drop: int
 
 
-LEVELS = {
-    "TetrisEasy": Level(3, 1, 2),
-    "TetrisMedium": Level(2, 1, 2),
-    "TetrisHard": Level(1, 2, 3),
-}
+LEVELS = {"TetrisEasy": Level(3, 1, 2), "TetrisMedium": Level(2, 1, 2), "TetrisHard": Level(1, 2, 3)}

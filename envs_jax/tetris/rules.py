@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.game import DOWN, LEFT, RIGHT, UP, Array, Rules
 from arcade_torch.envs_jax.tetris.numbers import (
     BOX,
@@ -58,11 +59,8 @@ class TetrisState(NamedTuple):
 
 
 def shuffled(key: Array) -> Array:
-    """A random permutation of the seven pieces, int32 [7]: the ranks of seven random numbers."""
-    draw = jax.random.bits(key, (PIECES,))
-    index = jnp.arange(PIECES)
-    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
-    return lower.sum(1, dtype=jnp.int32)
+    """A random permutation of the seven pieces, int32 [7]."""
+    return random_ranks(key, PIECES)
 
 
 def deal_order(level: Level, rules: Rules) -> tuple[int, int]:
@@ -213,11 +211,8 @@ def step(
 
     new = steer(new, action, window)
     new = fall(new, action, window, level, rules)
-    new = new._replace(
-        terminal=terminal,
-        frames_since_spawn=jnp.minimum(new.frames_since_spawn + 1, MAX_AGE),
-        time=state.time + 1,
-    )
+    age = jnp.minimum(new.frames_since_spawn + 1, MAX_AGE)
+    new = new._replace(terminal=terminal, frames_since_spawn=age, time=state.time + 1)
     won, late = new.lines >= GOAL, new.time >= MAX_STEPS
     lost = terminal & ~won if rules == "default" else terminal & ~won & ~late
     return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, late
