@@ -24,7 +24,7 @@ class Game(abc.ABC, Generic[State]):
     Attributes:
         id: Versioned identifier, such as ``"CartPoleEasy-v0"``.
         obs_size: Side of the picture in pixels, 128 or 256.
-        rules: ``"default"`` (the corrected law) or ``"reference"`` (the law of the published numbers).
+        rules: ``"default"`` (corrected) or ``"reference"`` (those of the published numbers).
         max_steps: Time limit in steps; reaching it truncates the episode.
         return_range: Lowest and highest undiscounted return an episode can have.
         num_actions: Always 5: up, down, left, right, fire.
@@ -102,8 +102,8 @@ class Game(abc.ABC, Generic[State]):
         return f"make({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
 
 
-class ScreenGame(Game[State]):
-    """What the games of this package have alike: numbers of each difficulty, ``levels``, and a ``screen`` that draws.
+class LevelGame(Game[State]):
+    """A game of this package; ``levels`` are the numbers of each difficulty by the bare name of its id.
 
     Args:
         level: Numbers of the difficulty.
@@ -113,12 +113,6 @@ class ScreenGame(Game[State]):
     """
 
     levels: ClassVar[Mapping[str, Any]]
-    screen: Any
 
     def __init__(self, level: Any, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
-
-    def render(self, state: State, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        frame: Array = self.screen.draw(state, partial)
-        return frame

@@ -145,7 +145,7 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         id: A registered id (``"CartPoleEasy-v0"``), its bare name (``"CartPoleEasy"``, the newest version), or an
             alias.
         obs_size: Side of the picture in pixels, 128 or 256.
-        rules: ``"default"`` for the corrected law, ``"reference"`` for the law of the published numbers (late endings
+        rules: ``"default"`` for the corrected rules, ``"reference"`` for those of the published numbers (late endings
             included).
         **options: Options of this game; an unknown one is refused with the list of those it has.
 

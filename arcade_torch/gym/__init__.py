@@ -9,7 +9,7 @@ from arcade_torch.envs_jax.registry import on_register
 NAMESPACE = "arcade_torch"
 
 
-def register_games(ids: Iterable[str]) -> None:
+def register_games(ids: Iterable[str] = ()) -> None:
     """Put games into Gymnasium's registry, as ``"arcade_torch/<id>"``; those that are there already stay.
 
     The games of the benchmark are there from the beginning, and a game of your own from its ``register`` on; this is

@@ -1,14 +1,14 @@
 """AutoEncode: watch a row of cards, then name their suits in reverse order."""
 
-from arcade_torch.envs_jax.autoencode import rules as law
+from arcade_torch.envs_jax.autoencode import rules
 from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
 from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.autoencode.picture import Screen
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 
-class AutoEncode(ScreenGame[AutoEncodeState]):
+class AutoEncode(LevelGame[AutoEncodeState]):
     """Watch N cards of four suits, one a step, then give the suits back, the last one first.
 
     For the first N steps the card of the step is on the table, whatever the player does. From then on action 4 answers
@@ -45,9 +45,13 @@ class AutoEncode(ScreenGame[AutoEncodeState]):
 
     def reset(self, key: Array) -> AutoEncodeState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: AutoEncodeState, action: Array) -> tuple[AutoEncodeState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
+
+    def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

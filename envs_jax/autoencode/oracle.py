@@ -34,11 +34,7 @@ class StateOracle:
 
 
 class FramesOracle:
-    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing.
-
-    Args:
-        game: The AutoEncode to play.
-    """
+    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing."""
 
     def __init__(self, game: Any) -> None:
         self.screen, self.cards, self.rules = game.screen, game.level.cards, game.rules

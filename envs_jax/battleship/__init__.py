@@ -1,14 +1,14 @@
 """BattleShip: hunt hidden ships with a cursor."""
 
-from arcade_torch.envs_jax.battleship import rules as law
+from arcade_torch.envs_jax.battleship import rules
 from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
 from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.battleship.picture import Screen
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 
-class BattleShip(ScreenGame[BattleShipState]):
+class BattleShip(LevelGame[BattleShipState]):
     """Hit every cell of four hidden ships, of lengths 2, 3, 3 and 4, in a square sea.
 
     Actions 0 to 3 move the cursor by one cell, 4 fires at the cell under it: a ship cell pays ``1 / 12``, water pays
@@ -37,8 +37,12 @@ class BattleShip(ScreenGame[BattleShipState]):
 
     def reset(self, key: Array) -> BattleShipState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
+
+    def render(self, state: BattleShipState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

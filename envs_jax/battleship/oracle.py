@@ -68,14 +68,9 @@ class FramesOracle:
 
 
 def ship_scores(known: npt.NDArray[np.int64], boost: float) -> npt.NDArray[np.float64]:
-    """How well ships fit onto each cell, given what is known.
+    """How well ships fit onto each cell of boards of ``UNKNOWN``, ``WATER`` and ``SHIP``: float64 [N, side, side].
 
-    Args:
-        known: int64 [N, side, side], ``UNKNOWN``, ``WATER`` or ``SHIP``.
-        boost: Factor for each known ship cell in a place.
-
-    Returns:
-        float64 [N, side, side], not normalised.
+    A known ship cell multiplies the weight of a place by ``boost``.
     """
     score = np.zeros(known.shape)
     for turned in (False, True):

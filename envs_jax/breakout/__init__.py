@@ -1,15 +1,15 @@
 """Breakout: clear a wall with a ball that the POMDP shows only on its way up."""
 
-from arcade_torch.envs_jax.breakout import rules as law
+from arcade_torch.envs_jax.breakout import rules
 from arcade_torch.envs_jax.breakout.numbers import LEVELS, MAX_STEPS, Level
 from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.shown import check_choice
 
 
-class Breakout(ScreenGame[BreakoutState]):
+class Breakout(LevelGame[BreakoutState]):
     """Keep a ball in play on a board of 20 x 10 cells until it has cleared a wall of 60 bricks.
 
     Actions 2 and 3 move the paddle to the left and right by one column, the others wait. Each brick pays by its row,
@@ -26,8 +26,9 @@ class Breakout(ScreenGame[BreakoutState]):
             ago (as published), which after a bounce does not tell the direction.
         random_start: Let the ball begin in any column; otherwise it begins at either side wall.
 
-    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: every brick pays, the paddle is always on
-        the board, the picture tells the direction, the time limit does not terminate.
+    Source: POPGym Arcade (ICML 2026), after MinAtar (arXiv:1903.03176). Differs from popgym-arcade 0.0.7 in: every
+        brick pays, the paddle is always on the board, the picture tells the direction, the time limit does not
+        terminate.
 
     Raises:
         ValueError: Unknown ``tail``.
@@ -57,8 +58,12 @@ class Breakout(ScreenGame[BreakoutState]):
 
     def reset(self, key: Array) -> BreakoutState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules, self.random_start)
+        return rules.reset(key, self.level, self.rules, self.random_start)
 
     def step(self, key: Array, state: BreakoutState, action: Array) -> tuple[BreakoutState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
+
+    def render(self, state: BreakoutState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

@@ -1,7 +1,4 @@
-"""The law of Breakout: a ball that moves one cell along a diagonal at every step; boards are indexed [row, column].
-
-Source: POPGym Arcade (ICML 2026), environment appendix; MinAtar (arXiv:1903.03176) for the tradition.
-"""
+"""The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed [row, column]."""
 
 from typing import NamedTuple
 
@@ -68,9 +65,6 @@ def step(state: BreakoutState, action: Array, level: Level, rules: Rules) -> tup
     A brick that is touched vanishes and turns the ball round, unless the step before touched one as well: then the ball
     flies on through the gap. By default both pay; with ``rules="reference"`` the second pays nothing and does not
     count.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     # Only a move brings a paddle back that sticks out, as it can at the start of the reference.

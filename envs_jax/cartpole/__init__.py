@@ -1,15 +1,15 @@
 """CartPole and NoisyCartPole: keep the pole up, seen as a picture with velocity arrows."""
 
-from arcade_torch.envs_jax.cartpole import rules as law
+from arcade_torch.envs_jax.cartpole import rules
 from arcade_torch.envs_jax.cartpole.numbers import LEVELS, Level
 from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.cartpole.picture import ARROWS, Arrow, Screen
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.shown import check_choice
 
 
-class CartPole(ScreenGame[CartPoleState]):
+class CartPole(LevelGame[CartPoleState]):
     """Push a cart left and right so that its pole stays up.
 
     Actions 2 and 3 push with 10 N to the left and right, the others not at all. Each step that begins within the limits
@@ -43,8 +43,12 @@ class CartPole(ScreenGame[CartPoleState]):
 
     def reset(self, key: Array) -> CartPoleState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: CartPoleState, action: Array) -> tuple[CartPoleState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules)
+        return rules.step(key, state, action, self.level, self.rules)
+
+    def render(self, state: CartPoleState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

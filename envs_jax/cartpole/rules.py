@@ -1,4 +1,4 @@
-"""The law of CartPole: Euler steps of the classic cart and pole, paid by survival.
+"""The rules of CartPole: Euler steps of the classic cart and pole, paid by survival.
 
 Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole; limits and rewards of POPGym Arcade
 (ICML 2026).
@@ -89,9 +89,6 @@ def step(
 
     By default the episode ends with the step that crosses a limit or reaches the time limit. With ``rules="reference"``
     both are judged on the state before the step, so that one unpaid step follows.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     new = move(state, action)._replace(noise=draw_noise(key, level))
     judged = new if rules == "default" else state

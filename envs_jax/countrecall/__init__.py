@@ -1,16 +1,16 @@
 """CountRecall: say how often the queried suit has been dealt."""
 
-from arcade_torch.envs_jax.countrecall import rules as law
+from arcade_torch.envs_jax.countrecall import rules
 from arcade_torch.envs_jax.countrecall.numbers import LEVELS, MOVE_BUDGET, Level
 from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.countrecall.picture import Screen
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 LARGEST_BUDGET = 800  # the counter of the reference, which is not held, then stays within three digits
 
 
-class CountRecall(ScreenGame[CountRecallState]):
+class CountRecall(LevelGame[CountRecallState]):
     """In each of N turns a card is dealt and a suit asked for: how many cards of that suit were dealt before?
 
     Actions 0 and 1 move the counter up and down, 4 confirms what it shows: ``1 / N`` if that is right, else 0; then the
@@ -47,9 +47,13 @@ class CountRecall(ScreenGame[CountRecallState]):
 
     def reset(self, key: Array) -> CountRecallState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: CountRecallState, action: Array) -> tuple[CountRecallState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
-        return law.step(state, action, self.level, self.max_steps, self.rules)
+        return rules.step(state, action, self.level, self.max_steps, self.rules)
+
+    def render(self, state: CountRecallState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

@@ -87,9 +87,6 @@ class FramesOracle:
 
     It always knows the right answer. What it cannot know is which answers will be asked for, and so whether the moves
     to a far one are better saved: it answers what is within ``3.5`` times the moves left per turn left, and a half.
-
-    Args:
-        game: The CountRecall to play.
     """
 
     def __init__(self, game: Any) -> None:

@@ -1,7 +1,4 @@
-"""The law of CountRecall: in every turn say how often a suit has been dealt before.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of CountRecall: in every turn say how often a suit has been dealt before."""
 
 from typing import NamedTuple
 
@@ -37,9 +34,6 @@ def step(
 
     The card on the table does not count yet: the right answer of the first turn is 0. By default the counter stays
     between 0 and the size of the largest suit; with ``rules="reference"`` it goes anywhere.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     answer = state.answer + (action == UP) - (action == DOWN)
     if rules == "default":

@@ -1,14 +1,14 @@
 """MineSweeper: sweep all safe cells with a cursor."""
 
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
-from arcade_torch.envs_jax.minesweeper import rules as law
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.minesweeper import rules
 from arcade_torch.envs_jax.minesweeper.numbers import LEVELS, Level
 from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.minesweeper.picture import Screen
 from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
 
 
-class MineSweeper(ScreenGame[MineSweeperState]):
+class MineSweeper(LevelGame[MineSweeperState]):
     """Sweep every safe cell of a square board, one cell at a time.
 
     Actions 0 to 3 move the cursor by one cell, 4 sweeps the cell under it: a covered safe cell pays ``1 / safe``, a
@@ -46,8 +46,12 @@ class MineSweeper(ScreenGame[MineSweeperState]):
 
     def reset(self, key: Array) -> MineSweeperState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: MineSweeperState, action: Array) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules, self.mine_reward)
+        return rules.step(state, action, self.level, self.rules, self.mine_reward)
+
+    def render(self, state: MineSweeperState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

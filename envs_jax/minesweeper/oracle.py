@@ -105,15 +105,9 @@ def block_sum(values: Board) -> Board:
 
 
 def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.NDArray[np.float64]:
-    """Chance of a mine in each covered cell, fitted to the numbers seen.
+    """Chance of a mine in each covered cell, fitted to the numbers seen: float64 [N, side, side], 0 in swept cells.
 
-    Args:
-        known: int64 [N, side, side], the number of each swept cell, -1 where covered.
-        mines: Mines on the board.
-        rounds: Fitting rounds.
-
-    Returns:
-        float64 [N, side, side]; 0 in swept cells.
+    ``known``, int64 [N, side, side], is the number of each swept cell, -1 where covered.
     """
     covered: Board = known < 0
     count = np.maximum(covered.sum((1, 2), keepdims=True), 1)

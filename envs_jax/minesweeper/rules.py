@@ -1,7 +1,4 @@
-"""The law of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y].
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y]."""
 
 from typing import NamedTuple
 
@@ -62,9 +59,6 @@ def step(
     By default the game ends when a mine is hit, all safe cells are swept, or the repeats reach their limit, and is cut
     at the time limit. With ``rules="reference"`` a sweep judges repeats and time on the state before it, one sweep
     late, and a move never looks at the repeats.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
 
@@ -79,8 +73,8 @@ def step(
     reward = jnp.where(safe, 1.0 / level.safe, jnp.where(mine, mine_reward, jnp.where(again, -2.0 / level.cells, 0.0)))
     cleared = new.score >= level.safe
     if rules == "default":
-        bored, late = new.repeats >= level.max_repeats, new.timestep >= level.max_steps
+        repeat_limit, time_limit = new.repeats >= level.max_repeats, new.timestep >= level.max_steps
     else:
-        bored = fire & (state.repeats >= level.max_repeats)
-        late = jnp.where(fire, state.timestep, new.timestep) >= level.max_steps
-    return new, reward.astype(jnp.float32), mine | cleared | bored, late
+        repeat_limit = fire & (state.repeats >= level.max_repeats)
+        time_limit = jnp.where(fire, state.timestep, new.timestep) >= level.max_steps
+    return new, reward.astype(jnp.float32), mine | cleared | repeat_limit, time_limit

@@ -1,14 +1,14 @@
 """Navigator: find the treasure, avoid TNT, on a map that the POMDP shows only once."""
 
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
-from arcade_torch.envs_jax.navigator import rules as law
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.navigator import rules
 from arcade_torch.envs_jax.navigator.numbers import LEVELS, Level
 from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.navigator.picture import Screen
 from arcade_torch.envs_jax.navigator.rules import NavigatorState
 
 
-class Navigator(ScreenGame[NavigatorState]):
+class Navigator(LevelGame[NavigatorState]):
     """Walk to the treasure and open it; seven blocks of TNT lie about.
 
     Actions 0 to 3 move the agent by one cell, 4 opens what it stands on. Opening the treasure pays 1 and ends the game,
@@ -39,8 +39,12 @@ class Navigator(ScreenGame[NavigatorState]):
 
     def reset(self, key: Array) -> NavigatorState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: NavigatorState, action: Array) -> tuple[NavigatorState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
+
+    def render(self, state: NavigatorState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

@@ -1,7 +1,4 @@
-"""The law of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y].
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y]."""
 
 from typing import NamedTuple
 
@@ -27,11 +24,7 @@ class NavigatorState(NamedTuple):
 def draw_distinct(key: Array, count: int, cells: int) -> Array:
     """A uniformly random set of cells, by Floyd's algorithm: int32 [count], in no useful order.
 
-    Args:
-        key: uint32 [2].
-        count: How many.
-        cells: Out of how many; the remainder that maps 32 random bits to so few favours some cells by less than one in
-            ten million.
+    The remainder that maps 32 random bits to so few favours some cells by less than one in ten million.
     """
     draws = jax.random.bits(key, (count,))
     chosen: list[Array] = []
@@ -43,7 +36,7 @@ def draw_distinct(key: Array, count: int, cells: int) -> Array:
 
 
 def reset(key: Array, level: Level, rules: Rules) -> NavigatorState:
-    """A fresh map; see :func:`place_apart` for the default law and :func:`place_as_published` for the reference."""
+    """A fresh map; see :func:`place_apart` and, for the reference, :func:`place_as_published`."""
     place = place_apart if rules == "default" else place_as_published
     tnt, treasure, agent = place(key, level)
     cell = jnp.arange(level.cells)
@@ -72,7 +65,7 @@ def place_apart(key: Array, level: Level) -> tuple[Array, Array, Array]:
 
 
 def place_as_published(key: Array, level: Level) -> tuple[Array, Array, Array]:
-    """The law of the reference: x and y of the treasure, and of the agent, are taken from two free cells each.
+    """The reference: x and y of the treasure, and of the agent, are taken from two free cells each.
 
     The treasure's are always the same two entries of the list of free cells, so that it hardly moves from one episode
     to the next. It may replace a block of TNT, and the agent may start on a block or on the treasure.
@@ -102,9 +95,6 @@ def step(
 
     A move that ends on TNT kills, also one against the border; opening the treasure wins; either ends the game. With
     ``rules="reference"`` the step that reaches the time limit pays nothing, whatever happened.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
     new = NavigatorState(x, y, state.board, state.timestep + 1)
@@ -113,8 +103,8 @@ def step(
     cell = jnp.sum(jnp.where(here, state.board, 0))
     fire = action == FIRE
     dead, won = ~fire & (cell == TNT), fire & (cell == TREASURE)
-    late = new.timestep >= level.max_steps
+    time_limit = new.timestep >= level.max_steps
     reward = jnp.where(won, TREASURE_REWARD, jnp.where(dead, DEATH_REWARD, level.step_reward))
     if rules == "reference":
-        reward = jnp.where(late, 0.0, reward)
-    return new, reward.astype(jnp.float32), dead | won, late
+        reward = jnp.where(time_limit, 0.0, reward)
+    return new, reward.astype(jnp.float32), dead | won, time_limit

@@ -1,14 +1,14 @@
 """Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten games."""
 
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
-from arcade_torch.envs_jax.signpost import rules as law
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.signpost import rules
 from arcade_torch.envs_jax.signpost.numbers import LEVELS, Level
 from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.signpost.picture import Screen
 from arcade_torch.envs_jax.signpost.rules import SignpostState
 
 
-class Signpost(ScreenGame[SignpostState]):
+class Signpost(LevelGame[SignpostState]):
     """Read the sign, walk to the gate, press the direction that the sign showed.
 
     Every action walks one cell along the corridor, and every one but 3 (right) stumbles and costs ``1 / corridor``. At
@@ -19,7 +19,7 @@ class Signpost(ScreenGame[SignpostState]):
     The MDP twin shows the sign all the time; the POMDP twin shows it in the first frame alone.
 
     Args:
-        rules: ``"default"`` and ``"reference"`` are the same here: there is no published law.
+        rules: ``"default"`` and ``"reference"`` are the same here: no rules were published.
 
     Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory") with four ways on.
     """
@@ -34,8 +34,12 @@ class Signpost(ScreenGame[SignpostState]):
 
     def reset(self, key: Array) -> SignpostState:
         """See :meth:`Game.reset`."""
-        return law.reset(key)
+        return rules.reset(key)
 
     def step(self, key: Array, state: SignpostState, action: Array) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level)
+        return rules.step(state, action, self.level)
+
+    def render(self, state: SignpostState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

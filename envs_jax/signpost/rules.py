@@ -1,4 +1,4 @@
-"""The law of Signpost: read the sign, walk to the gate, press what the sign said."""
+"""The rules of Signpost: read the sign, walk to the gate, press what the sign said."""
 
 from typing import NamedTuple
 
@@ -31,10 +31,7 @@ def step(state: SignpostState, action: Array, level: Level) -> tuple[SignpostSta
 
     Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents are told their last
     action, so a player without memory could carry the sign to the gate by repeating it; stumbling all the way costs as
-    much as the gate pays, so that nobody without memory can expect more than 1/4.
-
-    Returns:
-        New state, reward, terminated, truncated (never: an episode has ``corridor + 1`` steps).
+    much as the gate pays, so that nobody without memory can expect more than 1/4. Nothing truncates.
     """
     at_gate = state.x == level.corridor
     opened = at_gate & (action == state.sign)

@@ -1,14 +1,14 @@
 """Skittles: dodge blocks that fall, and flicker in the POMDP."""
 
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
-from arcade_torch.envs_jax.skittles import rules as law
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.skittles import rules
 from arcade_torch.envs_jax.skittles.numbers import LEVELS, MAX_STEPS, Level
 from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.skittles.picture import Screen
 from arcade_torch.envs_jax.skittles.rules import SkittlesState
 
 
-class Skittles(ScreenGame[SkittlesState]):
+class Skittles(LevelGame[SkittlesState]):
     """Dodge the blocks that fall towards the bottom row of a 10 x 10 grid, one new block a step.
 
     Actions 2 and 3 move the agent to the left and right within its lane, the others wait. Every step pays 1/100, the
@@ -42,8 +42,12 @@ class Skittles(ScreenGame[SkittlesState]):
 
     def reset(self, key: Array) -> SkittlesState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: SkittlesState, action: Array) -> tuple[SkittlesState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules, self.hit_reward)
+        return rules.step(key, state, action, self.level, self.rules, self.hit_reward)
+
+    def render(self, state: SkittlesState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

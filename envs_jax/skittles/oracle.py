@@ -44,11 +44,7 @@ def outlook(width: int, rounds: int = 5) -> npt.NDArray[np.float64]:
 
 
 class Planner:
-    """Chooses moves with a known or a partly known grid.
-
-    Args:
-        level: Numbers of the difficulty.
-    """
+    """Chooses moves with a known or a partly known grid."""
 
     def __init__(self, level: Level) -> None:
         self.level, self.worth = level, outlook(level.width)

@@ -1,7 +1,4 @@
-"""The law of Skittles: a new row with one block falls in at the top at every step; the agent dodges in the bottom row.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of Skittles: at every step a new row with one block falls in at the top; the agent dodges at the bottom."""
 
 from typing import NamedTuple
 
@@ -36,12 +33,9 @@ def reset(key: Array, level: Level, rules: Rules) -> SkittlesState:
 
 
 def reachable(safe: Array, newest: Array, level: Level) -> Array:
-    """Where a survivor can be one step on, when the block of the newest row leaves: bool [width].
+    """Where a survivor can be one step on, when the block of the newest row (or ``NO_BLOCK``) leaves: bool [width].
 
-    Args:
-        safe: bool [width], where survivors can be when the newest row arrives.
-        newest: int32, column of its block, or ``NO_BLOCK``.
-        level: Numbers of the difficulty.
+    ``safe``, bool [width], is where survivors can be when that row arrives.
     """
     beside = jnp.pad(safe, 1)
     lane = level.first + jnp.arange(level.width)
@@ -51,11 +45,7 @@ def reachable(safe: Array, newest: Array, level: Level) -> Array:
 def draw_block(key: Array, reach: Array, level: Level, rules: Rules) -> Array:
     """The column of a new block: int32, uniform among those that leave a survivor somewhere to be.
 
-    Args:
-        key: uint32 [2].
-        reach: bool [width], see :func:`reachable`. Never empty by default, as a lane has at least two columns.
-        level: Numbers of the difficulty.
-        rules: ``"reference"`` draws among all columns of the lane.
+    These are never none, as a lane has at least two columns. ``rules="reference"`` draws among all of the lane.
     """
     if rules == "reference":
         return level.first + jax.random.randint(key, (), 0, level.width, dtype=jnp.int32)
@@ -71,9 +61,6 @@ def step(
 
     The agent is hit by the block it walks into and by the block that falls on it. Every step pays ``1 / MAX_STEPS``,
     also the one in which the agent is hit, which pays ``hit_reward`` on top.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     x = jnp.clip(state.x + sideways, level.first, level.last)

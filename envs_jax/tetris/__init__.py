@@ -1,14 +1,14 @@
 """Tetris: clear ten lines; the POMDP twin hides the pile."""
 
-from arcade_torch.envs_jax.game import Array, Rules, ScreenGame
-from arcade_torch.envs_jax.tetris import rules as law
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.tetris import rules
 from arcade_torch.envs_jax.tetris.numbers import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Level
 from arcade_torch.envs_jax.tetris.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.tetris.picture import Screen
 from arcade_torch.envs_jax.tetris.rules import TetrisState
 
 
-class Tetris(ScreenGame[TetrisState]):
+class Tetris(LevelGame[TetrisState]):
     """Clear ten lines of a board with 20 rows of 10 cells.
 
     Action 0 turns the falling piece clockwise, 2 and 3 shift it, 1 is a soft drop, 4 does nothing; gravity pulls at
@@ -39,8 +39,12 @@ class Tetris(ScreenGame[TetrisState]):
 
     def reset(self, key: Array) -> TetrisState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: TetrisState, action: Array) -> tuple[TetrisState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules)
+        return rules.step(key, state, action, self.level, self.rules)
+
+    def render(self, state: TetrisState, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

@@ -122,11 +122,7 @@ def cost(pile: Bools) -> npt.NDArray[np.float64]:
 
 
 class Planner:
-    """Chooses a plan when a piece is about to appear, and carries it out blindly.
-
-    Args:
-        game: The Tetris to play.
-    """
+    """Chooses a plan when a piece is about to appear, and carries it out blindly."""
 
     def __init__(self, game: Any) -> None:
         self.level, self.tunnels = game.level, game.rules == "reference"
@@ -195,12 +191,7 @@ class FramesOracle:
 
 
 def read_board(frames: npt.NDArray[np.uint8], screen: Any) -> Ints:
-    """Which tile each cell shows: int64 [N, 20, 10], -1 for none. One pixel of a cell tells, for it is not framed.
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        screen: The :class:`~arcade_torch.envs_jax.tetris.picture.Screen` that drew them.
-    """
+    """Which tile each cell of frames [N, S, S, 3] shows: int64 [N, 20, 10], -1 for none; one pixel of a cell tells."""
     grid, cell = screen.board, screen.cell
     y, x = grid.y + cell // 2, grid.x + cell // 2
     middle = frames[:, y : y + ROWS * cell : cell, x : x + COLUMNS * cell : cell]
@@ -211,13 +202,7 @@ def read_board(frames: npt.NDArray[np.uint8], screen: Any) -> Ints:
 
 
 def read_preview(frames: npt.NDArray[np.uint8], screen: Any, which: int = 0) -> Ints:
-    """Which piece a preview shows: int64 [N].
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        screen: The :class:`~arcade_torch.envs_jax.tetris.picture.Screen` that drew them.
-        which: 0 for the nearest.
-    """
+    """Which piece a preview (0: the nearest) of frames [N, S, S, 3] shows: int64 [N]."""
     slot = screen.previews[which]
     height, width = slot.pictures.shape[1:3]
     shown = frames[:, None, slot.y : slot.y + height, slot.x : slot.x + width]

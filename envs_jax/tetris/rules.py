@@ -1,10 +1,7 @@
-"""The law of Tetris: one action, then gravity; a piece that cannot go further down locks at once.
+"""The rules of Tetris: one action, then gravity; a piece that cannot go further down locks at once.
 
 Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits beyond the board
-are set, so that walls and floor are blocks like any other.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+are set, so that walls and floor are blocks like any other."""
 
 from typing import NamedTuple
 
@@ -199,9 +196,6 @@ def step(
 
     Ends with ten lines, or when a new piece overlaps the pile, which costs 1 (not if the goal is reached at that very
     step; in the reference not at the time limit either). Cut at the time limit.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     cleared, reward = clear_rows(state, rules)
     new = spawn(key, cleared, level, rules)
@@ -213,6 +207,6 @@ def step(
     new = fall(new, action, window, level, rules)
     age = jnp.minimum(new.frames_since_spawn + 1, MAX_AGE)
     new = new._replace(terminal=terminal, frames_since_spawn=age, time=state.time + 1)
-    won, late = new.lines >= GOAL, new.time >= MAX_STEPS
-    lost = terminal & ~won if rules == "default" else terminal & ~won & ~late
-    return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, late
+    won, time_limit = new.lines >= GOAL, new.time >= MAX_STEPS
+    lost = terminal & ~won if rules == "default" else terminal & ~won & ~time_limit
+    return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, time_limit
