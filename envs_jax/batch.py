@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import Array, Game
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import format_value
 
 State = TypeVar("State")
 
@@ -60,7 +60,7 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         True
     """
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
-        raise TypeError(f"seed is {shown(seed)}, expected a whole number from 0 to 4294967295")
+        raise TypeError(f"seed is {format_value(seed)}, expected a whole number from 0 to 4294967295")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax import registry
 from arcade_torch.envs_jax.game import Array, Game
-from arcade_torch.envs_jax.shown import check_choice
+from arcade_torch.envs_jax.validation import check_choice
 
 Stepped = tuple[Array, Any, Array, Array, dict[str, Array]]
 

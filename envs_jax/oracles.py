@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
-from arcade_torch.envs_jax.shown import check_choice
+from arcade_torch.envs_jax.validation import check_choice
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]

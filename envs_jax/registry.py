@@ -8,7 +8,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from arcade_torch.envs_jax.shown import check_choice, shown
+from arcade_torch.envs_jax.validation import check_choice, format_value
 
 if TYPE_CHECKING:
     from arcade_torch.envs_jax.game import Game
@@ -113,7 +113,7 @@ def resolve_id(id: str) -> str:
         'NoisyCartPoleEasy-v0'
     """
     if not isinstance(id, str):
-        raise TypeError(f"the env id is {shown(id)}, expected a string such as 'CartPoleEasy'")
+        raise TypeError(f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'")
     match = _VERSIONED.match(id)
     name = match["name"] if match else id
     name = _ALIASES.get(name, name)
@@ -122,13 +122,13 @@ def resolve_id(id: str) -> str:
     if wanted in _ENTRIES:
         return wanted
     if name in newest:
-        raise ValueError(f"unknown version in env id {shown(id)}: the newest is {newest[name]!r}")
+        raise ValueError(f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}")
     known = {known.lower(): known for known in (*newest, *_ALIASES)}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
     raise ValueError(
-        f"unknown env id {shown(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a game of "
-        "your own has to be registered first, on the command line with --import"
+        f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a "
+        "game of your own has to be registered first, on the command line with --import"
     )
 
 

@@ -1,8 +1,8 @@
 """AutoEncode: watch a row of cards, then name their suits in reverse order."""
 
 from arcade_torch.envs_jax.autoencode import rules
-from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
 from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.autoencode.params import LEVELS, Params
 from arcade_torch.envs_jax.autoencode.picture import Screen
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
@@ -34,7 +34,7 @@ class AutoEncode(LevelGame[AutoEncodeState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
         if mdp_marker is not None and not isinstance(mdp_marker, bool):
             raise ValueError(f"mdp_marker is {mdp_marker!r}, allowed: True, False, or None for what the rules say")
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.autoencode.numbers import SUITS, Level
+from arcade_torch.envs_jax.autoencode.params import SUITS, Params
 from arcade_torch.envs_jax.cards import deal
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, Array, Rules
 
@@ -19,14 +19,14 @@ class AutoEncodeState(NamedTuple):
     score: Array  # int32, right answers
 
 
-def reset(key: Array, level: Level) -> AutoEncodeState:
+def reset(key: Array, level: Params) -> AutoEncodeState:
     """Suits as even as can be, in uniformly random order; the selector on hearts."""
     zero = jnp.int32(0)
     return AutoEncodeState(deal(key, 1, level.cards, SUITS)[0], zero, zero, zero, zero)
 
 
 def step(
-    state: AutoEncodeState, action: Array, level: Level, rules: Rules
+    state: AutoEncodeState, action: Array, level: Params, rules: Rules
 ) -> tuple[AutoEncodeState, Array, Array, Array]:
     """Turn the selector, or answer with the suit it points at.
 

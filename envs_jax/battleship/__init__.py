@@ -1,8 +1,8 @@
 """BattleShip: hunt hidden ships with a cursor."""
 
 from arcade_torch.envs_jax.battleship import rules
-from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
 from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.battleship.params import LEVELS, Params
 from arcade_torch.envs_jax.battleship.picture import Screen
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
@@ -29,7 +29,7 @@ class BattleShip(LevelGame[BattleShipState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-2 / level.cells * (level.max_repeats + (rules == "reference")), 1.0)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.battleship.numbers import SHIPS
+from arcade_torch.envs_jax.battleship.params import SHIPS
 from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
 from arcade_torch.envs_jax.minesweeper.oracle import towards
 

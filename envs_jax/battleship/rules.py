@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.battleship.numbers import SHIP_CELLS, SHIPS, Level
+from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, SHIPS, Params
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
 
@@ -60,7 +60,7 @@ def place_ship(draw: Array, occupied: Array, length: int) -> Array:
     return (columns >= 0) & (columns < end_x) & (rows >= 0) & (rows < end_y)
 
 
-def draw_board(key: Array, level: Level) -> Array:
+def draw_board(key: Array, level: Params) -> Array:
     """Ships one after the other, each uniform over the places left to it: int8 [side, side]."""
     draws = jax.random.bits(key, (len(SHIPS),))
     occupied = jnp.zeros((level.side, level.side), bool)
@@ -69,7 +69,7 @@ def draw_board(key: Array, level: Level) -> Array:
     return occupied.astype(jnp.int8)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> BattleShipState:
+def reset(key: Array, level: Params, rules: Rules) -> BattleShipState:
     """Ships anywhere without overlap, the cursor on any cell, nothing shot at.
 
     With ``rules="reference"`` the cursor never begins in the last column or row.
@@ -82,7 +82,7 @@ def reset(key: Array, level: Level, rules: Rules) -> BattleShipState:
 
 
 def step(
-    state: BattleShipState, action: Array, level: Level, rules: Rules
+    state: BattleShipState, action: Array, level: Params, rules: Rules
 ) -> tuple[BattleShipState, Array, Array, Array]:
     """Move the cursor, or fire at the cell under it.
 

@@ -1,12 +1,12 @@
 """Breakout: clear a wall with a ball that the POMDP shows only on its way up."""
 
 from arcade_torch.envs_jax.breakout import rules
-from arcade_torch.envs_jax.breakout.numbers import LEVELS, MAX_STEPS, Level
 from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.breakout.params import LEVELS, MAX_STEPS, Params
 from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
-from arcade_torch.envs_jax.shown import check_choice
+from arcade_torch.envs_jax.validation import check_choice
 
 
 class Breakout(LevelGame[BreakoutState]):
@@ -39,7 +39,7 @@ class Breakout(LevelGame[BreakoutState]):
 
     def __init__(
         self,
-        level: Level,
+        level: Params,
         *,
         id: str,
         obs_size: int,

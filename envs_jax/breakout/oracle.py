@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.breakout import rules
-from arcade_torch.envs_jax.breakout.numbers import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Level
+from arcade_torch.envs_jax.breakout.params import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
 from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
 
 
-def follow(ball_x: Any, pos: Any, level: Level) -> npt.NDArray[np.int32]:
+def follow(ball_x: Any, pos: Any, level: Params) -> npt.NDArray[np.int32]:
     """The move that brings the paddle's middle under the ball: int32 [N]."""
     goal = np.clip(np.asarray(ball_x) - level.paddle // 2, 0, level.right)
     return np.where(goal > pos, RIGHT, np.where(goal < pos, LEFT, UP)).astype(np.int32)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.breakout.numbers import (
+from arcade_torch.envs_jax.breakout.params import (
     BRICK_REWARD,
     BRICKS,
     COLUMNS,
@@ -15,7 +15,7 @@ from arcade_torch.envs_jax.breakout.numbers import (
     START_ROW,
     WALL_ROWS,
     WALL_TOP,
-    Level,
+    Params,
 )
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
 
@@ -45,7 +45,7 @@ def velocity(direction: Array) -> tuple[Array, Array]:
     return dx, jnp.where(direction < DOWN_RIGHT, -1, 1)
 
 
-def reset(key: Array, level: Level, rules: Rules, random_start: bool) -> BreakoutState:
+def reset(key: Array, level: Params, rules: Rules, random_start: bool) -> BreakoutState:
     """All bricks, and the ball at one side wall, about to hit it; with ``random_start`` anywhere in its row."""
     for_side, for_column = jax.random.split(key)
     right = jax.random.bernoulli(for_side)
@@ -59,7 +59,7 @@ def reset(key: Array, level: Level, rules: Rules, random_start: bool) -> Breakou
     return BreakoutState(x, y, direction, x, y, jnp.int32(pos), bricks, jnp.bool_(False), zero, zero)
 
 
-def step(state: BreakoutState, action: Array, level: Level, rules: Rules) -> tuple[BreakoutState, Array, Array, Array]:
+def step(state: BreakoutState, action: Array, level: Params, rules: Rules) -> tuple[BreakoutState, Array, Array, Array]:
     """Move the paddle, then the ball.
 
     A brick that is touched vanishes and turns the ball round, unless the step before touched one as well: then the ball
@@ -98,6 +98,6 @@ def step(state: BreakoutState, action: Array, level: Level, rules: Rules) -> tup
     return new, reward, lost | (left == 0), new.time >= MAX_STEPS
 
 
-def _covers(pos: Array, x: Array, level: Level) -> Array:
+def _covers(pos: Array, x: Array, level: Params) -> Array:
     """Whether a paddle at ``pos`` covers column ``x`` (bool scalar)."""
     return (x >= pos) & (x < pos + level.paddle)

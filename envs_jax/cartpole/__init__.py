@@ -1,12 +1,12 @@
 """CartPole and NoisyCartPole: keep the pole up, seen as a picture with velocity arrows."""
 
 from arcade_torch.envs_jax.cartpole import rules
-from arcade_torch.envs_jax.cartpole.numbers import LEVELS, Level
 from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.cartpole.params import LEVELS, Params
 from arcade_torch.envs_jax.cartpole.picture import ARROWS, Arrow, Screen
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
-from arcade_torch.envs_jax.shown import check_choice
+from arcade_torch.envs_jax.validation import check_choice
 
 
 class CartPole(LevelGame[CartPoleState]):
@@ -33,7 +33,7 @@ class CartPole(LevelGame[CartPoleState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
         check_choice("arrow", arrow, ARROWS)
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.arrow = arrow

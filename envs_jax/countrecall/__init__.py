@@ -1,8 +1,8 @@
 """CountRecall: say how often the queried suit has been dealt."""
 
 from arcade_torch.envs_jax.countrecall import rules
-from arcade_torch.envs_jax.countrecall.numbers import LEVELS, MOVE_BUDGET, Level
 from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.countrecall.params import LEVELS, MOVE_BUDGET, Params
 from arcade_torch.envs_jax.countrecall.picture import Screen
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
@@ -34,7 +34,7 @@ class CountRecall(LevelGame[CountRecallState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
         if isinstance(move_budget, bool) or not isinstance(move_budget, int) or not 0 <= move_budget <= LARGEST_BUDGET:
             raise ValueError(f"move_budget is {move_budget!r}, allowed: an integer from 0 to {LARGEST_BUDGET}")
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)

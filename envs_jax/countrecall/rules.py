@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cards import deal
-from arcade_torch.envs_jax.countrecall.numbers import Level
+from arcade_torch.envs_jax.countrecall.params import Params
 from arcade_torch.envs_jax.game import DOWN, FIRE, UP, Array, Rules
 
 
@@ -20,7 +20,7 @@ class CountRecallState(NamedTuple):
     moves: Array  # int32, steps taken
 
 
-def reset(key: Array, level: Level) -> CountRecallState:
+def reset(key: Array, level: Params) -> CountRecallState:
     """Two independent uniformly random orders of a pack with suits as even as can be; the counter at 0."""
     cards, queries = deal(key, 2, level.cards, level.suits)
     zero = jnp.int32(0)
@@ -28,7 +28,7 @@ def reset(key: Array, level: Level) -> CountRecallState:
 
 
 def step(
-    state: CountRecallState, action: Array, level: Level, max_steps: int, rules: Rules
+    state: CountRecallState, action: Array, level: Params, max_steps: int, rules: Rules
 ) -> tuple[CountRecallState, Array, Array, Array]:
     """Move the counter, or confirm what it shows.
 

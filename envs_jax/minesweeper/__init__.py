@@ -2,8 +2,8 @@
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.minesweeper import rules
-from arcade_torch.envs_jax.minesweeper.numbers import LEVELS, Level
 from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.minesweeper.params import LEVELS, Params
 from arcade_torch.envs_jax.minesweeper.picture import Screen
 from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
 
@@ -33,7 +33,7 @@ class MineSweeper(LevelGame[MineSweeperState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
         if not -1 <= mine_reward <= 0:
             raise ValueError(f"mine_reward is {mine_reward!r}, allowed: -1 to 0")
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
-from arcade_torch.envs_jax.minesweeper.numbers import Level
+from arcade_torch.envs_jax.minesweeper.params import Params
 
 COVERED_SAFE, COVERED_MINE, SWEPT = 0, 1, 2
 
@@ -33,12 +33,12 @@ def count_neighbours(mines: Array) -> Array:
     return columns[:, :side] + columns[:, 1 : side + 1] + columns[:, 2:]
 
 
-def draw_mines(key: Array, level: Level) -> Array:
+def draw_mines(key: Array, level: Params) -> Array:
     """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies."""
     return (random_ranks(key, level.cells) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
+def reset(key: Array, level: Params, rules: Rules) -> MineSweeperState:
     """Mines on distinct uniformly random cells, the cursor on any cell.
 
     With ``rules="reference"`` the cursor never begins in the last column or row.
@@ -52,7 +52,7 @@ def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
 
 
 def step(
-    state: MineSweeperState, action: Array, level: Level, rules: Rules, mine_reward: float
+    state: MineSweeperState, action: Array, level: Params, rules: Rules, mine_reward: float
 ) -> tuple[MineSweeperState, Array, Array, Array]:
     """Move the cursor, or sweep the cell under it.
 

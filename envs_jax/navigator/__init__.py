@@ -2,8 +2,8 @@
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.navigator import rules
-from arcade_torch.envs_jax.navigator.numbers import LEVELS, Level
 from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.navigator.params import LEVELS, Params
 from arcade_torch.envs_jax.navigator.picture import Screen
 from arcade_torch.envs_jax.navigator.rules import NavigatorState
 
@@ -29,7 +29,7 @@ class Navigator(LevelGame[NavigatorState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1 - level.step_reward, 1 + level.step_reward)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
-from arcade_torch.envs_jax.navigator.numbers import DEATH_REWARD, TNTS, TREASURE_REWARD, Level
+from arcade_torch.envs_jax.navigator.params import DEATH_REWARD, TNTS, TREASURE_REWARD, Params
 
 FREE, TNT, TREASURE = 0, 1, 2
 
@@ -35,7 +35,7 @@ def draw_distinct(key: Array, count: int, cells: int) -> Array:
     return jnp.stack(chosen)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> NavigatorState:
+def reset(key: Array, level: Params, rules: Rules) -> NavigatorState:
     """A fresh map; see :func:`place_apart` and, for the reference, :func:`place_as_published`."""
     place = place_apart if rules == "default" else place_as_published
     tnt, treasure, agent = place(key, level)
@@ -45,7 +45,7 @@ def reset(key: Array, level: Level, rules: Rules) -> NavigatorState:
     return NavigatorState(agent // level.side, agent % level.side, board, jnp.int32(0))
 
 
-def place_apart(key: Array, level: Level) -> tuple[Array, Array, Array]:
+def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
     """Blocks, treasure and agent on distinct cells, all ways with equal chance.
 
     Returns:
@@ -64,7 +64,7 @@ def place_apart(key: Array, level: Level) -> tuple[Array, Array, Array]:
     return jnp.where(spare, cells, some_block), treasure_cell, agent_cell
 
 
-def place_as_published(key: Array, level: Level) -> tuple[Array, Array, Array]:
+def place_as_published(key: Array, level: Params) -> tuple[Array, Array, Array]:
     """The reference: x and y of the treasure, and of the agent, are taken from two free cells each.
 
     The treasure's are always the same two entries of the list of free cells, so that it hardly moves from one episode
@@ -89,7 +89,7 @@ def place_as_published(key: Array, level: Level) -> tuple[Array, Array, Array]:
 
 
 def step(
-    state: NavigatorState, action: Array, level: Level, rules: Rules
+    state: NavigatorState, action: Array, level: Params, rules: Rules
 ) -> tuple[NavigatorState, Array, Array, Array]:
     """Move the agent, or open what it stands on.
 

@@ -2,8 +2,8 @@
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.signpost import rules
-from arcade_torch.envs_jax.signpost.numbers import LEVELS, Level
 from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.signpost.params import LEVELS, Params
 from arcade_torch.envs_jax.signpost.picture import Screen
 from arcade_torch.envs_jax.signpost.rules import SignpostState
 
@@ -26,7 +26,7 @@ class Signpost(LevelGame[SignpostState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1.0, 1.0)

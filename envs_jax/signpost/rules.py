@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import RIGHT, Array
-from arcade_torch.envs_jax.signpost.numbers import Level
+from arcade_torch.envs_jax.signpost.params import Params
 
 SIGNS = 4  # up, down, left, right, numbered like the actions
 
@@ -26,7 +26,7 @@ def reset(key: Array) -> SignpostState:
     return SignpostState(jax.random.randint(key, (), 0, SIGNS, dtype=jnp.int32), zero, zero, zero)
 
 
-def step(state: SignpostState, action: Array, level: Level) -> tuple[SignpostState, Array, Array, Array]:
+def step(state: SignpostState, action: Array, level: Params) -> tuple[SignpostState, Array, Array, Array]:
     """Walk one cell; at the gate, answer.
 
     Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents are told their last

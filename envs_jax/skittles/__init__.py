@@ -2,8 +2,8 @@
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.skittles import rules
-from arcade_torch.envs_jax.skittles.numbers import LEVELS, MAX_STEPS, Level
 from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.skittles.params import LEVELS, MAX_STEPS, Params
 from arcade_torch.envs_jax.skittles.picture import Screen
 from arcade_torch.envs_jax.skittles.rules import SkittlesState
 
@@ -31,7 +31,7 @@ class Skittles(LevelGame[SkittlesState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
         if not -1 <= hit_reward <= 0:
             raise ValueError(f"hit_reward is {hit_reward!r}, allowed: -1 to 0")
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)

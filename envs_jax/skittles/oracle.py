@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
-from arcade_torch.envs_jax.skittles.numbers import CELLS, Level
+from arcade_torch.envs_jax.skittles.params import CELLS, Params
 from arcade_torch.envs_jax.skittles.picture import AGENT
 from arcade_torch.envs_jax.skittles.rules import NO_BLOCK
 
@@ -46,7 +46,7 @@ def outlook(width: int, rounds: int = 5) -> npt.NDArray[np.float64]:
 class Planner:
     """Chooses moves with a known or a partly known grid."""
 
-    def __init__(self, level: Level) -> None:
+    def __init__(self, level: Params) -> None:
         self.level, self.worth = level, outlook(level.width)
 
     def plan(self, x: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

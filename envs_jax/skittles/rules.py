@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
-from arcade_torch.envs_jax.skittles.numbers import CELLS, COLOURS, MAX_STEPS, Level
+from arcade_torch.envs_jax.skittles.params import CELLS, COLOURS, MAX_STEPS, Params
 
 NO_BLOCK = -1
 
@@ -22,7 +22,7 @@ class SkittlesState(NamedTuple):
     time: Array  # int32, steps taken, which is the score
 
 
-def reset(key: Array, level: Level, rules: Rules) -> SkittlesState:
+def reset(key: Array, level: Params, rules: Rules) -> SkittlesState:
     """An empty grid, the agent anywhere in the lane; with ``rules="reference"`` all episodes flicker alike."""
     for_agent, flicker_key = jax.random.split(key)
     if rules == "reference":
@@ -32,7 +32,7 @@ def reset(key: Array, level: Level, rules: Rules) -> SkittlesState:
     return SkittlesState(empty, zeros, x, jnp.ones(level.width, bool), flicker_key, jnp.int32(0))
 
 
-def reachable(safe: Array, newest: Array, level: Level) -> Array:
+def reachable(safe: Array, newest: Array, level: Params) -> Array:
     """Where a survivor can be one step on, when the block of the newest row (or ``NO_BLOCK``) leaves: bool [width].
 
     ``safe``, bool [width], is where survivors can be when that row arrives.
@@ -42,7 +42,7 @@ def reachable(safe: Array, newest: Array, level: Level) -> Array:
     return (beside[:-2] | safe | beside[2:]) & (lane != newest)
 
 
-def draw_block(key: Array, reach: Array, level: Level, rules: Rules) -> Array:
+def draw_block(key: Array, reach: Array, level: Params, rules: Rules) -> Array:
     """The column of a new block: int32, uniform among those that leave a survivor somewhere to be.
 
     These are never none, as a lane has at least two columns. ``rules="reference"`` draws among all of the lane.
@@ -55,7 +55,7 @@ def draw_block(key: Array, reach: Array, level: Level, rules: Rules) -> Array:
 
 
 def step(
-    key: Array, state: SkittlesState, action: Array, level: Level, rules: Rules, hit_reward: float
+    key: Array, state: SkittlesState, action: Array, level: Params, rules: Rules, hit_reward: float
 ) -> tuple[SkittlesState, Array, Array, Array]:
     """Move the agent, then let all rows fall by one.
 

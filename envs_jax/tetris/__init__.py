@@ -2,8 +2,8 @@
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.tetris import rules
-from arcade_torch.envs_jax.tetris.numbers import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Level
 from arcade_torch.envs_jax.tetris.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.tetris.params import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Params
 from arcade_torch.envs_jax.tetris.picture import Screen
 from arcade_torch.envs_jax.tetris.rules import TetrisState
 
@@ -30,7 +30,7 @@ class Tetris(LevelGame[TetrisState]):
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = MAX_STEPS
         most_lines = GOAL if rules == "default" else GOAL + 3

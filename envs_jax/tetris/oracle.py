@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.tetris.numbers import BOX, COLUMNS, ROTATIONS, ROWS, SHAPES, SPAWN_X, SPAWN_Y
+from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, ROTATIONS, ROWS, SHAPES, SPAWN_X, SPAWN_Y
 from arcade_torch.envs_jax.tetris.picture import BAND
 
 Bools = npt.NDArray[np.bool_]

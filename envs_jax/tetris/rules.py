@@ -11,7 +11,7 @@ import numpy as np
 
 from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.game import DOWN, LEFT, RIGHT, UP, Array, Rules
-from arcade_torch.envs_jax.tetris.numbers import (
+from arcade_torch.envs_jax.tetris.params import (
     BOX,
     COLUMNS,
     GOAL,
@@ -25,7 +25,7 @@ from arcade_torch.envs_jax.tetris.numbers import (
     SPAWN_X,
     SPAWN_Y,
     TOP_OUT_REWARD,
-    Level,
+    Params,
 )
 
 MARGIN = 3  # bits to the left of column 0: a box may stand so far out
@@ -60,7 +60,7 @@ def shuffled(key: Array) -> Array:
     return random_ranks(key, PIECES)
 
 
-def deal_order(level: Level, rules: Rules) -> tuple[int, int]:
+def deal_order(level: Params, rules: Rules) -> tuple[int, int]:
     """Which of the first bag is dealt first after the previews, and where a new bag begins.
 
     By default that is the next one, and the end of the bag. The reference begins further on, and counts seven pieces
@@ -71,7 +71,7 @@ def deal_order(level: Level, rules: Rules) -> tuple[int, int]:
     return 2 * level.previews, level.previews - 1
 
 
-def reset(key: Array, level: Level, rules: Rules) -> TetrisState:
+def reset(key: Array, level: Params, rules: Rules) -> TetrisState:
     """An empty board and a shuffled bag, whose first piece is at the top."""
     bag = shuffled(key)
     zero, no = jnp.int32(0), jnp.bool_(False)
@@ -140,7 +140,7 @@ def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
     return state._replace(board=board, lines=lines), LINE_REWARD * paid.astype(jnp.float32)
 
 
-def spawn(key: Array, state: TetrisState, level: Level, rules: Rules) -> TetrisState:
+def spawn(key: Array, state: TetrisState, level: Params, rules: Rules) -> TetrisState:
     """Bring the next piece where one has just come to lie; the last preview is dealt from the bag."""
     dealt = state.bag[state.bag_index]
     index = (state.bag_index + 1) % PIECES
@@ -167,7 +167,7 @@ def steer(state: TetrisState, action: Array, window: Array) -> TetrisState:
     return state._replace(rot=jnp.where(free, rot, state.rot), px=jnp.where(free, px, state.px))
 
 
-def fall(state: TetrisState, action: Array, window: Array, level: Level, rules: Rules) -> TetrisState:
+def fall(state: TetrisState, action: Array, window: Array, level: Params, rules: Rules) -> TetrisState:
     """Let the piece go down, and lock it where it cannot go one further.
 
     A soft drop replaces gravity; at the step of the spawn it goes down by one. What cannot go the whole way goes one
@@ -190,7 +190,7 @@ def fall(state: TetrisState, action: Array, window: Array, level: Level, rules: 
 
 
 def step(
-    key: Array, state: TetrisState, action: Array, level: Level, rules: Rules
+    key: Array, state: TetrisState, action: Array, level: Params, rules: Rules
 ) -> tuple[TetrisState, Array, Array, Array]:
     """Clear rows and bring the next piece where one lies, then act on the piece, then let it fall.
 

@@ -5,12 +5,12 @@ from typing import Any
 _LONGEST = 200
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """The ``repr`` of a value without line breaks, cut where it gets long.
 
     Example:
         >>> import numpy as np
-        >>> shown(np.zeros((2, 2)))
+        >>> format_value(np.zeros((2, 2)))
         'array([[0., 0.], [0., 0.]])'
     """
     text = " ".join(repr(value).split())
@@ -30,4 +30,4 @@ def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
     kinds = tuple({type(one) for one in allowed})
     if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
-        raise ValueError(f"{what} is {shown(value)}, allowed: {', '.join(map(repr, allowed))}")
+        raise ValueError(f"{what} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}")
