@@ -7,7 +7,7 @@ Public names are resolved on first use, so that importing the package costs litt
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from arcade_torch.gym import register_games
+import arcade_torch.gym  # noqa: F401  (puts the games into Gymnasium's registry)
 
 __version__ = "0.2.0"
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from arcade_torch.factory import make
 
 __all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "registered_ids"]
-
-register_games()
 
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names

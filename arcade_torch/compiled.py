@@ -14,7 +14,7 @@ from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome
 from arcade_torch.envs_jax.mixture import Batched
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import format_value
 
 # Columns of ``Step.numbers``.
 REWARD, EPISODE_REWARD, STEP_COUNT, TERMINATED, TRUNCATED = range(5)
@@ -159,7 +159,9 @@ def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: d
 def _checked(ids: Any) -> Sequence[str]:
     """Refuse what is no list of ids."""
     if not isinstance(ids, Sequence) or isinstance(ids, bytes):
-        raise TypeError(f"the env id is {shown(ids)}, expected a string such as 'CartPoleEasy', or a list of them")
+        raise TypeError(
+            f"the env id is {format_value(ids)}, expected a string such as 'CartPoleEasy', or a list of them"
+        )
     if not ids:
         raise ValueError("the list of env ids is empty: name at least one game")
     return [resolve_id(id) for id in ids]

@@ -32,7 +32,7 @@ share_gpu()
 
 import jax  # noqa: E402  (after share_gpu)
 
-from arcade_torch.envs_jax.shown import shown  # noqa: E402
+from arcade_torch.envs_jax.validation import format_value  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
 _CPU_ALIGNMENT_BYTES = 64
@@ -162,7 +162,7 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
     try:
         wanted = torch.device(device)
     except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"device is {shown(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
+        raise ValueError(f"device is {format_value(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
     if wanted.type == "cpu":
         return torch.device("cpu"), jax.devices("cpu")[0]
     if wanted.type != "cuda":

@@ -42,7 +42,7 @@ def make(
         obs_size: Side of the frames, 128 or 256 pixels.
         seed: Seed of the batch; None draws one.
         device: Device of all tensors; None for the device that JAX computes on.
-        rules: ``"default"`` or ``"reference"`` (the law of the published numbers).
+        rules: ``"default"`` or ``"reference"`` (those of the published numbers).
         partial_obs: Alias: True means ``observability="partial"``.
         categorical_actions: False for one-hot actions.
         state_in_td: Whether the whole game state travels in the tensordict, for planners; see ``ArcadeEnv``.

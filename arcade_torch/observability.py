@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import format_value
 
 Observability = Literal["full", "partial"] | npt.ArrayLike  # a tensor is array-like too
 
@@ -39,11 +39,11 @@ def partial_flags(
                 "both observability and partial_obs are given: keep observability, partial_obs is its alias"
             )
         if not isinstance(partial_obs, bool):
-            raise TypeError(f"partial_obs is {shown(partial_obs)}, allowed: True, False")
+            raise TypeError(f"partial_obs is {format_value(partial_obs)}, allowed: True, False")
         return np.full(num_envs, partial_obs)
     if observability is None or isinstance(observability, str):
         if observability not in (None, "full", "partial"):
-            raise ValueError(f"observability is {shown(observability)}, {_ALLOWED}")
+            raise ValueError(f"observability is {format_value(observability)}, {_ALLOWED}")
         return np.full(num_envs, observability == "partial")
     given: Any = observability
     flags = np.array(given.cpu().numpy() if hasattr(given, "cpu") else given)

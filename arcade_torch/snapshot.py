@@ -27,11 +27,6 @@ def fingerprint(game_id: str) -> int:
     return zlib.crc32(game_id.encode())
 
 
-def _names(path: tuple[Any, ...]) -> tuple[str, ...]:
-    """Key path of a pytree leaf as names."""
-    return tuple(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path)
-
-
 def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
     return torch.from_numpy(np.empty(0, dtype)).dtype
 
@@ -53,7 +48,7 @@ class Snapshots:
 
     def __init__(self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device) -> None:
         leaves, self._tree = jax.tree_util.tree_flatten_with_path(jax.eval_shape(batched.wide, batch))
-        self._keys = [_names(path) for path, _ in leaves]
+        self._keys = [tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/")) for path, _ in leaves]
         self._dtypes = [np.dtype(leaf.dtype) for _, leaf in leaves]
         self._shapes = [torch.Size(leaf.shape) for _, leaf in leaves]
         self._num_envs = int(batch.step_count.shape[0])

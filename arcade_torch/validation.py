@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import format_value
 
 MOST_ENVS = 2**20
 """The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed allocation."""
@@ -15,7 +15,7 @@ MOST_ENVS = 2**20
 def check_num_envs(num_envs: int) -> None:
     """Raise unless ``num_envs`` is an int from 1 to ``MOST_ENVS``."""
     if isinstance(num_envs, bool) or not isinstance(num_envs, int):
-        raise TypeError(f"num_envs is {shown(num_envs)}, expected an int of 1 or more")
+        raise TypeError(f"num_envs is {format_value(num_envs)}, expected an int of 1 or more")
     if num_envs < 1:
         raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
     if num_envs > MOST_ENVS:
@@ -26,7 +26,7 @@ def check_flags(names: str, values: Sequence[bool | None]) -> None:
     """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also be None."""
     for name, value in zip(names.split(), values, strict=True):
         if not isinstance(value, bool) and not (value is None and name == "task_in_td"):
-            raise TypeError(f"{name} is {shown(value)}, allowed: True, False")
+            raise TypeError(f"{name} is {format_value(value)}, allowed: True, False")
 
 
 def check_tensordict(td: Any, num_envs: int) -> None:

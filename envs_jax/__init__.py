@@ -1,4 +1,4 @@
-"""The games in pure JAX: importing this loads no torch.
+"""The games in pure JAX: importing this loads no torch, and no JAX before it is needed.
 
 Example:
     >>> import jax
@@ -9,23 +9,24 @@ Example:
     (128, 128, 3)
 """
 
-from arcade_torch.envs_jax import (  # noqa: F401  (importing a game registers it)
-    autoencode,
-    battleship,
-    breakout,
-    cartpole,
-    countrecall,
-    minesweeper,
-    navigator,
-    signpost,
-    skittles,
-    tetris,
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from arcade_torch.envs_jax.registry import (
+    OBS_SIZES,
+    make,
+    option_names,
+    probe_ids,
+    register,
+    registered_ids,
+    resolve_id,
 )
-from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, env_keys
-from arcade_torch.envs_jax.checks import check_game
-from arcade_torch.envs_jax.game import ACTION_NAMES, NUM_ACTIONS, OBS_SIZES, Game
-from arcade_torch.envs_jax.mixture import MixedGames, Mixture
-from arcade_torch.envs_jax.registry import make, option_names, probe_ids, register, registered_ids, resolve_id
+
+if TYPE_CHECKING:
+    from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, env_keys
+    from arcade_torch.envs_jax.checks import check_game
+    from arcade_torch.envs_jax.game import ACTION_NAMES, NUM_ACTIONS, Game
+    from arcade_torch.envs_jax.mixture import MixedGames, Mixture
 
 __all__ = [
     "ACTION_NAMES",
@@ -46,3 +47,14 @@ __all__ = [
     "registered_ids",
     "resolve_id",
 ]
+
+
+if not TYPE_CHECKING:  # a checker is to find misspelt names
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name when it is first asked for (PEP 562)."""
+        for module in ("batch", "checks", "game", "mixture") if name in __all__ else ():
+            found = vars(import_module(f"arcade_torch.envs_jax.{module}"))
+            if name in found:
+                return found[name]
+        raise AttributeError(f"module 'arcade_torch.envs_jax' has no attribute {name!r}")

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import Array, Game
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import format_value
 
 State = TypeVar("State")
 
@@ -60,7 +60,7 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         True
     """
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
-        raise TypeError(f"seed is {shown(seed)}, expected a whole number from 0 to 4294967295")
+        raise TypeError(f"seed is {format_value(seed)}, expected a whole number from 0 to 4294967295")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)
@@ -133,7 +133,6 @@ class BatchedGame(Steps, Generic[State]):
         self.step_auto = jax.jit(self._step_auto)
         self.step_render = jax.jit(self._step_render)
         self.reset_render = jax.jit(self._reset_render)
-        self.render_rows = jax.jit(self._render_rows)
         self.draw = jax.jit(jax.vmap(game.render))  # states [K, ...], partial bool [K] -> uint8 [K, S, S, 3]
 
     @property
@@ -186,11 +185,6 @@ class BatchedGame(Steps, Generic[State]):
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""
         return jax.vmap(self.game.render)(batch.state, batch.partial)
-
-    def _render_rows(self, batch: Batch, index: Array) -> Array:
-        """Draw the envs in ``index`` (int32 [K]) alone: uint8 [K, S, S, 3]."""
-        rows = jax.tree.map(lambda leaf: leaf[index], (batch.state, batch.partial))
-        return jax.vmap(self.game.render)(*rows)
 
 
 @partial(jax.vmap, out_axes=0)

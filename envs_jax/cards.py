@@ -1,4 +1,4 @@
-"""Packs of suits, for the games that deal cards."""
+"""Shuffled things: packs of suits, for the games that deal cards, and ranks."""
 
 import jax
 import jax.numpy as jnp
@@ -31,3 +31,13 @@ def deal(key: Array, packs: int, cards: int, suits: int) -> Array:
     suit = jnp.arange(cards, dtype=jnp.uint32) % suits
     draw = jax.random.bits(key, (packs, cards)) & ~jnp.uint32(3)
     return (jnp.sort(draw | suit, axis=-1) & 3).astype(jnp.int8)
+
+
+def random_ranks(key: Array, count: int) -> Array:
+    """A uniformly random order of 0 to ``count - 1``: int32 [count], from a key uint32 [2].
+
+    Ranks of random numbers by comparison, several times faster than a sort of so few.
+    """
+    draw, index = jax.random.bits(key, (count,)), jnp.arange(count)
+    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
+    return lower.sum(1, dtype=jnp.int32)

@@ -44,6 +44,18 @@ def check_game(game: Game[Any]) -> None:
     _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
 
 
+def check_made(game: Any, full_id: str, obs_size: int) -> None:
+    """Refuse what a factory made if it is not the game that was asked for, or does not keep the contract."""
+    if not isinstance(game, Game):
+        raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
+    if (game.id, game.obs_size) != (full_id, obs_size):
+        made = f"{game.id!r} with obs_size {game.obs_size!r}"
+        raise ValueError(
+            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: pass on both"
+        )
+    check_foreign(game)
+
+
 def check_foreign(game: Game[Any]) -> None:
     """``check_game`` for a game that is not one of this package, whose own are checked by its tests."""
     if not type(game).__module__.startswith(_OURS):

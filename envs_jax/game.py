@@ -1,11 +1,10 @@
 """The contract every game obeys: pure functions from state to state and from state to picture."""
 
 import abc
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import jax
-
-from arcade_torch.envs_jax.shown import shown
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
@@ -14,8 +13,6 @@ State = TypeVar("State")
 NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
-OBS_SIZES = (128, 256)
-RULES: tuple[Rules, ...] = ("default", "reference")
 
 
 class Game(abc.ABC, Generic[State]):
@@ -27,13 +24,16 @@ class Game(abc.ABC, Generic[State]):
     Attributes:
         id: Versioned identifier, such as ``"CartPoleEasy-v0"``.
         obs_size: Side of the picture in pixels, 128 or 256.
-        rules: ``"default"`` (the corrected law) or ``"reference"`` (the law of the published numbers).
+        rules: ``"default"`` (corrected) or ``"reference"`` (those of the published numbers).
         max_steps: Time limit in steps; reaching it truncates the episode.
         return_range: Lowest and highest undiscounted return an episode can have.
         num_actions: Always 5: up, down, left, right, fire.
+        oracles: The scripted players there are, ``"state"``, ``"frames"`` or both: called with the game, each gives a
+            player, see :mod:`arcade_torch.envs_jax.oracles`.
     """
 
     num_actions: ClassVar[int] = NUM_ACTIONS
+    oracles: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}
     id: str
     obs_size: int
     rules: Rules
@@ -77,22 +77,42 @@ class Game(abc.ABC, Generic[State]):
             uint8 [S, S, 3], rows downwards, RGB.
         """
 
+    def step_autoreset(
+        self, key: Array, state: State, action: Array
+    ) -> tuple[State, State, tuple[Array, Array, Array]]:
+        """Take one action in one env, and begin a new episode if that ended this one; ``vmap`` it for many envs.
+
+        Args:
+            key: uint32 [2], a JAX random key for this step alone.
+            state: The state before the action.
+            action: int32 scalar in 0..4.
+
+        Returns:
+            The state to go on with; the state that the action led to, which differs at an end alone and whose picture
+            is the final observation; and reward, terminated, truncated as ``step`` gives them.
+        """
+        now, fresh = jax.random.split(key)
+        stepped, reward, terminated, truncated = self.step(now, state, action)
+        ended = terminated | truncated
+        following = jax.tree.map(lambda new, old: jax.numpy.where(ended, new, old), self.reset(fresh), stepped)
+        return following, stepped, (reward, terminated, truncated)
+
     def __repr__(self) -> str:
         """The call that makes this game again."""
         return f"make({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
 
 
-def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    """Refuse a value outside a closed set.
+class LevelGame(Game[State]):
+    """A game of this package; ``levels`` are the numbers of each difficulty by the bare name of its id.
 
     Args:
-        what: Name of the option, for the message.
-        value: What arrived.
-        allowed: All values that are allowed.
-
-    Raises:
-        ValueError: ``value`` is not one of ``allowed``.
+        level: Numbers of the difficulty.
+        id: Versioned id.
+        obs_size: 128 or 256.
+        rules: ``"default"`` or ``"reference"``; each game says what the reference does otherwise.
     """
-    kinds = tuple({type(one) for one in allowed})
-    if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
-        raise ValueError(f"{what} is {shown(value)}, allowed: {', '.join(map(repr, allowed))}")
+
+    levels: ClassVar[Mapping[str, Any]]
+
+    def __init__(self, level: Any, *, id: str, obs_size: int, rules: Rules) -> None:
+        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules

@@ -103,7 +103,6 @@ class MixedGames(Steps):
         self.step_auto = jax.jit(self._step_auto)
         self.step_render = jax.jit(self._step_render)
         self.reset_render = jax.jit(self._reset_render)
-        self.render_rows = jax.jit(self._render_rows)
         self.wide = jax.jit(self._wide)
         self.narrow = jax.jit(self._narrow)
 
@@ -162,10 +161,6 @@ class MixedGames(Steps):
         """Draw every env: uint8 [N, S, S, 3]."""
         parts = self._split(batch, batch.partial)
         return jnp.concatenate([_drawn_apart(group, part) for group, (part, _) in zip(self.groups, parts, strict=True)])
-
-    def _render_rows(self, batch: Batch, index: Array) -> Array:
-        """The frames of the envs in ``index`` (int32 [K]): uint8 [K, S, S, 3]; all are drawn, unlike in one game."""
-        return self._render(batch)[index]
 
     # -- one shape for all envs -------------------------------------------------------------------------------------
 

@@ -6,7 +6,6 @@ POMDP's frames have shown so far, and remembers it; it shows how much of that re
 
 import math
 import time
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -14,28 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.autoencode import AutoEncode
-from arcade_torch.envs_jax.autoencode.oracle import AutoEncodeFrames, AutoEncodeState
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
-from arcade_torch.envs_jax.battleship import BattleShip
-from arcade_torch.envs_jax.battleship.oracle import BattleShipFrames, BattleShipState
-from arcade_torch.envs_jax.breakout import Breakout
-from arcade_torch.envs_jax.breakout.oracle import BreakoutFrames, BreakoutState
-from arcade_torch.envs_jax.cartpole import CartPole
-from arcade_torch.envs_jax.cartpole.oracle import CartPoleFrames, CartPoleState
-from arcade_torch.envs_jax.countrecall import CountRecall
-from arcade_torch.envs_jax.countrecall.oracle import CountRecallFrames, CountRecallState
-from arcade_torch.envs_jax.game import NUM_ACTIONS, Game, check_choice
-from arcade_torch.envs_jax.minesweeper import MineSweeper
-from arcade_torch.envs_jax.minesweeper.oracle import MineSweeperFrames, MineSweeperState
-from arcade_torch.envs_jax.navigator import Navigator
-from arcade_torch.envs_jax.navigator.oracle import NavigatorFrames, NavigatorState
-from arcade_torch.envs_jax.signpost import Signpost
-from arcade_torch.envs_jax.signpost.oracle import SignpostFrames, SignpostState
-from arcade_torch.envs_jax.skittles import Skittles
-from arcade_torch.envs_jax.skittles.oracle import SkittlesFrames, SkittlesState
-from arcade_torch.envs_jax.tetris import Tetris
-from arcade_torch.envs_jax.tetris.oracle import TetrisFrames, TetrisState
+from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
+from arcade_torch.envs_jax.validation import check_choice
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]
@@ -70,35 +50,6 @@ class RandomPlayer:
         return self.generator.integers(NUM_ACTIONS, size=len(is_init), dtype=np.int32)
 
 
-_ORACLES: dict[type[Game[Any]], dict[str, Callable[[Any], Player]]] = {
-    AutoEncode: {"state": AutoEncodeState, "frames": AutoEncodeFrames},
-    CountRecall: {"state": CountRecallState, "frames": CountRecallFrames},
-    Breakout: {"state": BreakoutState, "frames": BreakoutFrames},
-    BattleShip: {"state": BattleShipState, "frames": BattleShipFrames},
-    Navigator: {"state": NavigatorState, "frames": NavigatorFrames},
-    CartPole: {"state": CartPoleState, "frames": CartPoleFrames},
-    MineSweeper: {"state": MineSweeperState, "frames": MineSweeperFrames},
-    Signpost: {"state": SignpostState, "frames": SignpostFrames},
-    Skittles: {"state": SkittlesState, "frames": SkittlesFrames},
-    Tetris: {"state": TetrisState, "frames": TetrisFrames},
-}
-
-
-def register_oracle(game_class: type[Game[Any]], kind: Kind, build: Callable[[Any], Player]) -> None:
-    """Add an oracle for a game class of one's own.
-
-    Args:
-        game_class: The class; its subclasses are served too.
-        kind: ``"state"`` or ``"frames"``.
-        build: Called with the game, returns the player.
-
-    Raises:
-        ValueError: Unknown ``kind``.
-    """
-    check_choice("kind", kind, ("state", "frames"))
-    _ORACLES.setdefault(game_class, {})[kind] = build
-
-
 def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
     """The scripted player of a game.
 
@@ -110,12 +61,10 @@ def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
         ValueError: Unknown ``kind``, or the game has no such oracle.
     """
     check_choice("kind", kind, ("state", "frames"))
-    for game_class, builders in _ORACLES.items():
-        if isinstance(game, game_class) and kind in builders:
-            return builders[kind](game)
-    raise ValueError(
-        f"{game.id} has no {kind} oracle: add one with register_oracle({type(game).__name__}, {kind!r}, ...)"
-    )
+    if kind not in game.oracles:
+        raise ValueError(f"{game.id} has no {kind} oracle: name one in {type(game).__name__}.oracles")
+    player: Player = game.oracles[kind](game)
+    return player
 
 
 def play(

@@ -1,34 +1,58 @@
-"""The one table of games: versioned ids, aliases, and how to make each."""
+"""The one table of games: versioned ids, aliases, and how to make each. Loads no JAX before a game is made."""
 
 import difflib
 import inspect
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import OBS_SIZES, RULES, Game, check_choice
-from arcade_torch.envs_jax.shown import shown
+from arcade_torch.envs_jax.validation import check_choice, format_value
 
-Factory = Callable[..., Game[Any]]
+if TYPE_CHECKING:
+    from arcade_torch.envs_jax.game import Game
 
-_FACTORIES: dict[str, Factory] = {}
-_NEWEST: dict[str, str] = {}
-_ALIASES: dict[str, str] = {}
-_PROBES: set[str] = set()
+Factory = Callable[..., "Game[Any]"]
+OBS_SIZES = (128, 256)
+DIFFICULTIES = ("Easy", "Medium", "Hard")
+# A game of this package is one line: where its class is. The class knows its difficulties (``levels``) and oracles.
+GAMES = {
+    "AutoEncode": "autoencode:AutoEncode",
+    "BattleShip": "battleship:BattleShip",
+    "Breakout": "breakout:Breakout",
+    "CartPole": "cartpole:CartPole",
+    "CountRecall": "countrecall:CountRecall",
+    "MineSweeper": "minesweeper:MineSweeper",
+    "Navigator": "navigator:Navigator",
+    "NoisyCartPole": "cartpole:CartPole",
+    "Skittles": "skittles:Skittles",
+    "Tetris": "tetris:Tetris",
+}
+PROBES = {"Signpost": "signpost:Signpost"}
+
+
+class _Entry(NamedTuple):
+    factory: Factory | str  # a string as in ``GAMES`` is imported when the game is asked for
+    probe: bool
+
+
+_ENTRIES: dict[str, _Entry] = {}  # by versioned id
+_ALIASES: dict[str, str] = {}  # from bare name to bare name
+_LISTENERS: list[Callable[[str], object]] = []
 _VERSIONED = re.compile(r"^(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>\d+)$")
 
 
-def register(id: str, factory: Factory, aliases: Iterable[str] = (), *, probe: bool = False) -> None:
-    """Add a game to the registry.
+def register(id: str, factory: Factory | str, aliases: Iterable[str] = (), *, probe: bool = False) -> None:
+    """Add a game: ``make``, Gymnasium, the command line and all tools know it from then on.
 
     Args:
         id: Versioned id, ``"NameDifficulty-vN"``. The bare name comes to mean the highest version registered.
         factory: Called as ``factory(id=..., obs_size=..., rules=..., **options)``; returns the game, which ``make``
-            checks. Its further keyword arguments are the options that ``make`` accepts.
+            checks. Mostly the game's class. Its further keyword arguments are the options that ``make`` accepts.
         aliases: Other bare names for the same game.
         probe: Whether this is a small task for looking at agents, listed by :func:`probe_ids`, and not one of the
-            benchmark's, listed by :func:`registered_ids`.
+            benchmark's, listed by :func:`registered_ids` and known to Gymnasium.
 
     Raises:
         ValueError: The id has no version, or is taken.
@@ -36,16 +60,19 @@ def register(id: str, factory: Factory, aliases: Iterable[str] = (), *, probe: b
     match = _VERSIONED.match(id)
     if match is None:
         raise ValueError(f"id {id!r} has no version: write it as 'NameDifficulty-v0'")
-    if id in _FACTORIES:
+    if id in _ENTRIES:
         raise ValueError(f"id {id!r} is registered already: raise its version or choose another name")
-    _FACTORIES[id] = factory
-    name = match["name"]
-    if name not in _NEWEST or int(match["version"]) > int(_NEWEST[name].rsplit("-v", 1)[1]):
-        _NEWEST[name] = id
-    for alias in aliases:
-        _ALIASES[alias] = name
-    if probe:
-        _PROBES.add(id)
+    _ENTRIES[id] = _Entry(factory, probe)
+    _ALIASES.update(dict.fromkeys(aliases, match["name"]))
+    for listener in () if probe else _LISTENERS:
+        listener(id)
+
+
+def on_register(listener: Callable[[str], object]) -> None:
+    """Call a function with every id that ``registered_ids`` gives now, and with each that is registered later."""
+    _LISTENERS.append(listener)
+    for id in registered_ids():
+        listener(id)
 
 
 def registered_ids() -> list[str]:
@@ -55,7 +82,7 @@ def registered_ids() -> list[str]:
         >>> "MineSweeperEasy-v0" in registered_ids()
         True
     """
-    return sorted(_FACTORIES.keys() - _PROBES)
+    return sorted(id for id, entry in _ENTRIES.items() if not entry.probe)
 
 
 def probe_ids() -> list[str]:
@@ -65,7 +92,7 @@ def probe_ids() -> list[str]:
         >>> probe_ids()
         ['SignpostEasy-v0', 'SignpostHard-v0', 'SignpostMedium-v0']
     """
-    return sorted(_PROBES)
+    return sorted(id for id, entry in _ENTRIES.items() if entry.probe)
 
 
 def resolve_id(id: str) -> str:
@@ -86,32 +113,39 @@ def resolve_id(id: str) -> str:
         'NoisyCartPoleEasy-v0'
     """
     if not isinstance(id, str):
-        raise TypeError(f"the env id is {shown(id)}, expected a string such as 'CartPoleEasy'")
+        raise TypeError(f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'")
     match = _VERSIONED.match(id)
     name = match["name"] if match else id
     name = _ALIASES.get(name, name)
-    wanted = f"{name}-v{match['version']}" if match else _NEWEST.get(name, "")
-    if wanted in _FACTORIES:
+    newest = _newest()
+    wanted = f"{name}-v{match['version']}" if match else newest.get(name, "")
+    if wanted in _ENTRIES:
         return wanted
-    if match and name in _NEWEST:
-        raise ValueError(f"unknown version in env id {shown(id)}: the newest is {_NEWEST[name]!r}")
-    known = {known.lower(): known for known in (*_NEWEST, *_ALIASES)}
+    if name in newest:
+        raise ValueError(f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}")
+    known = {known.lower(): known for known in (*newest, *_ALIASES)}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
     raise ValueError(
-        f"unknown env id {shown(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a game of "
-        "your own has to be registered first, on the command line with --import"
+        f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a "
+        "game of your own has to be registered first, on the command line with --import"
     )
 
 
-def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any) -> Game[Any]:
+def _newest() -> dict[str, str]:
+    """The newest id of each bare name."""
+    versions = sorted((int(version), name) for name, version in (id.rsplit("-v", 1) for id in _ENTRIES))
+    return {name: f"{name}-v{version}" for version, name in versions}
+
+
+def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any) -> "Game[Any]":
     """Make a game.
 
     Args:
         id: A registered id (``"CartPoleEasy-v0"``), its bare name (``"CartPoleEasy"``, the newest version), or an
             alias.
         obs_size: Side of the picture in pixels, 128 or 256.
-        rules: ``"default"`` for the corrected law, ``"reference"`` for the law of the published numbers (late endings
+        rules: ``"default"`` for the corrected rules, ``"reference"`` for those of the published numbers (late endings
             included).
         **options: Options of this game; an unknown one is refused with the list of those it has.
 
@@ -129,28 +163,27 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     """
     full_id = resolve_id(id)
     check_choice("obs_size", obs_size, OBS_SIZES)
-    check_choice("rules", rules, RULES)
-    factory = _FACTORIES[full_id]
+    check_choice("rules", rules, ("default", "reference"))
     allowed = option_names(full_id)
     unknown = sorted(set(options) - set(allowed))
     if unknown:
         has = f"its options are {', '.join(allowed)}" if allowed else "it has no options"
         raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has}")
-    game = factory(id=full_id, obs_size=obs_size, rules=rules, **options)
-    _check_made(game, full_id, obs_size)
+    from arcade_torch.envs_jax.checks import check_made
+
+    game = _factory(full_id)(id=full_id, obs_size=obs_size, rules=rules, **options)
+    check_made(game, full_id, obs_size)
     return game
 
 
-def _check_made(game: Game[Any], full_id: str, obs_size: int) -> None:
-    """Refuse what a factory made if it is not the game that was asked for, or does not keep the contract."""
-    if not isinstance(game, Game):
-        raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
-    if (game.id, game.obs_size) != (full_id, obs_size):
-        made = f"{game.id!r} with obs_size {game.obs_size!r}"
-        raise ValueError(
-            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: pass on both"
-        )
-    check_foreign(game)
+def _factory(id: str) -> Factory:
+    """What makes a game."""
+    factory = _ENTRIES[id].factory
+    if not isinstance(factory, str):
+        return factory
+    module, _, name = factory.partition(":")
+    game_class = getattr(import_module(f"arcade_torch.envs_jax.{module}"), name)
+    return partial(game_class, game_class.levels[id.rpartition("-v")[0]])
 
 
 def option_names(id: str) -> list[str]:
@@ -162,6 +195,11 @@ def option_names(id: str) -> list[str]:
     Returns:
         The names, in the order of the game's documentation.
     """
-    parameters = inspect.signature(_FACTORIES[resolve_id(id)]).parameters.values()
-    fixed = {"id", "obs_size", "rules", "level"}
-    return [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in fixed]
+    parameters = inspect.signature(_factory(resolve_id(id))).parameters.values()
+    return [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in ("id", "obs_size", "rules")]
+
+
+for _name, _where in (GAMES | PROBES).items():
+    for _difficulty in DIFFICULTIES:
+        _aliases = [f"NoisyPole{_difficulty}"] if _name == "NoisyCartPole" else []
+        register(f"{_name}{_difficulty}-v0", _where, _aliases, probe=_name in PROBES)

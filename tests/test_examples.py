@@ -97,3 +97,18 @@ def test_ppo_in_one_file_begins_with_the_policy_that_acted(monkeypatch: pytest.M
 def test_stable_baselines3_takes_the_environment() -> None:
     pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'")
     assert -1 <= example("cleanrl_style_ppo").stable_baselines3(frames=640) <= 1
+
+
+def test_a_thousand_steps_in_jax_do_not_leave_the_device() -> None:
+    """A transfer inside the compiled call would be refused by the guard of the script."""
+    script = example("jax_scan")
+    assert script.STEPS == 1000
+    result = script.main(num_envs=4)
+    assert (result.episodes >= 1000 // 32).all() and (abs(result.reward) <= result.episodes).all()
+    full, hidden = result.brightness[0::2].mean(), result.brightness[1::2].mean()
+    assert abs(full - hidden) > 0.5  # the twins differ in what they draw, and frames were drawn
+
+
+def test_a_script_written_for_gymnax_learns() -> None:
+    first, last = example("jax_actor_critic").main()
+    assert first < 0 and last > 0.15  # random play earns -0.6, the best without reading the sign 0.25

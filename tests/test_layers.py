@@ -176,8 +176,9 @@ def loaded_after(statement: str) -> set[str]:
     ("statement", "absent"),
     [
         ("import arcade_torch", {"torch", "tensordict", "torchrl", "jax"}),
-        ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl"}),
-        ("import arcade_torch; arcade_torch.registered_ids()", {"torch", "tensordict", "torchrl"}),
+        ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl", "jax"}),
+        ("import arcade_torch.envs_jax as games; games.make('CartPoleEasy')", {"torch", "tensordict", "torchrl"}),
+        ("import arcade_torch; arcade_torch.registered_ids()", {"torch", "tensordict", "torchrl", "jax"}),
         ("import arcade_torch.models", {"jax", "jaxlib"}),
         ("import arcade_torch.agents.presets", {"torch", "tensordict", "torchrl", "jax"}),
         ("import arcade_torch.tools.commands.train", {"torch", "tensordict", "torchrl", "jax"}),

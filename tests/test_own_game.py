@@ -2,15 +2,20 @@
 
 import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arcade_torch.envs_jax import BatchedGame, check_game, env_keys, make
+import arcade_torch
+from arcade_torch.envs_jax import BatchedGame, Game, check_game, env_keys, make, probe_ids, register, registered_ids
+from arcade_torch.envs_jax.game import Rules
+from arcade_torch.envs_jax.oracles import make_oracle, oracle_return
 from arcade_torch.tools import cli
+from arcade_torch.tools.contact_sheet import scene
 from tests.own_registry import own_registry  # noqa: F401
 
 FILE = Path(__file__).resolve().parents[1] / "examples/own_game.py"
@@ -86,3 +91,60 @@ def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(tmp_path: Path, capsy
     err = capsys.readouterr().err
     assert err == "arcade-torch: PairsWrong-v0: render gives uint8 [128, 64, 3], wanted uint8 [128, 128, 3]\n"
     assert not (tmp_path / "run").exists()
+
+
+class ToyState(NamedTuple):
+    """How often the player moved."""
+
+    count: jax.Array  # int32
+
+
+class Toy(Game[ToyState]):
+    """Five steps; action 4 pays. The POMDP hides the count."""
+
+    max_steps, return_range = 5, (0.0, 5.0)
+
+    def __init__(self, *, id: str, obs_size: int, rules: Rules, pay: float = 1.0) -> None:
+        self.id, self.obs_size, self.rules, self.pay = id, obs_size, rules, pay
+
+    def reset(self, key: jax.Array) -> ToyState:
+        return ToyState(jnp.int32(0))
+
+    def step(self, key: jax.Array, state: ToyState, action: jax.Array) -> tuple[ToyState, Any, Any, Any]:
+        count = state.count + 1
+        return ToyState(count), (action == 4) * jnp.float32(self.pay), jnp.bool_(False), count >= self.max_steps
+
+    def render(self, state: ToyState, partial: Any) -> jax.Array:
+        shade = jnp.where(partial, 0, 40 * state.count + 50).astype(jnp.uint8)
+        return jnp.broadcast_to(shade, (self.obs_size, self.obs_size, 3))
+
+
+class Fire:
+    """Always fires."""
+
+    def __init__(self, game: Toy) -> None:
+        del game
+
+    def act(self, seen: Any, is_init: np.ndarray) -> np.ndarray:
+        return np.full(len(is_init), 4, np.int32)
+
+
+def test_one_line_registers_a_game_for_make_oracles_gymnasium_and_the_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+    register("ToyEasy-v0", Toy)
+
+    assert make("ToyEasy", pay=0.5).pay == 0.5 and "ToyEasy-v0" in registered_ids()
+    assert arcade_torch.make("ToyEasy", num_envs=2).rollout(5)["next", "truncated"][:, -1].all()
+    frame, _ = gymnasium.make("arcade_torch/ToyEasy-v0", observability="partial", pay=0.5).reset(seed=0)
+    assert frame.shape == (128, 128, 3) and not frame.any()
+    full, hidden = scene("ToyEasy", 128)  # a game without an oracle is played at random
+    assert full.min() == full.max() > 50 and not hidden.any()
+    with pytest.raises(ValueError, match=r"ToyEasy-v0 has no state oracle: name one in Toy\.oracles"):
+        make_oracle(make("ToyEasy"))
+    monkeypatch.setattr(Toy, "oracles", {"state": Fire})
+    assert (oracle_return(make("ToyEasy"), episodes=3) == 5).all()
+
+
+def test_a_probe_stays_out_of_the_benchmark_and_of_gymnasium() -> None:
+    register("ToyEasy-v0", Toy, probe=True)
+    assert "ToyEasy-v0" in probe_ids() and "ToyEasy-v0" not in registered_ids()
+    assert "arcade_torch/ToyEasy-v0" not in gymnasium.registry and make("ToyEasy").max_steps == 5

@@ -42,10 +42,10 @@ def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
     import jax
 
     from arcade_torch.envs_jax import BatchedGame, env_keys, make
-    from arcade_torch.envs_jax.oracles import make_oracle
+    from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
 
     game = make(id, obs_size=obs_size)
-    batched, player = BatchedGame(game), make_oracle(game)
+    batched, player = BatchedGame(game), make_oracle(game) if "state" in game.oracles else RandomPlayer(seed)
 
     def draw(batch: Any) -> tuple[Picture, Picture]:
         twins = (batched.render(batch._replace(partial=np.array([hides]))) for hides in (False, True))

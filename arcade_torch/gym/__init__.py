@@ -2,29 +2,21 @@
 
 from collections.abc import Iterable
 
+import gymnasium
+
+from arcade_torch.envs_jax.registry import on_register
+
 NAMESPACE = "arcade_torch"
-GAMES = (
-    "AutoEncode",
-    "BattleShip",
-    "Breakout",
-    "CartPole",
-    "CountRecall",
-    "MineSweeper",
-    "Navigator",
-    "NoisyCartPole",
-    "Skittles",
-    "Tetris",
-)
-DIFFICULTIES = ("Easy", "Medium", "Hard")
-# The games' own registry would load JAX; a test holds the two lists together.
-BENCHMARK_IDS = tuple(f"{game}{difficulty}-v0" for game in GAMES for difficulty in DIFFICULTIES)
 
 
-def register_games(ids: Iterable[str] = BENCHMARK_IDS) -> None:
+def register_games(ids: Iterable[str] = ()) -> None:
     """Put games into Gymnasium's registry, as ``"arcade_torch/<id>"``; those that are there already stay.
 
+    The games of the benchmark are there from the beginning, and a game of your own from its ``register`` on; this is
+    for probes, which stay out by themselves.
+
     Args:
-        ids: Versioned ids of ``arcade_torch.envs_jax``; for games of your own, call this after their ``register``.
+        ids: Versioned ids of ``arcade_torch.envs_jax``.
 
     Example:
         >>> import gymnasium
@@ -32,8 +24,6 @@ def register_games(ids: Iterable[str] = BENCHMARK_IDS) -> None:
         >>> gymnasium.spec("arcade_torch/SignpostEasy-v0").kwargs
         {'game': 'SignpostEasy-v0'}
     """
-    import gymnasium
-
     for id in ids:
         name = f"{NAMESPACE}/{id}"
         if name not in gymnasium.registry:
@@ -43,3 +33,6 @@ def register_games(ids: Iterable[str] = BENCHMARK_IDS) -> None:
                 vector_entry_point="arcade_torch.gym.vector:ArcadeVectorEnv",
                 kwargs={"game": id},
             )
+
+
+on_register(lambda id: register_games([id]))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from arcade_torch.compiled import CompiledGame, FinalObservations, check_process
 from arcade_torch.envs_jax import Game
-from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.envs_jax.batch import Batch, Outcome, choose_rows, env_keys
 
 Bools = npt.NDArray[np.bool_]
 Frames = npt.NDArray[np.uint8]
@@ -84,7 +84,8 @@ class NumpyBatch:
     @property
     def info(self) -> Info:
         """Return so far (float64 [N]) and steps so far (int64 [N]) of the running episodes."""
-        return _info(self._batch)
+        counts = np.array(self._batch.step_count, np.int64)
+        return {"episode_reward": np.array(self._batch.episode_reward, np.float64), "step_count": counts}
 
     def set_partial(self, flags: Bools) -> None:
         """Change which twin is shown, bool [N]; only what is drawn from now on changes."""
@@ -113,7 +114,7 @@ class NumpyBatch:
     def step(self, action: npt.NDArray[np.int32]) -> Stepped:
         """Take one action in every env, int32 [N] in 0..4; nothing is drawn."""
         self._batch, outcome = self._batched.step(self._batch, action)
-        return _stepped(self._batch, outcome)
+        return self._stepped(outcome)
 
     def reset_or_step(self, action: npt.NDArray[np.int32], ended: Bools) -> Stepped:
         """Begin anew where ``ended`` (bool [N]) is true and take one action elsewhere; nothing is drawn.
@@ -121,7 +122,11 @@ class NumpyBatch:
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
         self._batch, outcome = _reset_or_step(self._compiled)(self._batch, action, ended)
-        return _stepped(self._batch, outcome)
+        return self._stepped(outcome)
+
+    def _stepped(self, outcome: Outcome) -> Stepped:
+        flags = np.array(outcome.terminated), np.array(outcome.truncated)
+        return Stepped(np.array(outcome.reward, np.float64), *flags, self.info)
 
     def step_and_reset(
         self, action: npt.NDArray[np.int32], copy: bool = True
@@ -152,12 +157,9 @@ def _reset_or_step(compiled: CompiledGame) -> Any:
 
     def advance(batch: Batch, action: jax.Array, ended: jax.Array) -> tuple[Batch, Outcome]:
         stepped, outcome = batched.step(batch, action)
-        # A row that begins anew has not stepped: it goes on from the random key it had.
-        key = jnp.where(ended[:, None], batch.key, stepped.key)
-        last_action = jnp.where(ended, batch.last_action, stepped.last_action)
-        root = batched.reset_where(stepped._replace(key=key, last_action=last_action), ended)
-        quiet = jax.tree.map(lambda leaf: jnp.where(ended, jnp.zeros_like(leaf), leaf), outcome)
-        return root, quiet
+        # A row that begins anew has not stepped: it goes on from the random key it had, and gets nothing.
+        root = batched.reset_where(choose_rows(ended, batch, stepped), ended)
+        return root, choose_rows(ended, jax.tree.map(jnp.zeros_like, outcome), outcome)
 
     return jax.jit(advance)
 
@@ -165,15 +167,3 @@ def _reset_or_step(compiled: CompiledGame) -> Any:
 def _own(array: jax.Array, copy: bool) -> Frames:
     """Frames as numpy: the caller's own, or a read-only view of what JAX wrote."""
     return np.array(array) if copy else np.asarray(array)
-
-
-def _info(batch: Batch) -> Info:
-    return {
-        "episode_reward": np.array(batch.episode_reward, np.float64),
-        "step_count": np.array(batch.step_count, np.int64),
-    }
-
-
-def _stepped(batch: Batch, outcome: Outcome) -> Stepped:
-    flags = np.array(outcome.terminated), np.array(outcome.truncated)
-    return Stepped(np.array(outcome.reward, np.float64), *flags, _info(batch))

@@ -78,13 +78,8 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode of a vector environment is {render_mode!r}, allowed: None, 'rgb_array'")
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": RENDER_FPS,
-            "autoreset_mode": _mode(autoreset_mode),
-        }
-        self._mode = _mode(autoreset_mode)
-        self._copy = copy
+        self._mode, self._copy = _mode(autoreset_mode), copy
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self._mode}
         flags = partial_flags(observability, num_envs, partial_obs)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.single_action_space = action_space(self._batch.game.num_actions)

@@ -1,16 +1,14 @@
 """AutoEncode: watch a row of cards, then name their suits in reverse order."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.autoencode import rules as law
-from arcade_torch.envs_jax.autoencode.numbers import LEVELS, Level
+from arcade_torch.envs_jax.autoencode import rules
+from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.autoencode.params import LEVELS, Params
 from arcade_torch.envs_jax.autoencode.picture import Screen
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 
-class AutoEncode(Game[AutoEncodeState]):
+class AutoEncode(LevelGame[AutoEncodeState]):
     """Watch N cards of four suits, one a step, then give the suits back, the last one first.
 
     For the first N steps the card of the step is on the table, whatever the player does. From then on action 4 answers
@@ -22,9 +20,6 @@ class AutoEncode(Game[AutoEncodeState]):
     the table, the selector and the number of right answers.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` makes the first step after the watch an answer whatever the action, judges both ends one
             step late (returns up to 1 + 1 / N), and leaves the stack of the MDP twin whole.
         mdp_marker: Whether answered cards leave the stack of the MDP twin. Unless given, they do by default and do not
@@ -37,10 +32,12 @@ class AutoEncode(Game[AutoEncodeState]):
         ValueError: ``mdp_marker`` is not a bool.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> None:
         if mdp_marker is not None and not isinstance(mdp_marker, bool):
             raise ValueError(f"mdp_marker is {mdp_marker!r}, allowed: True, False, or None for what the rules say")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.mdp_marker = rules == "default" if mdp_marker is None else mdp_marker
         self.max_steps = level.max_steps
         self.return_range = (0.0, 1.0 + (rules == "reference") / level.cards)
@@ -48,26 +45,13 @@ class AutoEncode(Game[AutoEncodeState]):
 
     def reset(self, key: Array) -> AutoEncodeState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: AutoEncodeState, action: Array) -> tuple[AutoEncodeState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
 
     def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, mdp_marker: bool | None = None) -> AutoEncode:
-        return AutoEncode(level, id=id, obs_size=obs_size, rules=rules, mdp_marker=mdp_marker)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

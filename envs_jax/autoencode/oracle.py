@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.autoencode.numbers import SUITS
+from arcade_torch.envs_jax.autoencode.params import SUITS
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UP
 from arcade_torch.envs_jax.render.suits import NO_CARD
 
@@ -16,7 +16,7 @@ def turn(selected: npt.NDArray[Any], wanted: npt.NDArray[Any]) -> npt.NDArray[np
     return np.select([ahead == 0, ahead == SUITS - 1], [FIRE, RIGHT], LEFT).astype(np.int32)
 
 
-class AutoEncodeState:
+class StateOracle:
     """Sees the cards; answers every one of them in at most three steps, and always reaches the highest return.
 
     It turns the selector to the last card during the watch, which the reference's forced first answer needs.
@@ -33,12 +33,8 @@ class AutoEncodeState:
         return np.where((action == FIRE) & (seen.timestep < self.cards), UP, action).astype(np.int32)
 
 
-class AutoEncodeFrames:
-    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing.
-
-    Args:
-        game: The AutoEncode to play.
-    """
+class FramesOracle:
+    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing."""
 
     def __init__(self, game: Any) -> None:
         self.screen, self.cards, self.rules = game.screen, game.level.cards, game.rules

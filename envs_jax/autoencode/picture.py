@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.autoencode.numbers import Level
+from arcade_torch.envs_jax.autoencode.params import Params
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import number_slot, titled_background
@@ -19,7 +19,7 @@ class Screen:
         mdp_marker: Whether the MDP twin takes the cards away that have been answered.
     """
 
-    def __init__(self, size: int, level: Level, mdp_marker: bool) -> None:
+    def __init__(self, size: int, level: Params, mdp_marker: bool) -> None:
         self.level, self.mdp_marker = level, mdp_marker
         self.background = titled_background(size, "AUTOENCODE", PALE_BLUE, HOT_PINK)
         self.score = number_slot(size, level.cards + 1, PALE_BLUE, SCARLET)  # the reference can pay one card twice

@@ -1,13 +1,10 @@
-"""The law of AutoEncode: watch a row of cards, then name their suits from the last to the first.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of AutoEncode: watch a row of cards, then name their suits from the last to the first."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.autoencode.numbers import SUITS, Level
+from arcade_torch.envs_jax.autoencode.params import SUITS, Params
 from arcade_torch.envs_jax.cards import deal
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, Array, Rules
 
@@ -22,46 +19,33 @@ class AutoEncodeState(NamedTuple):
     score: Array  # int32, right answers
 
 
-def reset(key: Array, level: Level) -> AutoEncodeState:
+def reset(key: Array, level: Params) -> AutoEncodeState:
     """Suits as even as can be, in uniformly random order; the selector on hearts."""
     zero = jnp.int32(0)
     return AutoEncodeState(deal(key, 1, level.cards, SUITS)[0], zero, zero, zero, zero)
 
 
 def step(
-    state: AutoEncodeState, action: Array, level: Level, rules: Rules
+    state: AutoEncodeState, action: Array, level: Params, rules: Rules
 ) -> tuple[AutoEncodeState, Array, Array, Array]:
     """Turn the selector, or answer with the suit it points at.
 
     By default only action 4 answers, and the game ends with the last answer or at the time limit. With
     ``rules="reference"`` the first step after the last card always answers, and both ends are judged on the state
     before the step: one more step follows the last answer, in which the first card can be paid twice.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
-    late = rules == "reference"
+    is_late = rules == "reference"
     selected = (state.selected + (action == LEFT) - (action == RIGHT)) % SUITS
     confirm = action == FIRE
-    if late:
+    if is_late:
         confirm |= state.timestep == level.cards
     answers = confirm & (state.timestep >= level.cards)
     asked = level.cards - 1 - state.given  # below 0 when all are answered: no card
-    if late:
+    if is_late:
         asked = jnp.where(state.given == level.cards, 0, asked)
     right = answers & ((jnp.arange(level.cards) == asked) & (state.cards == selected)).any()
 
-    new = AutoEncodeState(
-        state.cards,
-        state.timestep + 1,
-        state.given + answers,
-        selected,
-        state.score + right,
-    )
-    judged = state if late else new
-    return (
-        new,
-        jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0)),
-        judged.given >= level.cards,
-        judged.timestep >= level.max_steps,
-    )
+    new = AutoEncodeState(state.cards, state.timestep + 1, state.given + answers, selected, state.score + right)
+    judged = state if is_late else new
+    reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
+    return new, reward, judged.given >= level.cards, judged.timestep >= level.max_steps

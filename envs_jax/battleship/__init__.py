@@ -1,16 +1,14 @@
 """BattleShip: hunt hidden ships with a cursor."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.battleship import rules as law
-from arcade_torch.envs_jax.battleship.numbers import LEVELS, Level
+from arcade_torch.envs_jax.battleship import rules
+from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.battleship.params import LEVELS, Params
 from arcade_torch.envs_jax.battleship.picture import Screen
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 
-class BattleShip(Game[BattleShipState]):
+class BattleShip(LevelGame[BattleShipState]):
     """Hit every cell of four hidden ships, of lengths 2, 3, 3 and 4, in a square sea.
 
     Actions 0 to 3 move the cursor by one cell, 4 fires at the cell under it: a ship cell pays ``1 / 12``, water pays
@@ -22,9 +20,6 @@ class BattleShip(Game[BattleShipState]):
     cursor alone. The number of hits is shown in both.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` judges the repeats one shot late (the lowest return is then one repeat lower) and never
             starts the cursor in the last row or column.
 
@@ -32,33 +27,22 @@ class BattleShip(Game[BattleShipState]):
     cursor starts on any cell, a mark has one colour in both twins and at all times.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-2 / level.cells * (level.max_repeats + (rules == "reference")), 1.0)
         self.screen = Screen(obs_size, level)
 
     def reset(self, key: Array) -> BattleShipState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
 
     def render(self, state: BattleShipState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> BattleShip:
-        return BattleShip(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

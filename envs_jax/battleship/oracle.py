@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.battleship.numbers import SHIPS
+from arcade_torch.envs_jax.battleship.params import SHIPS
 from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
 from arcade_torch.envs_jax.minesweeper.oracle import towards
 
@@ -20,7 +20,7 @@ def distances(x: Board, y: Board, side: int) -> npt.NDArray[np.int64]:
     return away
 
 
-class BattleShipState:
+class StateOracle:
     """Sees the ships: goes to the nearest ship cell that is not hit yet and fires. The return is always 1."""
 
     def __init__(self, game: Any) -> None:
@@ -34,7 +34,7 @@ class BattleShipState:
         return towards(seen.x, seen.y, goal // self.side, goal % self.side)
 
 
-class BattleShipFrames:
+class FramesOracle:
     """Sees the POMDP's frames: remembers every mark and fires where a ship is likely and near.
 
     The score of a cell counts the straight places of every ship that hold the cell and no known water; places that hold
@@ -68,14 +68,9 @@ class BattleShipFrames:
 
 
 def ship_scores(known: npt.NDArray[np.int64], boost: float) -> npt.NDArray[np.float64]:
-    """How well ships fit onto each cell, given what is known.
+    """How well ships fit onto each cell of boards of ``UNKNOWN``, ``WATER`` and ``SHIP``: float64 [N, side, side].
 
-    Args:
-        known: int64 [N, side, side], ``UNKNOWN``, ``WATER`` or ``SHIP``.
-        boost: Factor for each known ship cell in a place.
-
-    Returns:
-        float64 [N, side, side], not normalised.
+    A known ship cell multiplies the weight of a place by ``boost``.
     """
     score = np.zeros(known.shape)
     for turned in (False, True):

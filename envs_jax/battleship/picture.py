@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.battleship.numbers import SHIP_CELLS, Level
+from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, Params
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
 from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
@@ -38,7 +38,7 @@ class Screen:
         level: Numbers of the difficulty.
     """
 
-    def __init__(self, size: int, level: Level) -> None:
+    def __init__(self, size: int, level: Params) -> None:
         self.layout = grid_layout(size, level.side)
         side, thickness = self.layout.tile, size // 128
         tiles = []

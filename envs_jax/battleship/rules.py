@@ -1,7 +1,4 @@
-"""The law of BattleShip: a cursor fires at cells of a sea that hides ships; boards are indexed [x, y].
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of BattleShip: a cursor fires at cells of a sea that hides ships; boards are indexed [x, y]."""
 
 from functools import reduce
 from operator import or_
@@ -10,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.battleship.numbers import SHIP_CELLS, SHIPS, Level
+from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, SHIPS, Params
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
 
@@ -28,11 +25,9 @@ class BattleShipState(NamedTuple):
 
 
 def free_places(occupied: Array, length: int) -> Array:
-    """Where a ship fits: bool [2, side, side], its first cell if it lies along x, then along y.
+    """Where a ship of ``length`` cells fits: bool [2, side, side], its first cell if it lies along x, then along y.
 
-    Args:
-        occupied: bool [side, side], cells that are taken; touching them is allowed.
-        length: Cells of the ship.
+    ``occupied``, bool [side, side], are cells that are taken; touching them is allowed.
     """
     side = occupied.shape[0]
     padded = jnp.pad(occupied, (0, length - 1), constant_values=True)
@@ -42,16 +37,10 @@ def free_places(occupied: Array, length: int) -> Array:
 
 
 def place_ship(draw: Array, occupied: Array, length: int) -> Array:
-    """Put a ship at one of the places where it fits.
+    """Put a ship at one of the places where it fits, ``free_places``: bool [side, side], its cells.
 
-    Args:
-        draw: uint32, which of the places, counted round: a uniform draw picks each with equal chance (the remainder
-            favours some by less than one in ten million).
-        occupied: bool [side, side], cells that are taken.
-        length: Cells of the ship.
-
-    Returns:
-        bool [side, side], the cells of the new ship.
+    ``draw``, uint32, is which of the places, counted round: a uniform draw picks each with equal chance (the remainder
+    favours some by less than one in ten million).
     """
     side = occupied.shape[0]
     places = free_places(occupied, length).reshape(2 * side, side)
@@ -71,7 +60,7 @@ def place_ship(draw: Array, occupied: Array, length: int) -> Array:
     return (columns >= 0) & (columns < end_x) & (rows >= 0) & (rows < end_y)
 
 
-def draw_board(key: Array, level: Level) -> Array:
+def draw_board(key: Array, level: Params) -> Array:
     """Ships one after the other, each uniform over the places left to it: int8 [side, side]."""
     draws = jax.random.bits(key, (len(SHIPS),))
     occupied = jnp.zeros((level.side, level.side), bool)
@@ -80,7 +69,7 @@ def draw_board(key: Array, level: Level) -> Array:
     return occupied.astype(jnp.int8)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> BattleShipState:
+def reset(key: Array, level: Params, rules: Rules) -> BattleShipState:
     """Ships anywhere without overlap, the cursor on any cell, nothing shot at.
 
     With ``rules="reference"`` the cursor never begins in the last column or row.
@@ -93,15 +82,12 @@ def reset(key: Array, level: Level, rules: Rules) -> BattleShipState:
 
 
 def step(
-    state: BattleShipState, action: Array, level: Level, rules: Rules
+    state: BattleShipState, action: Array, level: Params, rules: Rules
 ) -> tuple[BattleShipState, Array, Array, Array]:
     """Move the cursor, or fire at the cell under it.
 
     By default the game ends when all ship cells are hit or the repeats reach their limit, and is cut at the time limit.
     With ``rules="reference"`` a shot judges the repeats before it, one shot late, and a move never looks at them.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
 
@@ -111,17 +97,12 @@ def step(
     hit = fire & ~shot_before & jnp.any(here & (state.board == 1))
     again = fire & shot_before
 
-    new = BattleShipState(
-        x,
-        y,
-        state.board,
-        jnp.where(here & fire, jnp.int8(1), state.guesses),
-        state.hits + hit,
-        state.repeats + again,
-        state.timestep + 1,
-    )
+    guesses = jnp.where(here & fire, jnp.int8(1), state.guesses)
+    hits, repeats = state.hits + hit, state.repeats + again
+    new = BattleShipState(x, y, state.board, guesses, hits, repeats, state.timestep + 1)
     reward = jnp.where(hit, 1.0 / SHIP_CELLS, jnp.where(again, -2.0 / level.cells, 0.0))
-    late = fire & (state.repeats >= level.max_repeats)
-    bored = late if rules == "reference" else new.repeats >= level.max_repeats
+    repeat_limit = new.repeats >= level.max_repeats
+    if rules == "reference":
+        repeat_limit = fire & (state.repeats >= level.max_repeats)
     won = new.hits >= SHIP_CELLS
-    return new, reward.astype(jnp.float32), won | bored, new.timestep >= level.max_steps
+    return new, reward.astype(jnp.float32), won | repeat_limit, new.timestep >= level.max_steps

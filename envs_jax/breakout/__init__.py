@@ -1,16 +1,15 @@
 """Breakout: clear a wall with a ball that the POMDP shows only on its way up."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.breakout import rules as law
-from arcade_torch.envs_jax.breakout.numbers import LEVELS, MAX_STEPS, Level
+from arcade_torch.envs_jax.breakout import rules
+from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.breakout.params import LEVELS, MAX_STEPS, Params
 from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
-from arcade_torch.envs_jax.game import Array, Game, Rules, check_choice
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.validation import check_choice
 
 
-class Breakout(Game[BreakoutState]):
+class Breakout(LevelGame[BreakoutState]):
     """Keep a ball in play on a board of 20 x 10 cells until it has cleared a wall of 60 bricks.
 
     Actions 2 and 3 move the paddle to the left and right by one column, the others wait. Each brick pays by its row,
@@ -21,26 +20,26 @@ class Breakout(Game[BreakoutState]):
     downwards.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` pays nothing for a brick touched right after another, and lets the widest paddle begin
             partly beyond the board.
         tail: ``"direction"`` puts the tail opposite to where the ball goes next; ``"previous"`` where it was one step
             ago (as published), which after a bounce does not tell the direction.
         random_start: Let the ball begin in any column; otherwise it begins at either side wall.
 
-    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: every brick pays, the paddle is always on
-        the board, the picture tells the direction, the time limit does not terminate.
+    Source: POPGym Arcade (ICML 2026), after MinAtar (arXiv:1903.03176). Differs from popgym-arcade 0.0.7 in: every
+        brick pays, the paddle is always on the board, the picture tells the direction, the time limit does not
+        terminate.
 
     Raises:
         ValueError: Unknown ``tail``.
         TypeError: ``random_start`` is not a bool.
     """
 
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
     def __init__(
         self,
-        level: Level,
+        level: Params,
         *,
         id: str,
         obs_size: int,
@@ -51,7 +50,7 @@ class Breakout(Game[BreakoutState]):
         check_choice("tail", tail, TAILS)
         if not isinstance(random_start, bool):
             raise TypeError(f"random_start is {random_start!r}, allowed: True or False")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.tail, self.random_start = tail, random_start
         self.max_steps = MAX_STEPS
         self.return_range = (-1.0, 1.0)
@@ -59,27 +58,12 @@ class Breakout(Game[BreakoutState]):
 
     def reset(self, key: Array) -> BreakoutState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules, self.random_start)
+        return rules.reset(key, self.level, self.rules, self.random_start)
 
     def step(self, key: Array, state: BreakoutState, action: Array) -> tuple[BreakoutState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
 
     def render(self, state: BreakoutState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(
-        *, id: str, obs_size: int, rules: Rules, tail: Tail = "direction", random_start: bool = False
-    ) -> Breakout:
-        return Breakout(level, id=id, obs_size=obs_size, rules=rules, tail=tail, random_start=random_start)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -7,19 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.breakout import rules as law
-from arcade_torch.envs_jax.breakout.numbers import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Level
+from arcade_torch.envs_jax.breakout import rules
+from arcade_torch.envs_jax.breakout.params import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
 from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
 
 
-def follow(ball_x: Any, pos: Any, level: Level) -> npt.NDArray[np.int32]:
+def follow(ball_x: Any, pos: Any, level: Params) -> npt.NDArray[np.int32]:
     """The move that brings the paddle's middle under the ball: int32 [N]."""
     goal = np.clip(np.asarray(ball_x) - level.paddle // 2, 0, level.right)
     return np.where(goal > pos, RIGHT, np.where(goal < pos, LEFT, UP)).astype(np.int32)
 
 
-class BreakoutState:
+class StateOracle:
     """Sees the ball and keeps the paddle under it, which clears the wall."""
 
     def __init__(self, game: Any) -> None:
@@ -30,8 +30,8 @@ class BreakoutState:
         return follow(seen.ball_x, seen.pos, self.level)
 
 
-class BreakoutFrames:
-    """Sees the POMDP's frames: carries the ball on by the known law while it is hidden.
+class FramesOracle:
+    """Sees the POMDP's frames: carries the ball on by the known rules while it is hidden.
 
     Bricks and paddle are always seen. The ball is seen on its way up, the first of it in the first frame, so that two
     frames tell all there is to know.
@@ -42,8 +42,8 @@ class BreakoutFrames:
         self.belief: Any = None  # a BreakoutState with numpy leaves
         self.action = np.zeros(0, np.int32)
 
-        def carry_on(state: law.BreakoutState, action: jax.Array) -> law.BreakoutState:
-            return law.step(state, action, game.level, game.rules)[0]
+        def carry_on(state: rules.BreakoutState, action: jax.Array) -> rules.BreakoutState:
+            return rules.step(state, action, game.level, game.rules)[0]
 
         self._carry_on = jax.jit(jax.vmap(carry_on))
 
@@ -59,14 +59,14 @@ class BreakoutFrames:
 
         if self.belief is None or len(self.action) != len(seen):
             zero = np.zeros(len(seen), np.int32)
-            self.belief = law.BreakoutState._make([zero, zero, zero, zero, zero, zero, bricks, zero > 0, zero, zero])
+            self.belief = rules.BreakoutState._make([zero, zero, zero, zero, zero, zero, bricks, zero > 0, zero, zero])
         else:
             self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
         belief = self.belief
         # At first sight the ball is taken to make for the nearer wall; the second tells.
-        guess = np.where(x * 2 >= COLUMNS, law.UP_RIGHT, law.UP_LEFT)
+        guess = np.where(x * 2 >= COLUMNS, rules.UP_RIGHT, rules.UP_LEFT)
         wrong = shown & ((x != belief.ball_x) | (y != belief.ball_y))
-        turned = np.where(is_init, guess, np.where(wrong, belief.ball_dir ^ law.SIDEWAYS, belief.ball_dir))
+        turned = np.where(is_init, guess, np.where(wrong, belief.ball_dir ^ rules.SIDEWAYS, belief.ball_dir))
         self.belief = belief._replace(
             ball_x=np.where(shown, x, belief.ball_x).astype(np.int32),
             ball_y=np.where(shown, y, belief.ball_y).astype(np.int32),

@@ -5,7 +5,7 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.breakout.numbers import BRICKS, COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Level
+from arcade_torch.envs_jax.breakout.params import BRICKS, COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
 from arcade_torch.envs_jax.breakout.rules import DOWN_RIGHT, BreakoutState, velocity
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import TileGrid, blank, centred, disc, number_slot, rectangle, titled_background
@@ -78,7 +78,7 @@ class Screen:
         tail: Where the tail is, see :class:`~arcade_torch.envs_jax.breakout.Breakout`.
     """
 
-    def __init__(self, size: int, level: Level, tail: Tail) -> None:
+    def __init__(self, size: int, level: Params, tail: Tail) -> None:
         self.paddle, self.tail = level.paddle, tail
         atlas = cell_pictures(size)
         field = atlas.shape[2] * COLUMNS

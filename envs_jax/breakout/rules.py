@@ -1,14 +1,11 @@
-"""The law of Breakout: a ball that moves one cell along a diagonal at every step; boards are indexed [row, column].
-
-Source: POPGym Arcade (ICML 2026), environment appendix; MinAtar (arXiv:1903.03176) for the tradition.
-"""
+"""The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed [row, column]."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.breakout.numbers import (
+from arcade_torch.envs_jax.breakout.params import (
     BRICK_REWARD,
     BRICKS,
     COLUMNS,
@@ -18,7 +15,7 @@ from arcade_torch.envs_jax.breakout.numbers import (
     START_ROW,
     WALL_ROWS,
     WALL_TOP,
-    Level,
+    Params,
 )
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
 
@@ -48,7 +45,7 @@ def velocity(direction: Array) -> tuple[Array, Array]:
     return dx, jnp.where(direction < DOWN_RIGHT, -1, 1)
 
 
-def reset(key: Array, level: Level, rules: Rules, random_start: bool) -> BreakoutState:
+def reset(key: Array, level: Params, rules: Rules, random_start: bool) -> BreakoutState:
     """All bricks, and the ball at one side wall, about to hit it; with ``random_start`` anywhere in its row."""
     for_side, for_column = jax.random.split(key)
     right = jax.random.bernoulli(for_side)
@@ -62,15 +59,12 @@ def reset(key: Array, level: Level, rules: Rules, random_start: bool) -> Breakou
     return BreakoutState(x, y, direction, x, y, jnp.int32(pos), bricks, jnp.bool_(False), zero, zero)
 
 
-def step(state: BreakoutState, action: Array, level: Level, rules: Rules) -> tuple[BreakoutState, Array, Array, Array]:
+def step(state: BreakoutState, action: Array, level: Params, rules: Rules) -> tuple[BreakoutState, Array, Array, Array]:
     """Move the paddle, then the ball.
 
     A brick that is touched vanishes and turns the ball round, unless the step before touched one as well: then the ball
     flies on through the gap. By default both pay; with ``rules="reference"`` the second pays nothing and does not
     count.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     # Only a move brings a paddle back that sticks out, as it can at the start of the reference.
@@ -104,6 +98,6 @@ def step(state: BreakoutState, action: Array, level: Level, rules: Rules) -> tup
     return new, reward, lost | (left == 0), new.time >= MAX_STEPS
 
 
-def _covers(pos: Array, x: Array, level: Level) -> Array:
+def _covers(pos: Array, x: Array, level: Params) -> Array:
     """Whether a paddle at ``pos`` covers column ``x`` (bool scalar)."""
     return (x >= pos) & (x < pos + level.paddle)

@@ -1,16 +1,15 @@
 """CartPole and NoisyCartPole: keep the pole up, seen as a picture with velocity arrows."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.cartpole import rules as law
-from arcade_torch.envs_jax.cartpole.numbers import LEVELS, Level
+from arcade_torch.envs_jax.cartpole import rules
+from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.cartpole.params import LEVELS, Params
 from arcade_torch.envs_jax.cartpole.picture import ARROWS, Arrow, Screen
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
-from arcade_torch.envs_jax.game import Array, Game, Rules, check_choice
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.validation import check_choice
 
 
-class CartPole(Game[CartPoleState]):
+class CartPole(LevelGame[CartPoleState]):
     """Push a cart left and right so that its pole stays up.
 
     Actions 2 and 3 push with 10 N to the left and right, the others not at all. Each step that begins within the limits
@@ -20,9 +19,6 @@ class CartPole(Game[CartPoleState]):
     ``NoisyCartPole`` adds normal noise to what is drawn, never to the dynamics; the same noise in both twins.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` judges reward and end one step late, on the state before the step.
         arrow: ``"log"`` draws arrows whose size grows with the logarithm of the speed, in eight classes for speeds up
             to 4 (as published); ``"linear"`` draws lengths proportional to the speed, from which the position can be
@@ -35,34 +31,24 @@ class CartPole(Game[CartPoleState]):
         ValueError: Unknown ``arrow``.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
         check_choice("arrow", arrow, ARROWS)
-        self.level, self.id, self.obs_size, self.rules, self.arrow = level, id, obs_size, rules, arrow
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
+        self.arrow = arrow
         self.max_steps = level.max_steps
         self.return_range = (1.0 / level.max_steps, 1.0)
         self.screen = Screen(obs_size, level.max_steps, arrow)
 
     def reset(self, key: Array) -> CartPoleState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: CartPoleState, action: Array) -> tuple[CartPoleState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules)
+        return rules.step(key, state, action, self.level, self.rules)
 
     def render(self, state: CartPoleState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> CartPole:
-        return CartPole(level, id=id, obs_size=obs_size, rules=rules, arrow=arrow)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level), aliases=[_name.replace("Cart", "")] if "Noisy" in _name else [])

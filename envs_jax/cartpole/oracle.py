@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.cartpole import rules as law
-from arcade_torch.envs_jax.cartpole.numbers import START, THETA_LIMIT, X_LIMIT
+from arcade_torch.envs_jax.cartpole import rules
+from arcade_torch.envs_jax.cartpole.params import START, THETA_LIMIT, X_LIMIT
 from arcade_torch.envs_jax.cartpole.picture import LINEAR_TOP, LOG_CLASSES
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array
 
@@ -21,7 +21,7 @@ def feedback(pose: Any) -> Any:
     return sum(gain * pose[..., i] for i, gain in enumerate(GAINS))
 
 
-class CartPoleState:
+class StateOracle:
     """Sees the state; keeps the pole up for as long as the episode lasts."""
 
     def __init__(self, game: Any) -> None:
@@ -41,7 +41,7 @@ class Belief(NamedTuple):
     key: Array  # uint32 [2]
 
 
-class CartPoleFrames:
+class FramesOracle:
     """Sees the POMDP's frames: reads the two arrows, and keeps a belief over poses.
 
     The dynamics are known and deterministic, the start is known to 0.05, and every picture tells in which of eight
@@ -93,7 +93,7 @@ def _update(
     """Advance one env's belief by the action taken and the arrows seen; choose the next action."""
     key, for_start, for_jitter, for_resample = jax.random.split(belief.key, 4)
     start = jax.random.uniform(for_start, belief.pose.shape, minval=-START, maxval=START)
-    moved = law.move(law.at_pose(belief.pose.T, jnp.zeros(4)), action)
+    moved = rules.move(rules.at_pose(belief.pose.T, jnp.zeros(4)), action)
     pose = jnp.stack([moved.x, moved.x_dot, moved.theta, moved.theta_dot], -1)
     pose = jnp.where(is_init, start, pose)
     log_weight = jnp.where(is_init, 0.0, belief.log_weight)

@@ -6,7 +6,7 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.cartpole.numbers import THETA_LIMIT, X_LIMIT
+from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT, X_LIMIT
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import Slot, arc, blank, number_slot, place, polygon, rectangle, titled_background

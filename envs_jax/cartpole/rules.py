@@ -1,4 +1,4 @@
-"""The law of CartPole: Euler steps of the classic cart and pole, paid by survival.
+"""The rules of CartPole: Euler steps of the classic cart and pole, paid by survival.
 
 Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole; limits and rewards of POPGym Arcade
 (ICML 2026).
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cartpole.numbers import (
+from arcade_torch.envs_jax.cartpole.params import (
     FORCE,
     GRAVITY,
     HALF_POLE,
@@ -19,7 +19,7 @@ from arcade_torch.envs_jax.cartpole.numbers import (
     THETA_LIMIT,
     TOTAL_MASS,
     X_LIMIT,
-    Level,
+    Params,
 )
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
 
@@ -41,14 +41,14 @@ def is_out(state: CartPoleState) -> Array:
     return (jnp.abs(state.x) > X_LIMIT) | (jnp.abs(state.theta) > THETA_LIMIT)
 
 
-def draw_noise(key: Array, level: Level) -> Array:
+def draw_noise(key: Array, level: Params) -> Array:
     """Noise for one picture: float32 [4], normal with the level's sigma."""
     if level.sigma == 0:
         return jnp.zeros(4)
     return level.sigma * jax.random.normal(key, (4,))
 
 
-def reset(key: Array, level: Level) -> CartPoleState:
+def reset(key: Array, level: Params) -> CartPoleState:
     """Cart and pole near the upright rest, all four variables uniform in [-0.05, 0.05]."""
     for_pose, for_noise = jax.random.split(key)
     pose = jax.random.uniform(for_pose, (4,), minval=-START, maxval=START)
@@ -83,15 +83,12 @@ def move(state: CartPoleState, action: Array) -> CartPoleState:
 
 
 def step(
-    key: Array, state: CartPoleState, action: Array, level: Level, rules: Rules
+    key: Array, state: CartPoleState, action: Array, level: Params, rules: Rules
 ) -> tuple[CartPoleState, Array, Array, Array]:
     """One step: reward ``1 / max_steps`` for every step that began within the limits.
 
     By default the episode ends with the step that crosses a limit or reaches the time limit. With ``rules="reference"``
     both are judged on the state before the step, so that one unpaid step follows.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     new = move(state, action)._replace(noise=draw_noise(key, level))
     judged = new if rules == "default" else state

@@ -1,18 +1,16 @@
 """CountRecall: say how often the queried suit has been dealt."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.countrecall import rules as law
-from arcade_torch.envs_jax.countrecall.numbers import LEVELS, MOVE_BUDGET, Level
+from arcade_torch.envs_jax.countrecall import rules
+from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.countrecall.params import LEVELS, MOVE_BUDGET, Params
 from arcade_torch.envs_jax.countrecall.picture import Screen
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 LARGEST_BUDGET = 800  # the counter of the reference, which is not held, then stays within three digits
 
 
-class CountRecall(Game[CountRecallState]):
+class CountRecall(LevelGame[CountRecallState]):
     """In each of N turns a card is dealt and a suit asked for: how many cards of that suit were dealt before?
 
     Actions 0 and 1 move the counter up and down, 4 confirms what it shows: ``1 / N`` if that is right, else 0; then the
@@ -24,9 +22,6 @@ class CountRecall(Game[CountRecallState]):
     counter and the number of right answers.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` lets the counter leave the range of possible answers.
         move_budget: Counter moves that the step limit leaves, 0 to 800; 100 is the published number.
 
@@ -37,10 +32,13 @@ class CountRecall(Game[CountRecallState]):
         ValueError: ``move_budget`` is not an integer from 0 to 800.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> None:
         if isinstance(move_budget, bool) or not isinstance(move_budget, int) or not 0 <= move_budget <= LARGEST_BUDGET:
             raise ValueError(f"move_budget is {move_budget!r}, allowed: an integer from 0 to {LARGEST_BUDGET}")
-        self.level, self.id, self.obs_size, self.rules, self.move_budget = level, id, obs_size, rules, move_budget
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
+        self.move_budget = move_budget
         self.max_steps = level.cards + move_budget
         self.return_range = (0.0, 1.0)
         # A counter that is not held shows what it reaches, except that it stops at two digits below 0.
@@ -49,26 +47,13 @@ class CountRecall(Game[CountRecallState]):
 
     def reset(self, key: Array) -> CountRecallState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level)
+        return rules.reset(key, self.level)
 
     def step(self, key: Array, state: CountRecallState, action: Array) -> tuple[CountRecallState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
-        return law.step(state, action, self.level, self.max_steps, self.rules)
+        return rules.step(state, action, self.level, self.max_steps, self.rules)
 
     def render(self, state: CountRecallState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, move_budget: int = MOVE_BUDGET) -> CountRecall:
-        return CountRecall(level, id=id, obs_size=obs_size, rules=rules, move_budget=move_budget)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -61,7 +61,7 @@ def towards(answer: npt.NDArray[Any], goal: npt.NDArray[Any]) -> npt.NDArray[np.
     return np.where(there, FIRE, np.where(goal > answer, UP, DOWN)).astype(np.int32)
 
 
-class CountRecallState:
+class StateOracle:
     """Sees both packs, future turns included: reaches the highest return that the step limit leaves.
 
     That is 1 for every deal on Easy and for most on Medium, but for a minority on Hard; the mean is near 0.96 there.
@@ -82,14 +82,11 @@ class CountRecallState:
         return towards(seen.answer, self.plan[np.arange(len(turn)), turn])
 
 
-class CountRecallFrames:
+class FramesOracle:
     """Sees the POMDP's frames: counts the cards of each suit as they are dealt.
 
     It always knows the right answer. What it cannot know is which answers will be asked for, and so whether the moves
     to a far one are better saved: it answers what is within ``3.5`` times the moves left per turn left, and a half.
-
-    Args:
-        game: The CountRecall to play.
     """
 
     def __init__(self, game: Any) -> None:

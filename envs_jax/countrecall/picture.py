@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.countrecall.numbers import Level
+from arcade_torch.envs_jax.countrecall.params import Params
 from arcade_torch.envs_jax.countrecall.rules import CountRecallState
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
@@ -58,7 +58,7 @@ class Screen:
         counter: Lowest and highest value shown; what lies beyond is shown as the nearer of the two.
     """
 
-    def __init__(self, size: int, level: Level, counter: tuple[int, int]) -> None:
+    def __init__(self, size: int, level: Params, counter: tuple[int, int]) -> None:
         self.level, self.counter_range = level, counter
         offset, side = (length * (size // 128) for length in FIELD)
         background = titled_background(size, "COUNTRECALL", SMOKE, AZURE)

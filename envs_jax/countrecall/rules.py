@@ -1,14 +1,11 @@
-"""The law of CountRecall: in every turn say how often a suit has been dealt before.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of CountRecall: in every turn say how often a suit has been dealt before."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cards import deal
-from arcade_torch.envs_jax.countrecall.numbers import Level
+from arcade_torch.envs_jax.countrecall.params import Params
 from arcade_torch.envs_jax.game import DOWN, FIRE, UP, Array, Rules
 
 
@@ -23,7 +20,7 @@ class CountRecallState(NamedTuple):
     moves: Array  # int32, steps taken
 
 
-def reset(key: Array, level: Level) -> CountRecallState:
+def reset(key: Array, level: Params) -> CountRecallState:
     """Two independent uniformly random orders of a pack with suits as even as can be; the counter at 0."""
     cards, queries = deal(key, 2, level.cards, level.suits)
     zero = jnp.int32(0)
@@ -31,15 +28,12 @@ def reset(key: Array, level: Level) -> CountRecallState:
 
 
 def step(
-    state: CountRecallState, action: Array, level: Level, max_steps: int, rules: Rules
+    state: CountRecallState, action: Array, level: Params, max_steps: int, rules: Rules
 ) -> tuple[CountRecallState, Array, Array, Array]:
     """Move the counter, or confirm what it shows.
 
     The card on the table does not count yet: the right answer of the first turn is 0. By default the counter stays
     between 0 and the size of the largest suit; with ``rules="reference"`` it goes anywhere.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     answer = state.answer + (action == UP) - (action == DOWN)
     if rules == "default":
@@ -52,13 +46,7 @@ def step(
     dealt = ((index < state.timestep) & (state.cards == query)).sum()
     right = confirm & now.any() & (answer == dealt)
 
-    new = CountRecallState(
-        state.cards,
-        state.queries,
-        state.timestep + confirm,
-        answer,
-        state.score + right,
-        state.moves + 1,
-    )
+    turn, score = state.timestep + confirm, state.score + right
+    new = CountRecallState(state.cards, state.queries, turn, answer, score, state.moves + 1)
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, new.timestep >= level.cards, new.moves >= max_steps

@@ -1,16 +1,14 @@
 """MineSweeper: sweep all safe cells with a cursor."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.minesweeper import rules as law
-from arcade_torch.envs_jax.minesweeper.numbers import LEVELS, Level
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.minesweeper import rules
+from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.minesweeper.params import LEVELS, Params
 from arcade_torch.envs_jax.minesweeper.picture import Screen
 from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
-from arcade_torch.envs_jax.registry import register
 
 
-class MineSweeper(Game[MineSweeperState]):
+class MineSweeper(LevelGame[MineSweeperState]):
     """Sweep every safe cell of a square board, one cell at a time.
 
     Actions 0 to 3 move the cursor by one cell, 4 sweeps the cell under it: a covered safe cell pays ``1 / safe``, a
@@ -22,31 +20,24 @@ class MineSweeper(Game[MineSweeperState]):
     cursor.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` judges repeats and time one sweep late, and never starts the cursor in the last row or
             column.
         mine_reward: Reward for hitting a mine. The published scale has 0; the paper's words ask for a negative number.
 
     Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: ends are not one sweep late, the cursor
-        starts on
-    any cell, numbers are legible and equal in both twins.
+        starts on any cell, numbers are legible and equal in both twins.
 
     Raises:
         ValueError: ``mine_reward`` is positive or beyond -1.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
         if not -1 <= mine_reward <= 0:
             raise ValueError(f"mine_reward is {mine_reward!r}, allowed: -1 to 0")
-        self.level, self.id, self.obs_size, self.rules, self.mine_reward = (
-            level,
-            id,
-            obs_size,
-            rules,
-            float(mine_reward),
-        )
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
+        self.mine_reward = float(mine_reward)
         self.max_steps = level.max_steps
         repeats = level.max_repeats + (rules == "reference")
         lowest = 1 / level.safe - 2 / level.cells * repeats
@@ -55,25 +46,12 @@ class MineSweeper(Game[MineSweeperState]):
 
     def reset(self, key: Array) -> MineSweeperState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: MineSweeperState, action: Array) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules, self.mine_reward)
+        return rules.step(state, action, self.level, self.rules, self.mine_reward)
 
     def render(self, state: MineSweeperState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> MineSweeper:
-        return MineSweeper(level, id=id, obs_size=obs_size, rules=rules, mine_reward=mine_reward)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -24,7 +24,7 @@ def towards(x: Board, y: Board, goal_x: Board, goal_y: Board) -> npt.NDArray[np.
     return np.where(goal_x != x, sideways, np.where(goal_y != y, along, FIRE)).astype(np.int32)
 
 
-class MineSweeperState:
+class StateOracle:
     """Sees the mines: goes to the nearest corner, then walks the board in turns and sweeps what is safe.
 
     The walk takes at most ``side - 2`` steps to a corner, ``cells - 1`` over the board and ``safe`` sweeps, which fits
@@ -58,7 +58,7 @@ class MineSweeperState:
         return towards(seen.x, seen.y, goal[:, 0], goal[:, 1])
 
 
-class MineSweeperFrames:
+class FramesOracle:
     """Sees the POMDP's frames: remembers every number seen and infers where mines may lie.
 
     Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen and to the number of
@@ -105,15 +105,9 @@ def block_sum(values: Board) -> Board:
 
 
 def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.NDArray[np.float64]:
-    """Chance of a mine in each covered cell, fitted to the numbers seen.
+    """Chance of a mine in each covered cell, fitted to the numbers seen: float64 [N, side, side], 0 in swept cells.
 
-    Args:
-        known: int64 [N, side, side], the number of each swept cell, -1 where covered.
-        mines: Mines on the board.
-        rounds: Fitting rounds.
-
-    Returns:
-        float64 [N, side, side]; 0 in swept cells.
+    ``known``, int64 [N, side, side], is the number of each swept cell, -1 where covered.
     """
     covered: Board = known < 0
     count = np.maximum(covered.sum((1, 2), keepdims=True), 1)

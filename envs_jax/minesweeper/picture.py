@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.minesweeper.numbers import Level
+from arcade_torch.envs_jax.minesweeper.params import Params
 from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState
 from arcade_torch.envs_jax.render import (
     DIGITS,
@@ -39,7 +39,7 @@ class Screen:
         level: Numbers of the difficulty.
     """
 
-    def __init__(self, size: int, level: Level) -> None:
+    def __init__(self, size: int, level: Params) -> None:
         self.layout = grid_layout(size, level.side)
         side = self.layout.tile
         tiles = []

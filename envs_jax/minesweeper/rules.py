@@ -1,16 +1,14 @@
-"""The law of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y].
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y]."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
-from arcade_torch.envs_jax.minesweeper.numbers import Level
+from arcade_torch.envs_jax.minesweeper.params import Params
 
 COVERED_SAFE, COVERED_MINE, SWEPT = 0, 1, 2
 
@@ -35,18 +33,12 @@ def count_neighbours(mines: Array) -> Array:
     return columns[:, :side] + columns[:, 1 : side + 1] + columns[:, 2:]
 
 
-def draw_mines(key: Array, level: Level) -> Array:
-    """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies.
-
-    The cells that drew the lowest numbers; ranking by comparison is several times faster than a sort of so few.
-    """
-    draw = jax.random.bits(key, (level.cells,))
-    index = jnp.arange(level.cells)
-    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
-    return (lower.sum(1) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
+def draw_mines(key: Array, level: Params) -> Array:
+    """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies."""
+    return (random_ranks(key, level.cells) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
+def reset(key: Array, level: Params, rules: Rules) -> MineSweeperState:
     """Mines on distinct uniformly random cells, the cursor on any cell.
 
     With ``rules="reference"`` the cursor never begins in the last column or row.
@@ -60,16 +52,13 @@ def reset(key: Array, level: Level, rules: Rules) -> MineSweeperState:
 
 
 def step(
-    state: MineSweeperState, action: Array, level: Level, rules: Rules, mine_reward: float
+    state: MineSweeperState, action: Array, level: Params, rules: Rules, mine_reward: float
 ) -> tuple[MineSweeperState, Array, Array, Array]:
     """Move the cursor, or sweep the cell under it.
 
     By default the game ends when a mine is hit, all safe cells are swept, or the repeats reach their limit, and is cut
     at the time limit. With ``rules="reference"`` a sweep judges repeats and time on the state before it, one sweep
     late, and a move never looks at the repeats.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
 
@@ -78,20 +67,14 @@ def step(
     cell = jnp.sum(jnp.where(here, state.grid, 0))
     safe, mine, again = fire & (cell == COVERED_SAFE), fire & (cell == COVERED_MINE), fire & (cell == SWEPT)
 
-    new = MineSweeperState(
-        x,
-        y,
-        jnp.where(here & fire, jnp.int8(SWEPT), state.grid),
-        state.neighbours,
-        state.score + safe,
-        state.repeats + again,
-        state.timestep + 1,
-    )
+    grid = jnp.where(here & fire, jnp.int8(SWEPT), state.grid)
+    score, repeats = state.score + safe, state.repeats + again
+    new = MineSweeperState(x, y, grid, state.neighbours, score, repeats, state.timestep + 1)
     reward = jnp.where(safe, 1.0 / level.safe, jnp.where(mine, mine_reward, jnp.where(again, -2.0 / level.cells, 0.0)))
     cleared = new.score >= level.safe
     if rules == "default":
-        bored, late = new.repeats >= level.max_repeats, new.timestep >= level.max_steps
+        repeat_limit, time_limit = new.repeats >= level.max_repeats, new.timestep >= level.max_steps
     else:
-        bored = fire & (state.repeats >= level.max_repeats)
-        late = jnp.where(fire, state.timestep, new.timestep) >= level.max_steps
-    return new, reward.astype(jnp.float32), mine | cleared | bored, late
+        repeat_limit = fire & (state.repeats >= level.max_repeats)
+        time_limit = jnp.where(fire, state.timestep, new.timestep) >= level.max_steps
+    return new, reward.astype(jnp.float32), mine | cleared | repeat_limit, time_limit

@@ -1,16 +1,14 @@
 """Navigator: find the treasure, avoid TNT, on a map that the POMDP shows only once."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.navigator import rules as law
-from arcade_torch.envs_jax.navigator.numbers import LEVELS, Level
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.navigator import rules
+from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.navigator.params import LEVELS, Params
 from arcade_torch.envs_jax.navigator.picture import Screen
 from arcade_torch.envs_jax.navigator.rules import NavigatorState
-from arcade_torch.envs_jax.registry import register
 
 
-class Navigator(Game[NavigatorState]):
+class Navigator(LevelGame[NavigatorState]):
     """Walk to the treasure and open it; seven blocks of TNT lie about.
 
     Actions 0 to 3 move the agent by one cell, 4 opens what it stands on. Opening the treasure pays 1 and ends the game,
@@ -21,9 +19,6 @@ class Navigator(Game[NavigatorState]):
     (3, 0.5 and 0.3 in a thousand) TNT walls off treasure or agent.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` puts the treasure almost always on the same few cells, may put it or the agent onto TNT,
             and pays nothing for the step that reaches the time limit. Returns then lie in [1 / cells - 1, 1].
 
@@ -32,8 +27,10 @@ class Navigator(Game[NavigatorState]):
     colours are blended.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1 - level.step_reward, 1 + level.step_reward)
         if rules == "reference":
@@ -42,25 +39,12 @@ class Navigator(Game[NavigatorState]):
 
     def reset(self, key: Array) -> NavigatorState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: NavigatorState, action: Array) -> tuple[NavigatorState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level, self.rules)
+        return rules.step(state, action, self.level, self.rules)
 
     def render(self, state: NavigatorState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Navigator:
-        return Navigator(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -55,7 +55,7 @@ class _Walker:
         return np.where(arrived | (ahead.min(0) >= FAR), FIRE, best).astype(np.int32)
 
 
-class NavigatorState(_Walker):
+class StateOracle(_Walker):
     """Sees the map; its return is ``1 - 0.5 d / cells`` after the shortest path of d moves."""
 
     def __init__(self, game: Any) -> None:
@@ -67,7 +67,7 @@ class NavigatorState(_Walker):
         return self.walk(seen.x, seen.y)
 
 
-class NavigatorFrames(_Walker):
+class FramesOracle(_Walker):
     """Sees the POMDP's frames: remembers the map of the first, and reads the agent's place in each.
 
     It walks as well as one that sees the map throughout.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.navigator.numbers import Level
+from arcade_torch.envs_jax.navigator.params import Params
 from arcade_torch.envs_jax.navigator.rules import FREE, NavigatorState
 from arcade_torch.envs_jax.render import (
     bitmap,
@@ -74,7 +74,7 @@ class Screen:
         level: Numbers of the difficulty.
     """
 
-    def __init__(self, size: int, level: Level) -> None:
+    def __init__(self, size: int, level: Params) -> None:
         self.layout = grid_layout(size, level.side)
         side = self.layout.tile
         tiles = [blank(side, side, MAUVE), tnt_tile(side), treasure_tile(side)]

@@ -1,7 +1,4 @@
-"""The law of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y].
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y]."""
 
 from typing import NamedTuple
 
@@ -10,7 +7,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
-from arcade_torch.envs_jax.navigator.numbers import DEATH_REWARD, TNTS, TREASURE_REWARD, Level
+from arcade_torch.envs_jax.navigator.params import DEATH_REWARD, TNTS, TREASURE_REWARD, Params
 
 FREE, TNT, TREASURE = 0, 1, 2
 
@@ -27,11 +24,7 @@ class NavigatorState(NamedTuple):
 def draw_distinct(key: Array, count: int, cells: int) -> Array:
     """A uniformly random set of cells, by Floyd's algorithm: int32 [count], in no useful order.
 
-    Args:
-        key: uint32 [2].
-        count: How many.
-        cells: Out of how many; the remainder that maps 32 random bits to so few favours some cells by less than one in
-            ten million.
+    The remainder that maps 32 random bits to so few favours some cells by less than one in ten million.
     """
     draws = jax.random.bits(key, (count,))
     chosen: list[Array] = []
@@ -42,8 +35,8 @@ def draw_distinct(key: Array, count: int, cells: int) -> Array:
     return jnp.stack(chosen)
 
 
-def reset(key: Array, level: Level, rules: Rules) -> NavigatorState:
-    """A fresh map; see :func:`place_apart` for the default law and :func:`place_as_published` for the reference."""
+def reset(key: Array, level: Params, rules: Rules) -> NavigatorState:
+    """A fresh map; see :func:`place_apart` and, for the reference, :func:`place_as_published`."""
     place = place_apart if rules == "default" else place_as_published
     tnt, treasure, agent = place(key, level)
     cell = jnp.arange(level.cells)
@@ -52,7 +45,7 @@ def reset(key: Array, level: Level, rules: Rules) -> NavigatorState:
     return NavigatorState(agent // level.side, agent % level.side, board, jnp.int32(0))
 
 
-def place_apart(key: Array, level: Level) -> tuple[Array, Array, Array]:
+def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
     """Blocks, treasure and agent on distinct cells, all ways with equal chance.
 
     Returns:
@@ -71,8 +64,8 @@ def place_apart(key: Array, level: Level) -> tuple[Array, Array, Array]:
     return jnp.where(spare, cells, some_block), treasure_cell, agent_cell
 
 
-def place_as_published(key: Array, level: Level) -> tuple[Array, Array, Array]:
-    """The law of the reference: x and y of the treasure, and of the agent, are taken from two free cells each.
+def place_as_published(key: Array, level: Params) -> tuple[Array, Array, Array]:
+    """The reference: x and y of the treasure, and of the agent, are taken from two free cells each.
 
     The treasure's are always the same two entries of the list of free cells, so that it hardly moves from one episode
     to the next. It may replace a block of TNT, and the agent may start on a block or on the treasure.
@@ -96,15 +89,12 @@ def place_as_published(key: Array, level: Level) -> tuple[Array, Array, Array]:
 
 
 def step(
-    state: NavigatorState, action: Array, level: Level, rules: Rules
+    state: NavigatorState, action: Array, level: Params, rules: Rules
 ) -> tuple[NavigatorState, Array, Array, Array]:
     """Move the agent, or open what it stands on.
 
     A move that ends on TNT kills, also one against the border; opening the treasure wins; either ends the game. With
     ``rules="reference"`` the step that reaches the time limit pays nothing, whatever happened.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
     new = NavigatorState(x, y, state.board, state.timestep + 1)
@@ -113,8 +103,8 @@ def step(
     cell = jnp.sum(jnp.where(here, state.board, 0))
     fire = action == FIRE
     dead, won = ~fire & (cell == TNT), fire & (cell == TREASURE)
-    late = new.timestep >= level.max_steps
+    time_limit = new.timestep >= level.max_steps
     reward = jnp.where(won, TREASURE_REWARD, jnp.where(dead, DEATH_REWARD, level.step_reward))
     if rules == "reference":
-        reward = jnp.where(late, 0.0, reward)
-    return new, reward.astype(jnp.float32), dead | won, late
+        reward = jnp.where(time_limit, 0.0, reward)
+    return new, reward.astype(jnp.float32), dead | won, time_limit

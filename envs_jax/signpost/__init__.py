@@ -1,16 +1,14 @@
 """Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten games."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
-from arcade_torch.envs_jax.signpost import rules as law
-from arcade_torch.envs_jax.signpost.numbers import LEVELS, Level
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.signpost import rules
+from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.signpost.params import LEVELS, Params
 from arcade_torch.envs_jax.signpost.picture import Screen
 from arcade_torch.envs_jax.signpost.rules import SignpostState
 
 
-class Signpost(Game[SignpostState]):
+class Signpost(LevelGame[SignpostState]):
     """Read the sign, walk to the gate, press the direction that the sign showed.
 
     Every action walks one cell along the corridor, and every one but 3 (right) stumbles and costs ``1 / corridor``. At
@@ -21,41 +19,27 @@ class Signpost(Game[SignpostState]):
     The MDP twin shows the sign all the time; the POMDP twin shows it in the first frame alone.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
-        rules: ``"default"`` and ``"reference"`` are the same here: there is no published law.
+        rules: ``"default"`` and ``"reference"`` are the same here: no rules were published.
 
     Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory") with four ways on.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = level.max_steps
         self.return_range = (-1.0, 1.0)
         self.screen = Screen(obs_size, level)
 
     def reset(self, key: Array) -> SignpostState:
         """See :meth:`Game.reset`."""
-        return law.reset(key)
+        return rules.reset(key)
 
     def step(self, key: Array, state: SignpostState, action: Array) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(state, action, self.level)
+        return rules.step(state, action, self.level)
 
     def render(self, state: SignpostState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Signpost:
-        return Signpost(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level), probe=True)

@@ -11,7 +11,7 @@ from arcade_torch.envs_jax.signpost.picture import KINDS
 Actions = npt.NDArray[np.int32]
 
 
-class SignpostState:
+class StateOracle:
     """Sees the sign: always opens the gate, return 1."""
 
     def __init__(self, game: Any) -> None:
@@ -22,7 +22,7 @@ class SignpostState:
         return np.where(seen.x == self.gate, seen.sign, RIGHT).astype(np.int32)
 
 
-class SignpostFrames:
+class FramesOracle:
     """Sees the POMDP's frames: the sign stands on the first of them alone; return 1."""
 
     def __init__(self, game: Any) -> None:

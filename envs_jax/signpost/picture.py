@@ -17,7 +17,7 @@ from arcade_torch.envs_jax.render import (
 )
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import BLACK, GREY, NAVY, ORANGE, SPRING_GREEN, WHITE, YELLOW
-from arcade_torch.envs_jax.signpost.numbers import Level
+from arcade_torch.envs_jax.signpost.params import Params
 from arcade_torch.envs_jax.signpost.rules import SIGNS, SignpostState
 
 FLOOR, GATE, OPEN, KINDS = 0, 1, 2, 3  # tile codes; the same again under the walker
@@ -49,7 +49,7 @@ class Screen:
         level: Numbers of the difficulty.
     """
 
-    def __init__(self, size: int, level: Level) -> None:
+    def __init__(self, size: int, level: Params) -> None:
         self.cells = level.cells
         tile = size * 3 // 4 // level.cells
         self.background = titled_background(size, "SIGNPOST", BLACK, WHITE)

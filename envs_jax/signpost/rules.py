@@ -1,4 +1,4 @@
-"""The law of Signpost: read the sign, walk to the gate, press what the sign said."""
+"""The rules of Signpost: read the sign, walk to the gate, press what the sign said."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import RIGHT, Array
-from arcade_torch.envs_jax.signpost.numbers import Level
+from arcade_torch.envs_jax.signpost.params import Params
 
 SIGNS = 4  # up, down, left, right, numbered like the actions
 
@@ -26,15 +26,12 @@ def reset(key: Array) -> SignpostState:
     return SignpostState(jax.random.randint(key, (), 0, SIGNS, dtype=jnp.int32), zero, zero, zero)
 
 
-def step(state: SignpostState, action: Array, level: Level) -> tuple[SignpostState, Array, Array, Array]:
+def step(state: SignpostState, action: Array, level: Params) -> tuple[SignpostState, Array, Array, Array]:
     """Walk one cell; at the gate, answer.
 
     Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents are told their last
     action, so a player without memory could carry the sign to the gate by repeating it; stumbling all the way costs as
-    much as the gate pays, so that nobody without memory can expect more than 1/4.
-
-    Returns:
-        New state, reward, terminated, truncated (never: an episode has ``corridor + 1`` steps).
+    much as the gate pays, so that nobody without memory can expect more than 1/4. Nothing truncates.
     """
     at_gate = state.x == level.corridor
     opened = at_gate & (action == state.sign)

@@ -1,16 +1,14 @@
 """Skittles: dodge blocks that fall, and flicker in the POMDP."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
-from arcade_torch.envs_jax.skittles import rules as law
-from arcade_torch.envs_jax.skittles.numbers import LEVELS, MAX_STEPS, Level
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.skittles import rules
+from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.skittles.params import LEVELS, MAX_STEPS, Params
 from arcade_torch.envs_jax.skittles.picture import Screen
 from arcade_torch.envs_jax.skittles.rules import SkittlesState
 
 
-class Skittles(Game[SkittlesState]):
+class Skittles(LevelGame[SkittlesState]):
     """Dodge the blocks that fall towards the bottom row of a 10 x 10 grid, one new block a step.
 
     Actions 2 and 3 move the agent to the left and right within its lane, the others wait. Every step pays 1/100, the
@@ -20,9 +18,6 @@ class Skittles(Game[SkittlesState]):
     The MDP twin shows every block; the POMDP twin hides each cell with probability 1/2, anew at every step.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` flickers alike in all episodes, and blocks may leave no way through.
         hit_reward: Added to the reward of the step in which the agent is hit. The published scale has 0; the paper's
             words ask for a negative number.
@@ -34,10 +29,12 @@ class Skittles(Game[SkittlesState]):
         ValueError: ``hit_reward`` is positive or beyond -1.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
         if not -1 <= hit_reward <= 0:
             raise ValueError(f"hit_reward is {hit_reward!r}, allowed: -1 to 0")
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.hit_reward = float(hit_reward)
         self.max_steps = MAX_STEPS
         self.return_range = (0.1 + self.hit_reward, 1.0)
@@ -45,25 +42,12 @@ class Skittles(Game[SkittlesState]):
 
     def reset(self, key: Array) -> SkittlesState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: SkittlesState, action: Array) -> tuple[SkittlesState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules, self.hit_reward)
+        return rules.step(key, state, action, self.level, self.rules, self.hit_reward)
 
     def render(self, state: SkittlesState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> Skittles:
-        return Skittles(level, id=id, obs_size=obs_size, rules=rules, hit_reward=hit_reward)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
-from arcade_torch.envs_jax.skittles.numbers import CELLS, Level
+from arcade_torch.envs_jax.skittles.params import CELLS, Params
 from arcade_torch.envs_jax.skittles.picture import AGENT
 from arcade_torch.envs_jax.skittles.rules import NO_BLOCK
 
@@ -44,13 +44,9 @@ def outlook(width: int, rounds: int = 5) -> npt.NDArray[np.float64]:
 
 
 class Planner:
-    """Chooses moves with a known or a partly known grid.
+    """Chooses moves with a known or a partly known grid."""
 
-    Args:
-        level: Numbers of the difficulty.
-    """
-
-    def __init__(self, level: Level) -> None:
+    def __init__(self, level: Params) -> None:
         self.level, self.worth = level, outlook(level.width)
 
     def plan(self, x: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
@@ -82,7 +78,7 @@ class Planner:
         return moves
 
 
-class SkittlesState:
+class StateOracle:
     """Sees all blocks."""
 
     def __init__(self, game: Any) -> None:
@@ -93,7 +89,7 @@ class SkittlesState:
         return self.planner.plan(seen.x, seen.column)
 
 
-class SkittlesFrames:
+class FramesOracle:
     """Sees the POMDP's frames: every block seen once is remembered while it falls.
 
     A block has nine looks before it can hit; the one in 512 that is never seen is what the player cannot avoid but by

@@ -25,7 +25,7 @@ from arcade_torch.envs_jax.render.palette import (
     WHITE,
     YELLOW,
 )
-from arcade_torch.envs_jax.skittles.numbers import CELLS, MAX_STEPS
+from arcade_torch.envs_jax.skittles.params import CELLS, MAX_STEPS
 from arcade_torch.envs_jax.skittles.rules import SkittlesState, shown
 
 BLOCKS = (RED, ORANGE, YELLOW, GREEN, BLUE, SKY, ULTRAVIOLET)

@@ -1,7 +1,4 @@
-"""The law of Skittles: a new row with one block falls in at the top at every step; the agent dodges in the bottom row.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+"""The rules of Skittles: at every step a new row with one block falls in at the top; the agent dodges at the bottom."""
 
 from typing import NamedTuple
 
@@ -9,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
-from arcade_torch.envs_jax.skittles.numbers import CELLS, COLOURS, MAX_STEPS, Level
+from arcade_torch.envs_jax.skittles.params import CELLS, COLOURS, MAX_STEPS, Params
 
 NO_BLOCK = -1
 
@@ -25,43 +22,30 @@ class SkittlesState(NamedTuple):
     time: Array  # int32, steps taken, which is the score
 
 
-def reset(key: Array, level: Level, rules: Rules) -> SkittlesState:
+def reset(key: Array, level: Params, rules: Rules) -> SkittlesState:
     """An empty grid, the agent anywhere in the lane; with ``rules="reference"`` all episodes flicker alike."""
     for_agent, flicker_key = jax.random.split(key)
     if rules == "reference":
         flicker_key = jnp.zeros_like(flicker_key)
     x = level.first + jax.random.randint(for_agent, (), 0, level.width, dtype=jnp.int32)
-    return SkittlesState(
-        jnp.full(CELLS, NO_BLOCK, jnp.int32),
-        jnp.zeros(CELLS, jnp.int32),
-        x,
-        jnp.ones(level.width, bool),
-        flicker_key,
-        jnp.int32(0),
-    )
+    empty, zeros = jnp.full(CELLS, NO_BLOCK, jnp.int32), jnp.zeros(CELLS, jnp.int32)
+    return SkittlesState(empty, zeros, x, jnp.ones(level.width, bool), flicker_key, jnp.int32(0))
 
 
-def reachable(safe: Array, newest: Array, level: Level) -> Array:
-    """Where a survivor can be one step on, when the block of the newest row leaves: bool [width].
+def reachable(safe: Array, newest: Array, level: Params) -> Array:
+    """Where a survivor can be one step on, when the block of the newest row (or ``NO_BLOCK``) leaves: bool [width].
 
-    Args:
-        safe: bool [width], where survivors can be when the newest row arrives.
-        newest: int32, column of its block, or ``NO_BLOCK``.
-        level: Numbers of the difficulty.
+    ``safe``, bool [width], is where survivors can be when that row arrives.
     """
     beside = jnp.pad(safe, 1)
     lane = level.first + jnp.arange(level.width)
     return (beside[:-2] | safe | beside[2:]) & (lane != newest)
 
 
-def draw_block(key: Array, reach: Array, level: Level, rules: Rules) -> Array:
+def draw_block(key: Array, reach: Array, level: Params, rules: Rules) -> Array:
     """The column of a new block: int32, uniform among those that leave a survivor somewhere to be.
 
-    Args:
-        key: uint32 [2].
-        reach: bool [width], see :func:`reachable`. Never empty by default, as a lane has at least two columns.
-        level: Numbers of the difficulty.
-        rules: ``"reference"`` draws among all columns of the lane.
+    These are never none, as a lane has at least two columns. ``rules="reference"`` draws among all of the lane.
     """
     if rules == "reference":
         return level.first + jax.random.randint(key, (), 0, level.width, dtype=jnp.int32)
@@ -71,15 +55,12 @@ def draw_block(key: Array, reach: Array, level: Level, rules: Rules) -> Array:
 
 
 def step(
-    key: Array, state: SkittlesState, action: Array, level: Level, rules: Rules, hit_reward: float
+    key: Array, state: SkittlesState, action: Array, level: Params, rules: Rules, hit_reward: float
 ) -> tuple[SkittlesState, Array, Array, Array]:
     """Move the agent, then let all rows fall by one.
 
     The agent is hit by the block it walks into and by the block that falls on it. Every step pays ``1 / MAX_STEPS``,
     also the one in which the agent is hit, which pays ``hit_reward`` on top.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     x = jnp.clip(state.x + sideways, level.first, level.last)
@@ -88,14 +69,10 @@ def step(
     reach = reachable(state.safe, state.column[0], level)
     block = draw_block(key, reach, level, rules)
     time = state.time + 1
-    new = SkittlesState(
-        jnp.concatenate([block[None], state.column[:-1]]),
-        jnp.concatenate([(state.colour[:1] + 1) % COLOURS, state.colour[:-1]]),
-        x,
-        reach & (level.first + jnp.arange(level.width) != block),
-        state.flicker_key,
-        time,
-    )
+    column = jnp.concatenate([block[None], state.column[:-1]])
+    colour = jnp.concatenate([(state.colour[:1] + 1) % COLOURS, state.colour[:-1]])
+    safe = reach & (level.first + jnp.arange(level.width) != block)
+    new = SkittlesState(column, colour, x, safe, state.flicker_key, time)
     reward = 1.0 / MAX_STEPS + jnp.where(hit, jnp.float32(hit_reward), 0.0)
     return new, reward, hit, time >= MAX_STEPS
 

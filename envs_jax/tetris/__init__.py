@@ -1,16 +1,14 @@
 """Tetris: clear ten lines; the POMDP twin hides the pile."""
 
-from typing import Any
-
-from arcade_torch.envs_jax.game import Array, Game, Rules
-from arcade_torch.envs_jax.registry import register
-from arcade_torch.envs_jax.tetris import rules as law
-from arcade_torch.envs_jax.tetris.numbers import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Level
+from arcade_torch.envs_jax.game import Array, LevelGame, Rules
+from arcade_torch.envs_jax.tetris import rules
+from arcade_torch.envs_jax.tetris.oracle import FramesOracle, StateOracle
+from arcade_torch.envs_jax.tetris.params import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Params
 from arcade_torch.envs_jax.tetris.picture import Screen
 from arcade_torch.envs_jax.tetris.rules import TetrisState
 
 
-class Tetris(Game[TetrisState]):
+class Tetris(LevelGame[TetrisState]):
     """Clear ten lines of a board with 20 rows of 10 cells.
 
     Action 0 turns the falling piece clockwise, 2 and 3 shift it, 1 is a soft drop, 4 does nothing; gravity pulls at
@@ -23,9 +21,6 @@ class Tetris(Game[TetrisState]):
     locks), the coming pieces, complete rows as white bands, and the lines cleared.
 
     Args:
-        level: Numbers of the difficulty.
-        id: Versioned id.
-        obs_size: 128 or 256.
         rules: ``"reference"`` deals the first bag with repeats and gaps when there is more than one preview, lets long
             falls pass through blocks, pays lines beyond the tenth, and does not punish topping out at the time limit.
 
@@ -33,8 +28,10 @@ class Tetris(Game[TetrisState]):
     return never exceeds 1, topping out always costs 1, the time limit does not terminate.
     """
 
-    def __init__(self, level: Level, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+
+    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
+        super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.max_steps = MAX_STEPS
         most_lines = GOAL if rules == "default" else GOAL + 3
         self.return_range = (-1.0, LINE_REWARD * most_lines)
@@ -42,25 +39,12 @@ class Tetris(Game[TetrisState]):
 
     def reset(self, key: Array) -> TetrisState:
         """See :meth:`Game.reset`."""
-        return law.reset(key, self.level, self.rules)
+        return rules.reset(key, self.level, self.rules)
 
     def step(self, key: Array, state: TetrisState, action: Array) -> tuple[TetrisState, Array, Array, Array]:
         """See :meth:`Game.step`."""
-        return law.step(key, state, action, self.level, self.rules)
+        return rules.step(key, state, action, self.level, self.rules)
 
     def render(self, state: TetrisState, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
-
-
-def _factory(level: Level) -> Any:
-    """A factory with the signature that the registry reads the options from."""
-
-    def build(*, id: str, obs_size: int, rules: Rules) -> Tetris:
-        return Tetris(level, id=id, obs_size=obs_size, rules=rules)
-
-    return build
-
-
-for _name, _level in LEVELS.items():
-    register(f"{_name}-v0", _factory(_level))

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.tetris.numbers import BOX, COLUMNS, ROTATIONS, ROWS, SHAPES, SPAWN_X, SPAWN_Y
+from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, ROTATIONS, ROWS, SHAPES, SPAWN_X, SPAWN_Y
 from arcade_torch.envs_jax.tetris.picture import BAND
 
 Bools = npt.NDArray[np.bool_]
@@ -122,11 +122,7 @@ def cost(pile: Bools) -> npt.NDArray[np.float64]:
 
 
 class Planner:
-    """Chooses a plan when a piece is about to appear, and carries it out blindly.
-
-    Args:
-        game: The Tetris to play.
-    """
+    """Chooses a plan when a piece is about to appear, and carries it out blindly."""
 
     def __init__(self, game: Any) -> None:
         self.level, self.tunnels = game.level, game.rules == "reference"
@@ -154,7 +150,7 @@ class Planner:
         return action.astype(np.int32)
 
 
-class TetrisState:
+class StateOracle:
     """Sees the pile: looks where the coming piece can be brought, and takes the place that leaves the best pile."""
 
     def __init__(self, game: Any) -> None:
@@ -168,7 +164,7 @@ class TetrisState:
         return self.planner.act(pile, piece, is_init | seen.just_locked)
 
 
-class TetrisFrames:
+class FramesOracle:
     """Sees the POMDP's frames: adds every piece to a remembered pile when it comes to lie, and plays as if it saw it.
 
     Nothing is lost: a piece lies when its cells have the floor or the remembered pile below them, or when a band
@@ -195,12 +191,7 @@ class TetrisFrames:
 
 
 def read_board(frames: npt.NDArray[np.uint8], screen: Any) -> Ints:
-    """Which tile each cell shows: int64 [N, 20, 10], -1 for none. One pixel of a cell tells, for it is not framed.
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        screen: The :class:`~arcade_torch.envs_jax.tetris.picture.Screen` that drew them.
-    """
+    """Which tile each cell of frames [N, S, S, 3] shows: int64 [N, 20, 10], -1 for none; one pixel of a cell tells."""
     grid, cell = screen.board, screen.cell
     y, x = grid.y + cell // 2, grid.x + cell // 2
     middle = frames[:, y : y + ROWS * cell : cell, x : x + COLUMNS * cell : cell]
@@ -211,13 +202,7 @@ def read_board(frames: npt.NDArray[np.uint8], screen: Any) -> Ints:
 
 
 def read_preview(frames: npt.NDArray[np.uint8], screen: Any, which: int = 0) -> Ints:
-    """Which piece a preview shows: int64 [N].
-
-    Args:
-        frames: uint8 [N, S, S, 3].
-        screen: The :class:`~arcade_torch.envs_jax.tetris.picture.Screen` that drew them.
-        which: 0 for the nearest.
-    """
+    """Which piece a preview (0: the nearest) of frames [N, S, S, 3] shows: int64 [N]."""
     slot = screen.previews[which]
     height, width = slot.pictures.shape[1:3]
     shown = frames[:, None, slot.y : slot.y + height, slot.x : slot.x + width]

@@ -21,7 +21,7 @@ from arcade_torch.envs_jax.render.palette import (
     YELLOW,
     Colour,
 )
-from arcade_torch.envs_jax.tetris.numbers import BOX, COLUMNS, GOAL, ROWS, SHAPES, Level
+from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, GOAL, ROWS, SHAPES, Params
 from arcade_torch.envs_jax.tetris.rules import TetrisState, complete_rows, covers
 
 PIECE_COLOURS: tuple[Colour, ...] = (LAGOON, GOLD, VIOLET, EMERALD, BLOOD, COBALT, AMBER)  # I O T S Z J L
@@ -53,7 +53,7 @@ class Screen:
         level: Numbers of the difficulty.
     """
 
-    def __init__(self, size: int, level: Level) -> None:
+    def __init__(self, size: int, level: Params) -> None:
         self.cell = cell = {128: 5, 256: 10}[size]
         field = ROWS * cell  # the black square is as wide as the board is high
         corner = centred(size, field)

@@ -1,10 +1,7 @@
-"""The law of Tetris: one action, then gravity; a piece that cannot go further down locks at once.
+"""The rules of Tetris: one action, then gravity; a piece that cannot go further down locks at once.
 
 Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits beyond the board
-are set, so that walls and floor are blocks like any other.
-
-Source: POPGym Arcade (ICML 2026), environment appendix.
-"""
+are set, so that walls and floor are blocks like any other."""
 
 from typing import NamedTuple
 
@@ -12,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.game import DOWN, LEFT, RIGHT, UP, Array, Rules
-from arcade_torch.envs_jax.tetris.numbers import (
+from arcade_torch.envs_jax.tetris.params import (
     BOX,
     COLUMNS,
     GOAL,
@@ -27,7 +25,7 @@ from arcade_torch.envs_jax.tetris.numbers import (
     SPAWN_X,
     SPAWN_Y,
     TOP_OUT_REWARD,
-    Level,
+    Params,
 )
 
 MARGIN = 3  # bits to the left of column 0: a box may stand so far out
@@ -58,14 +56,11 @@ class TetrisState(NamedTuple):
 
 
 def shuffled(key: Array) -> Array:
-    """A random permutation of the seven pieces, int32 [7]: the ranks of seven random numbers."""
-    draw = jax.random.bits(key, (PIECES,))
-    index = jnp.arange(PIECES)
-    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
-    return lower.sum(1, dtype=jnp.int32)
+    """A random permutation of the seven pieces, int32 [7]."""
+    return random_ranks(key, PIECES)
 
 
-def deal_order(level: Level, rules: Rules) -> tuple[int, int]:
+def deal_order(level: Params, rules: Rules) -> tuple[int, int]:
     """Which of the first bag is dealt first after the previews, and where a new bag begins.
 
     By default that is the next one, and the end of the bag. The reference begins further on, and counts seven pieces
@@ -76,7 +71,7 @@ def deal_order(level: Level, rules: Rules) -> tuple[int, int]:
     return 2 * level.previews, level.previews - 1
 
 
-def reset(key: Array, level: Level, rules: Rules) -> TetrisState:
+def reset(key: Array, level: Params, rules: Rules) -> TetrisState:
     """An empty board and a shuffled bag, whose first piece is at the top."""
     bag = shuffled(key)
     zero, no = jnp.int32(0), jnp.bool_(False)
@@ -145,7 +140,7 @@ def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
     return state._replace(board=board, lines=lines), LINE_REWARD * paid.astype(jnp.float32)
 
 
-def spawn(key: Array, state: TetrisState, level: Level, rules: Rules) -> TetrisState:
+def spawn(key: Array, state: TetrisState, level: Params, rules: Rules) -> TetrisState:
     """Bring the next piece where one has just come to lie; the last preview is dealt from the bag."""
     dealt = state.bag[state.bag_index]
     index = (state.bag_index + 1) % PIECES
@@ -172,7 +167,7 @@ def steer(state: TetrisState, action: Array, window: Array) -> TetrisState:
     return state._replace(rot=jnp.where(free, rot, state.rot), px=jnp.where(free, px, state.px))
 
 
-def fall(state: TetrisState, action: Array, window: Array, level: Level, rules: Rules) -> TetrisState:
+def fall(state: TetrisState, action: Array, window: Array, level: Params, rules: Rules) -> TetrisState:
     """Let the piece go down, and lock it where it cannot go one further.
 
     A soft drop replaces gravity; at the step of the spawn it goes down by one. What cannot go the whole way goes one
@@ -195,15 +190,12 @@ def fall(state: TetrisState, action: Array, window: Array, level: Level, rules: 
 
 
 def step(
-    key: Array, state: TetrisState, action: Array, level: Level, rules: Rules
+    key: Array, state: TetrisState, action: Array, level: Params, rules: Rules
 ) -> tuple[TetrisState, Array, Array, Array]:
     """Clear rows and bring the next piece where one lies, then act on the piece, then let it fall.
 
     Ends with ten lines, or when a new piece overlaps the pile, which costs 1 (not if the goal is reached at that very
     step; in the reference not at the time limit either). Cut at the time limit.
-
-    Returns:
-        New state, reward, terminated, truncated.
     """
     cleared, reward = clear_rows(state, rules)
     new = spawn(key, cleared, level, rules)
@@ -213,11 +205,8 @@ def step(
 
     new = steer(new, action, window)
     new = fall(new, action, window, level, rules)
-    new = new._replace(
-        terminal=terminal,
-        frames_since_spawn=jnp.minimum(new.frames_since_spawn + 1, MAX_AGE),
-        time=state.time + 1,
-    )
-    won, late = new.lines >= GOAL, new.time >= MAX_STEPS
-    lost = terminal & ~won if rules == "default" else terminal & ~won & ~late
-    return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, late
+    age = jnp.minimum(new.frames_since_spawn + 1, MAX_AGE)
+    new = new._replace(terminal=terminal, frames_since_spawn=age, time=state.time + 1)
+    won, time_limit = new.lines >= GOAL, new.time >= MAX_STEPS
+    lost = terminal & ~won if rules == "default" else terminal & ~won & ~time_limit
+    return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, time_limit

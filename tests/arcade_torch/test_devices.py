@@ -28,6 +28,7 @@ from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax import registry
 from tests.arcade_torch.stub import GAME, MIXED, StubGame
 from tests.arcade_torch.test_collector import Recurrent, assert_same, scripted
+from tests.own_registry import forget_games
 
 ROOT = Path(__file__).resolve().parents[2]
 N = 6
@@ -197,8 +198,7 @@ def test_the_counter_of_waits_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def games_of_this_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget afterwards what a test registers."""
-    for table in ("_FACTORIES", "_NEWEST", "_ALIASES"):
-        monkeypatch.setattr(registry, table, dict(getattr(registry, table)))
+    forget_games(monkeypatch)
 
 
 class Large(StubGame):

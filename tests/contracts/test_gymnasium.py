@@ -8,12 +8,13 @@ import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from arcade_torch import gym
+from arcade_torch import registered_ids
+from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
 
 SIZES, TWINS = (128, 256), ("full", "partial")
 HAS_PYGAME = importlib.util.find_spec("pygame") is not None
 # Every game once; difficulties and sizes take turns.
-COVER = [(f"{game}{gym.DIFFICULTIES[i % 3]}-v0", SIZES[i % 2]) for i, game in enumerate(gym.GAMES)]
+COVER = [(f"{game}{DIFFICULTIES[i % 3]}-v0", SIZES[i % 2]) for i, game in enumerate(GAMES)]
 
 
 def check(id: str, obs_size: int, observability: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,15 +36,15 @@ def test_gymnasium_s_checker_passes(
 
 def test_the_cover_has_every_game_difficulty_and_size() -> None:
     split = [re.fullmatch(r"(\w+?)(Easy|Medium|Hard)-v0", id).groups() for id, _ in COVER]
-    assert {game for game, _ in split} == set(gym.GAMES)
-    assert {difficulty for _, difficulty in split} == set(gym.DIFFICULTIES)
+    assert {game for game, _ in split} == set(GAMES)
+    assert {difficulty for _, difficulty in split} == set(DIFFICULTIES)
     assert {size for _, size in COVER} == set(SIZES)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("observability", TWINS)
 @pytest.mark.parametrize("obs_size", SIZES)
-@pytest.mark.parametrize("id", gym.BENCHMARK_IDS)
+@pytest.mark.parametrize("id", registered_ids())
 def test_gymnasium_s_checker_passes_on_all_configurations(
     id: str, obs_size: int, observability: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,7 +5,7 @@ import warnings
 import gymnasium
 import pytest
 
-from arcade_torch import gym
+from arcade_torch import registered_ids
 from tests.contracts.test_gymnasium import COVER, SIZES, TWINS
 
 pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'")
@@ -30,7 +30,7 @@ def test_stable_baselines3_s_checker_passes(id: str, obs_size: int, observabilit
 @pytest.mark.slow
 @pytest.mark.parametrize("observability", TWINS)
 @pytest.mark.parametrize("obs_size", SIZES)
-@pytest.mark.parametrize("id", gym.BENCHMARK_IDS)
+@pytest.mark.parametrize("id", registered_ids())
 def test_stable_baselines3_s_checker_passes_on_all_configurations(id: str, obs_size: int, observability: str) -> None:
     check(id, obs_size, observability)
 

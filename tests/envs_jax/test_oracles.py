@@ -10,7 +10,6 @@ from arcade_torch.envs_jax.oracles import (
     oracle_return,
     play,
     random_return,
-    register_oracle,
 )
 
 IDS = [
@@ -70,7 +69,5 @@ def test_bad_questions_are_refused():
     game = make("CartPoleEasy")
     with pytest.raises(ValueError, match="kind is 'pixels'"):
         make_oracle(game, "pixels")
-    with pytest.raises(ValueError, match="kind"):
-        register_oracle(type(game), "pixels", RandomPlayer)
     with pytest.raises(ValueError, match="episodes is 0"):
         play(game, RandomPlayer(), 0)

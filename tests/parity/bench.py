@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from arcade_torch.envs_jax import BatchedGame, env_keys, make
-from arcade_torch.gym import GAMES
+from arcade_torch.envs_jax.registry import GAMES
 from arcade_torch.tools.bench.envs import read_all
 from arcade_torch.tools.bench.harness import Measure, Measured, interleaved, machine
 from arcade_torch.tools.tables import show_table

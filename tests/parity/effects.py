@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
-from arcade_torch.gym import DIFFICULTIES, GAMES
+from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
 from arcade_torch.tools.files import write_text
 from arcade_torch.tools.versions import versions
 from tests.parity.faults import FAULTS, Fault, take_all

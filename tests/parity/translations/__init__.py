@@ -2,7 +2,7 @@
 
 from importlib import import_module
 
-from arcade_torch.gym import DIFFICULTIES, GAMES
+from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
 from tests.parity.translation import Translation
 
 TASKS = tuple(game + level for game in GAMES for level in DIFFICULTIES)

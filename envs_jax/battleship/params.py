@@ -1,4 +1,4 @@
-"""The numbers of BattleShip."""
+"""The parameters of BattleShip."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ SHIP_CELLS = sum(SHIPS)  # hitting one pays 1 / SHIP_CELLS
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -32,8 +32,4 @@ class Level:
         return self.cells // 2
 
 
-LEVELS = {
-    "BattleShipEasy": Level(8),
-    "BattleShipMedium": Level(10),
-    "BattleShipHard": Level(12),
-}
+LEVELS = {"BattleShipEasy": Params(8), "BattleShipMedium": Params(10), "BattleShipHard": Params(12)}

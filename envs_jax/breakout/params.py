@@ -1,4 +1,4 @@
-"""The numbers of Breakout."""
+"""The parameters of Breakout."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ BRICK_REWARD = tuple(weight / (sum(_WEIGHTS) * COLUMNS) for weight in _WEIGHTS) 
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -31,8 +31,4 @@ class Level:
         return COLUMNS - self.paddle
 
 
-LEVELS = {
-    "BreakoutEasy": Level(6),
-    "BreakoutMedium": Level(5),
-    "BreakoutHard": Level(4),
-}
+LEVELS = {"BreakoutEasy": Params(6), "BreakoutMedium": Params(5), "BreakoutHard": Params(4)}

@@ -1,4 +1,4 @@
-"""The numbers of Tetris."""
+"""The parameters of Tetris."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,7 @@ SHAPES = _shapes()
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -55,8 +55,4 @@ class Level:
     drop: int
 
 
-LEVELS = {
-    "TetrisEasy": Level(3, 1, 2),
-    "TetrisMedium": Level(2, 1, 2),
-    "TetrisHard": Level(1, 2, 3),
-}
+LEVELS = {"TetrisEasy": Params(3, 1, 2), "TetrisMedium": Params(2, 1, 2), "TetrisHard": Params(1, 2, 3)}

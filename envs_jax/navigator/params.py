@@ -1,4 +1,4 @@
-"""The numbers of Navigator."""
+"""The parameters of Navigator."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ TREASURE_REWARD = 1.0
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -37,7 +37,7 @@ class Level:
 
 
 LEVELS = {
-    "NavigatorEasy": Level(8, (18, 38)),
-    "NavigatorMedium": Level(10, (45, 56)),
-    "NavigatorHard": Level(12, (112, 79)),
+    "NavigatorEasy": Params(8, (18, 38)),
+    "NavigatorMedium": Params(10, (45, 56)),
+    "NavigatorHard": Params(12, (112, 79)),
 }

@@ -1,4 +1,4 @@
-"""The numbers of CountRecall."""
+"""The parameters of CountRecall."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ MOVE_BUDGET = 100  # counter moves that fit in an episode: one step a card is sp
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -23,8 +23,4 @@ class Level:
         return -(-self.cards // self.suits)
 
 
-LEVELS = {
-    "CountRecallEasy": Level(26, 2),
-    "CountRecallMedium": Level(52, 2),
-    "CountRecallHard": Level(78, 4),
-}
+LEVELS = {"CountRecallEasy": Params(26, 2), "CountRecallMedium": Params(52, 2), "CountRecallHard": Params(78, 4)}

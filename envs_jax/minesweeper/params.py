@@ -1,10 +1,10 @@
-"""The numbers of MineSweeper."""
+"""The parameters of MineSweeper."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -36,8 +36,4 @@ class Level:
         return self.cells // 2
 
 
-LEVELS = {
-    "MineSweeperEasy": Level(4, 2),
-    "MineSweeperMedium": Level(6, 6),
-    "MineSweeperHard": Level(8, 10),
-}
+LEVELS = {"MineSweeperEasy": Params(4, 2), "MineSweeperMedium": Params(6, 6), "MineSweeperHard": Params(8, 10)}

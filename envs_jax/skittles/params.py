@@ -1,4 +1,4 @@
-"""The numbers of Skittles."""
+"""The parameters of Skittles."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ COLOURS = 7  # blocks take turns through as many colours
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty: the lane, where blocks fall and the agent may stand.
 
     Attributes:
@@ -25,8 +25,4 @@ class Level:
         return self.first + self.width - 1
 
 
-LEVELS = {
-    "SkittlesEasy": Level(8, 1),
-    "SkittlesMedium": Level(7, 2),
-    "SkittlesHard": Level(6, 2),
-}
+LEVELS = {"SkittlesEasy": Params(8, 1), "SkittlesMedium": Params(7, 2), "SkittlesHard": Params(6, 2)}

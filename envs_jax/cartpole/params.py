@@ -1,4 +1,4 @@
-"""The numbers of CartPole and NoisyCartPole."""
+"""The parameters of CartPole and NoisyCartPole."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ START = 0.05  # all four variables start uniformly in [-START, START]
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -28,10 +28,10 @@ class Level:
 
 
 LEVELS = {
-    "CartPoleEasy": Level(200),
-    "CartPoleMedium": Level(400),
-    "CartPoleHard": Level(600),
-    "NoisyCartPoleEasy": Level(200, 0.1),
-    "NoisyCartPoleMedium": Level(200, 0.2),
-    "NoisyCartPoleHard": Level(200, 0.3),
+    "CartPoleEasy": Params(200),
+    "CartPoleMedium": Params(400),
+    "CartPoleHard": Params(600),
+    "NoisyCartPoleEasy": Params(200, 0.1),
+    "NoisyCartPoleMedium": Params(200, 0.2),
+    "NoisyCartPoleHard": Params(200, 0.3),
 }

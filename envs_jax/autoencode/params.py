@@ -1,4 +1,4 @@
-"""The numbers of AutoEncode."""
+"""The parameters of AutoEncode."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ SUITS = 4
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -21,8 +21,4 @@ class Level:
         return 10 * self.cards
 
 
-LEVELS = {
-    "AutoEncodeEasy": Level(26),
-    "AutoEncodeMedium": Level(52),
-    "AutoEncodeHard": Level(78),
-}
+LEVELS = {"AutoEncodeEasy": Params(26), "AutoEncodeMedium": Params(52), "AutoEncodeHard": Params(78)}

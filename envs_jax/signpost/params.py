@@ -1,10 +1,10 @@
-"""The numbers of Signpost."""
+"""The parameters of Signpost."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Level:
+class Params:
     """One difficulty.
 
     Attributes:
@@ -24,8 +24,4 @@ class Level:
         return self.cells
 
 
-LEVELS = {
-    "SignpostEasy": Level(4),
-    "SignpostMedium": Level(6),
-    "SignpostHard": Level(9),
-}
+LEVELS = {"SignpostEasy": Params(4), "SignpostMedium": Params(6), "SignpostHard": Params(9)}
