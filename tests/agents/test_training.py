@@ -219,6 +219,16 @@ def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
     assert "loss is nan" in json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
 
 
+def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> None:
+    """It took over the checkpoint's, which is on the CPU and which no graph reads."""
+    trainer = training.Trainer(CONFIG)
+    group, rate = trainer.learner.optimizer.param_groups[0], torch.tensor(0.5)
+    group["lr"] = rate
+    trainer.learner.load_state_dict(trainer.learner.state_dict())
+    trainer.close()
+    assert trainer.learner.optimizer.param_groups[0]["lr"] is rate
+
+
 KILLED = """
 import sys
 from arcade_torch.agents import TrainConfig, train
@@ -227,9 +237,9 @@ train(TrainConfig.from_dict(json.loads(sys.argv[1])), sys.argv[2])
 """
 
 
-def kill_and_resume(folder: Path, rng: random.Random) -> int:
+def kill_and_resume(folder: Path, rng: random.Random, config: TrainConfig = CONFIG) -> int:
     """Start a run in another process, kill it at a random moment, go on here; returns how many rows it had left."""
-    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(CONFIG.to_dict()), str(folder)])
+    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(config.to_dict()), str(folder)])
     try:
         rows, deadline = rng.randint(1, 9), time.monotonic() + 120
         log = folder / "metrics.csv"
@@ -241,7 +251,7 @@ def kill_and_resume(folder: Path, rng: random.Random) -> int:
         process.kill()
         process.wait()
     left = len(read_csv(log))
-    assert train(CONFIG, folder, resume=True).status == "finished"
+    assert train(config, folder, resume=True).status == "finished"
     return left
 
 

@@ -59,6 +59,35 @@ def test_actions_on_a_gpu_reach_jax_on_the_cpu() -> None:
     assert argument.tolist() == [0, 1, 2, 3, 4]
 
 
+def test_a_tensor_on_a_gpu_that_begins_where_jax_cannot_compute_is_refused() -> None:
+    """XLA's programs refuse it when they run; only the CPU's alignment was checked."""
+    with pytest.raises(ValueError, match="multiple of 16 bytes, JAX cannot compute with it"):
+        dlpack.to_jax(torch.zeros(64).as_subclass(CudaStandIn)[1:])
+
+
+@pytest.mark.parametrize("change", ["reset", "observe", "set_seed", "set_observability", "set_state"])
+def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
+    monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    """A step waits for its actions. The others gave JAX memory of frames that torch had yet to read."""
+    env = ArcadeEnv(GAME, N)
+    env.reset()
+    argument = {"set_seed": [1], "set_observability": ["partial"], "set_state": [env.get_state()]}.get(change, [])
+    events: list[str] = []
+    stream = type("Stream", (), {"synchronize": lambda self: events.append("torch")})()
+    monkeypatch.setattr(dlpack, "is_host", lambda value: False)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    monkeypatch.setattr(env_module, "to_torch", lambda array, device: torch.from_numpy(np.array(array)))
+    for name in ("render", "reset_render"):
+        original = getattr(env._batched, name)
+        call = lambda *args, original=original: (events.append("jax"), original(*args))[1]  # noqa: E731
+        monkeypatch.setattr(env._batched, name, call)
+    put = jax.device_put
+    monkeypatch.setattr(jax, "device_put", lambda *args: (events.append("jax"), put(*args))[1])
+    getattr(env, change)(*argument)
+    assert events[0] == "torch" and "jax" in events
+
+
 @pytest.mark.parametrize("path", ["collector", "env"])
 def test_a_step_exports_frames_and_one_array_of_numbers(monkeypatch: pytest.MonkeyPatch, path: str) -> None:
     """Each export is a transfer where JAX is on the CPU and torch on a GPU; there were nine."""
