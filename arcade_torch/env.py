@@ -106,8 +106,7 @@ class ArcadeEnv(EnvBase):
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         wait_for_torch(torch_device, jax_device)
-        keys = jax.device_put(env_keys(0, num_envs), jax_device)
-        self._live = _Live(self._batched.init(keys, jax.device_put(flags, jax_device)))
+        self._live = _Live(self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device)))
         self._finals = self.final_observations(1)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
@@ -158,8 +157,7 @@ class ArcadeEnv(EnvBase):
         """
         flags = partial_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
-        partial = jax.device_put(flags, self._jax_device)
-        self._live.batch = self._live.batch._replace(partial=partial)
+        self._live.batch = self._live.batch._replace(partial=jax.device_put(flags, self._jax_device))
         self._live.view += 1
 
     def get_state(self) -> TensorDict:
@@ -192,8 +190,7 @@ class ArcadeEnv(EnvBase):
             The root tensordict: what a policy acts on next.
         """
         wait_for_torch(self.device, self._jax_device)
-        batch = self._live.batch
-        return self._root(batch, to_torch(self._batched.render(batch), self.device))
+        return self._root(self._live.batch, to_torch(self._batched.render(self._live.batch), self.device))
 
     @property
     def generation(self) -> tuple[int, int]:
@@ -354,9 +351,8 @@ class ArcadeEnv(EnvBase):
         if seed is None:
             seed = int(torch.randint(2**32, ()))
         wait_for_torch(self.device, self._jax_device)
-        keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
-        self._live.replace(self._live.batch._replace(key=keys, last_action=last_action))
+        new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
+        self._live.replace(self._live.batch._replace(key=new[0], last_action=new[1]))
 
     # -- exports ----------------------------------------------------------------------------------------------------
 
