@@ -14,10 +14,12 @@ import pytest
 import torch
 
 import arcade_torch
+from arcade_torch.agents import Trainer, preset
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.dlpack import to_jax, to_torch
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax import registered_ids
+from arcade_torch.models import memory_names
 from tests.arcade_torch.stub import GAME, MIXED
 from tests.arcade_torch.test_collector import Recurrent, assert_same, scripted
 
@@ -44,8 +46,9 @@ def slowly(x: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, 50, lambda _, y: jnp.round(y @ jnp.eye(len(y))), x)
 
 
-def numbers(device: jax.Device, seed: int = 0, size: int = 1024) -> jax.Array:
-    return jax.device_put(np.random.default_rng(seed).integers(0, 99, (size, size)).astype(np.float32), device)
+def numbers(device: jax.Device) -> jax.Array:
+    size = 128 if device.platform == "cpu" else 4096
+    return jax.device_put(np.random.default_rng(0).integers(0, 99, (size, size)).astype(np.float32), device)
 
 
 # -- the same memory --------------------------------------------------------------------------------------------------
@@ -219,7 +222,20 @@ def test_where_jax_has_the_cpu_alone_frames_are_copied_and_somebody_says_so(devi
 @pytest.mark.parametrize("mode", ["truncated", "all"])
 def test_the_host_waits_once_a_window(mode: Any, cuda: str) -> None:
     """By torch's own count; ``tests/arcade_torch/test_devices.py`` counts without a GPU."""
-    collector = ArcadeCollector(ArcadeEnv(GAME, N, device=cuda), Recurrent(), N * 128, final_frames=mode)
+    count_waits(ArcadeCollector(ArcadeEnv(GAME, N, device=cuda), Recurrent(), N * 128, final_frames=mode))
+
+
+@pytest.mark.parametrize("memory", memory_names())
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
+def test_the_host_waits_once_a_window_of_a_training_too(algorithm: str, memory: str, cuda: str) -> None:
+    learner = {algorithm: {"time_limit": "bootstrap"}}
+    config = preset("smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, device=cuda, **learner)
+    trainer = Trainer(config)
+    count_waits(trainer.collector)
+    trainer.close()
+
+
+def count_waits(collector: ArcadeCollector) -> None:
     for _ in range(2):  # the first call compiles
         collector.collect()
     with warnings.catch_warnings(record=True) as caught, jax.transfer_guard_device_to_host("disallow"):
