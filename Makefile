@@ -2,22 +2,26 @@
 #
 #   PYTHON=python3.12 make install     another interpreter (3.11, 3.12 or 3.13)
 #   make test WORKERS=4                more test processes
-#   make demo ARGS="--help"            ARGS goes to the command behind demo, bench, test and test-slow
+#   make demo ARGS="--help"            ARGS goes to the command behind demo, bench, gpu, test and test-slow
 
 PYTHON  ?= python3
 WORKERS ?= 2
 ARGS    ?=
+DEVICE  ?= cuda
+OUT     ?= build/gpu-$(DEVICE)
+PAGE    ?= $(if $(filter cuda,$(DEVICE)),results,$(OUT))/gpu.md
 
 VENV := .venv
 OLDEST := .venv-oldest
 OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
   models/test_memory_models.py agents/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
 RUN  := $(VENV)/bin/python
+GPU_PYTHON := $(if $(wildcard $(RUN)),$(RUN),$(PYTHON))
 PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow test-oldest test-triton lint bench parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-oldest test-triton lint bench gpu parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -28,6 +32,8 @@ help:
 	@echo "make test-oldest  a part of the tests with the oldest supported versions, in $(OLDEST)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
+	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
+	@echo "                (make gpu DEVICE=cpu: a rehearsal of it, a few minutes)"
 	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
 	@echo "                (make bench-parity: the ratio of speed to it, game by game)"
 	@echo "make docs       the documentation as a site in build/docs, API reference included"
@@ -85,6 +91,10 @@ lint: install
 
 bench: install
 	$(VENV)/bin/arcade-torch bench all $(ARGS)
+
+# With the interpreter at hand where there is no $(VENV): torch and JAX for a GPU are the machine's own.
+gpu:
+	PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(GPU_PYTHON) -m tests.gpu.stages $(OUT) --device $(DEVICE) --page $(PAGE) $(ARGS)
 
 parity: $(VENV)/.parity
 	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity --timeout=3600 tests/parity $(ARGS)

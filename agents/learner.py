@@ -123,7 +123,10 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment; the weights are loaded elsewhere."""
+        rates = [group["lr"] for group in self.optimizer.param_groups]
         self.optimizer.load_state_dict(state["optimizer"])
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate  # set before every step; on CUDA a tensor, which a checkpoint would put on the CPU
         self.grad_steps = state["grad_steps"]
 
 

@@ -35,7 +35,7 @@ import jax  # noqa: E402  (after share_gpu)
 from arcade_torch.envs_jax.validation import format_value  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
-_CPU_ALIGNMENT_BYTES = 64
+_ALIGNMENT_BYTES = {"cpu": 64, "cuda": 16}  # below it JAX copies; on a GPU its programs refuse the argument
 
 
 def _numpy_shares_read_only() -> bool:
@@ -91,7 +91,8 @@ def to_jax(tensor: torch.Tensor) -> jax.Array:
     ``.contiguous()``, ``.clone()``).
 
     Args:
-        tensor: At most 32 bits an element, dense, detached, and on the CPU aligned to 64 bytes (fresh tensors are).
+        tensor: At most 32 bits an element, dense, detached, and aligned to 64 bytes on the CPU, to 16 on a GPU (fresh
+            tensors are).
 
     Returns:
         An array over the same memory. Do not write to the tensor as long as JAX may read it.
@@ -114,8 +115,12 @@ def to_jax(tensor: torch.Tensor) -> jax.Array:
         raise ValueError("the tensor requires grad, JAX cannot record it: pass tensor.detach()")
     if not (tensor.is_contiguous() or _is_dense(tensor)):
         raise ValueError(f"strides {tensor.stride()} of shape {tuple(tensor.shape)} have holes: pass .contiguous()")
-    if tensor.device.type == "cpu" and tensor.data_ptr() % _CPU_ALIGNMENT_BYTES:
-        raise ValueError("the tensor does not begin at a multiple of 64 bytes, JAX would copy it: pass .clone()")
+    alignment = _ALIGNMENT_BYTES.get(tensor.device.type, 1)
+    if tensor.data_ptr() % alignment:
+        raise ValueError(
+            f"the tensor does not begin at a multiple of {alignment} bytes, "
+            f"JAX {'would copy' if is_host(tensor.device) else 'cannot compute with'} it: pass .clone()"
+        )
     array: jax.Array = jax.dlpack.from_dlpack(tensor)
     return array
 
@@ -135,6 +140,15 @@ def int32_argument(tensor: torch.Tensor, jax_device: jax.Device) -> np.ndarray |
     if is_host(jax_device):
         return tensor.to("cpu", torch.int32, copy=True).numpy()
     return to_jax(tensor.to(torch.int32, copy=True))
+
+
+def wait_for_torch(device: torch.device, jax_device: jax.Device) -> None:
+    """Wait until torch has read the frames that it has let go of: on a GPU, JAX may take their memory for what is next.
+
+    A step need not wait: JAX waits for its actions, which stand behind those reads in torch's current stream.
+    """
+    if not (is_host(device) or is_host(jax_device)):
+        torch.cuda.current_stream(device).synchronize()
 
 
 def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:

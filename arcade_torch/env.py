@@ -20,7 +20,7 @@ from arcade_torch.compiled import (
     Step,
     check_process,
 )
-from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, upload
+from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, upload, wait_for_torch
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
@@ -105,8 +105,8 @@ class ArcadeEnv(EnvBase):
         self._state_in_td = state_in_td
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
-        keys = jax.device_put(env_keys(0, num_envs), jax_device)
-        self._live = _Live(self._batched.init(keys, jax.device_put(flags, jax_device)))
+        wait_for_torch(torch_device, jax_device)
+        self._live = _Live(self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device)))
         self._finals = self.final_observations(1)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
@@ -156,8 +156,8 @@ class ArcadeEnv(EnvBase):
             TypeError: Not a word and not a bool tensor.
         """
         flags = partial_flags(observability, self.num_envs)
-        partial = jax.device_put(flags, self._jax_device)
-        self._live.batch = self._live.batch._replace(partial=partial)
+        wait_for_torch(self.device, self._jax_device)
+        self._live.batch = self._live.batch._replace(partial=jax.device_put(flags, self._jax_device))
         self._live.view += 1
 
     def get_state(self) -> TensorDict:
@@ -189,8 +189,8 @@ class ArcadeEnv(EnvBase):
         Returns:
             The root tensordict: what a policy acts on next.
         """
-        batch = self._live.batch
-        return self._root(batch, to_torch(self._batched.render(batch), self.device))
+        wait_for_torch(self.device, self._jax_device)
+        return self._root(self._live.batch, to_torch(self._batched.render(self._live.batch), self.device))
 
     @property
     def generation(self) -> tuple[int, int]:
@@ -282,6 +282,7 @@ class ArcadeEnv(EnvBase):
         rows = np.ones(self.num_envs, np.bool_)
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
+        wait_for_torch(self.device, self._jax_device)
         batch, pixels = self._batched.reset_render(self._live.batch, rows)
         root = self._root(batch, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
@@ -349,9 +350,9 @@ class ArcadeEnv(EnvBase):
         """Give every env a new random key and forget the last action; running episodes go on until they are reset."""
         if seed is None:
             seed = int(torch.randint(2**32, ()))
-        keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
-        self._live.replace(self._live.batch._replace(key=keys, last_action=last_action))
+        wait_for_torch(self.device, self._jax_device)
+        new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
+        self._live.replace(self._live.batch._replace(key=new[0], last_action=new[1]))
 
     # -- exports ----------------------------------------------------------------------------------------------------
 

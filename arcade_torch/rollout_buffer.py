@@ -96,7 +96,7 @@ class RolloutBuffer:
     @property
     def done(self) -> torch.Tensor:
         """bool [N, L], where an episode ended."""
-        return self._numbers[..., [TERMINATED, TRUNCATED]].any(-1)
+        return self._numbers[..., TERMINATED:].any(-1)  # no list of columns: it is copied to a GPU and waited for
 
     # -- writing ----------------------------------------------------------------------------------------------------
 
@@ -176,7 +176,7 @@ class RolloutBuffer:
             self._dense[:, -1] = last
         if self.final_frames == "none" or (self.final_frames == "all" and not dense):
             return np.zeros_like(self._wanted)
-        flags = (self._numbers[:, first:, [TERMINATED, TRUNCATED]] > 0).cpu().numpy()
+        flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
         terminated, truncated = flags[..., 0], flags[..., 1]
         self._wanted[:, first:] = terminated | truncated if self.final_frames == "all" else truncated & ~terminated
         if self._places > 1 and self._wanted[:, :-1].sum(1).max() >= self._places:

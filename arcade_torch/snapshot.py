@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
-from arcade_torch.dlpack import to_torch
+from arcade_torch.dlpack import to_torch, wait_for_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched
@@ -82,6 +82,7 @@ class Snapshots:
             TypeError: Not a TensorDict, or a leaf that is no tensor.
         """
         self._check_game(td)
+        wait_for_torch(self._device, self._jax_device)
         arrays = []
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
             name, tensor = ".".join(key), _entry(td, key)

@@ -29,10 +29,17 @@ settings.register_profile(
 settings.load_profile("arcade")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--device cpu`` rehearses the tests marked `gpu` on the CPU, as far as they make sense there."""
+    parser.addoption("--device", choices=("cuda", "cpu"), default="cuda", help="device of the tests marked gpu")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip `gpu` and `ray` tests with a reason where the machine lacks what they need."""
-    needing_gpu = [item for item in items if "gpu" in item.keywords]
-    needing_ray = [item for item in items if "ray" in item.keywords]
+    rehearsed = config.getoption("device") == "cpu"
+    needing_gpu = [item for item in items if item.get_closest_marker("gpu")]
+    needing_gpu = [item for item in needing_gpu if not (rehearsed and "device" in getattr(item, "fixturenames", ()))]
+    needing_ray = [item for item in items if item.get_closest_marker("ray")]
     if needing_gpu and not _has_cuda():
         for item in needing_gpu:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
@@ -45,6 +52,20 @@ def _has_cuda() -> bool:
     import torch
 
     return torch.cuda.is_available()
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> str:
+    """Where a test marked `gpu` runs: ``cuda``, or ``cpu`` in a rehearsal."""
+    return str(request.config.getoption("device"))
+
+
+@pytest.fixture
+def cuda(device: str) -> str:
+    """``cuda``; skips the test in a rehearsal."""
+    if device != "cuda":
+        pytest.skip("says something on a CUDA device alone")
+    return device
 
 
 @pytest.fixture(autouse=True)

@@ -195,8 +195,8 @@ def _with_graphs(config: TrainConfig, folder: Path) -> Trainer:
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
-def test_a_run_with_graphs_is_a_run(algorithm: str, tmp_path: Path) -> None:
-    config = preset("smoke", algorithm=algorithm, env="SignpostEasy", device="cuda", total_frames=1024)
+def test_a_run_with_graphs_is_a_run(algorithm: str, tmp_path: Path, cuda: str) -> None:
+    config = preset("smoke", algorithm=algorithm, env="SignpostEasy", device=cuda, total_frames=1024)
     results = [train(dataclasses.replace(config, cuda_graphs=on), tmp_path / str(on)) for on in (True, False)]
     assert all(result.status == "finished" for result in results) and load(tmp_path / "True").config.cuda_graphs
     one, other = (load(tmp_path / str(on)).network.state_dict() for on in (True, False))

@@ -219,6 +219,16 @@ def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
     assert "loss is nan" in json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
 
 
+def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> None:
+    """It took over the checkpoint's, which is on the CPU and which no graph reads."""
+    trainer = training.Trainer(CONFIG)
+    group, rate = trainer.learner.optimizer.param_groups[0], torch.tensor(0.5)
+    group["lr"] = rate
+    trainer.learner.load_state_dict(trainer.learner.state_dict())
+    trainer.close()
+    assert trainer.learner.optimizer.param_groups[0]["lr"] is rate
+
+
 KILLED = """
 import sys
 from arcade_torch.agents import TrainConfig, train

@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 
 import arcade_torch
 from arcade_torch import collector as collector_module
 from arcade_torch import compiled, dlpack, rollout_buffer
 from arcade_torch import env as env_module
+from arcade_torch.agents import Trainer, preset
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import compiled_game
 from arcade_torch.env import ArcadeEnv
@@ -58,6 +59,35 @@ def test_actions_on_a_gpu_reach_jax_on_the_cpu() -> None:
     argument = dlpack.int32_argument(action, jax.devices("cpu")[0])
     assert isinstance(argument, np.ndarray) and argument.dtype == np.int32
     assert argument.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_tensor_on_a_gpu_that_begins_where_jax_cannot_compute_is_refused() -> None:
+    """XLA's programs refuse it when they run; only the CPU's alignment was checked."""
+    with pytest.raises(ValueError, match="multiple of 16 bytes, JAX cannot compute with it"):
+        dlpack.to_jax(torch.zeros(64).as_subclass(CudaStandIn)[1:])
+
+
+@pytest.mark.parametrize("change", ["reset", "observe", "set_seed", "set_observability", "set_state"])
+def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
+    monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    """A step waits for its actions. The others gave JAX memory of frames that torch had yet to read."""
+    env = ArcadeEnv(GAME, N)
+    env.reset()
+    argument = {"set_seed": [1], "set_observability": ["partial"], "set_state": [env.get_state()]}.get(change, [])
+    events: list[str] = []
+    stream = type("Stream", (), {"synchronize": lambda self: events.append("torch")})()
+    monkeypatch.setattr(dlpack, "is_host", lambda value: False)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    monkeypatch.setattr(env_module, "to_torch", lambda array, device: torch.from_numpy(np.array(array)))
+    for name in ("render", "reset_render"):
+        original = getattr(env._batched, name)
+        call = lambda *args, original=original: (events.append("jax"), original(*args))[1]  # noqa: E731
+        monkeypatch.setattr(env._batched, name, call)
+    put = jax.device_put
+    monkeypatch.setattr(jax, "device_put", lambda *args: (events.append("jax"), put(*args))[1])
+    getattr(env, change)(*argument)
+    assert events[0] == "torch" and "jax" in events
 
 
 @pytest.mark.parametrize("path", ["collector", "env"])
@@ -116,9 +146,12 @@ def output_of(code: str, environment: dict[str, str] | None = None) -> str:
 
 
 class Waits(TorchDispatchMode):
-    """Counts what makes the host wait for a GPU: values that Python reads, and shapes that depend on values."""
+    """Counts what makes the host wait for a GPU: values that Python reads, and shapes that depend on values.
 
-    READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique")
+    Also Python numbers that become a tensor (``lift_fresh``), as a list of indices does: the copy is waited for.
+    """
+
+    READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique", "lift_fresh")
 
     def __init__(self) -> None:
         super().__init__()
@@ -151,6 +184,7 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
     for module in (dlpack, rollout_buffer, env_module, collector_module):
         monkeypatch.setattr(module, "is_host", lambda value: False)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
+    monkeypatch.setattr(torch, "from_numpy", _disable_current_modes()(torch.from_numpy))  # from pinned memory: no wait
     monkeypatch.setattr(env, "_check_actions", False)
     monkeypatch.setattr(torch.Tensor, "cpu", counted("cpu", torch.Tensor.cpu))
     for name in ("array", "asarray"):
@@ -181,6 +215,23 @@ def test_the_host_waits_once_a_window(monkeypatch: pytest.MonkeyPatch, game: Any
     assert_same(batch.exclude("final_pixels"), again.exclude("final_pixels"))
 
 
+@pytest.mark.parametrize("memory", ["lru", "gru"])
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
+def test_the_host_waits_once_a_window_of_a_training_too(
+    monkeypatch: pytest.MonkeyPatch, algorithm: str, memory: str
+) -> None:
+    """With our networks, exploration and final frames of truncated episodes."""
+    learner = {algorithm: {"time_limit": "bootstrap"}}
+    trainer = Trainer(preset("smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, **learner))
+    for _ in range(2):
+        trainer.collector.collect()
+    with as_on_cuda(monkeypatch, trainer.env) as counts:
+        trainer.collector.collect()
+    monkeypatch.undo()
+    trainer.close()
+    assert counts == {"cpu": 1}
+
+
 def test_the_counter_of_waits_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     env = ArcadeEnv(GAME, N)
     root, ones = env.reset(), jnp.ones(2)
@@ -189,7 +240,8 @@ def test_the_counter_of_waits_counts(monkeypatch: pytest.MonkeyPatch) -> None:
         root["is_init"].cpu()
         np.asarray(ones)
         root["step_count"][root["is_init"]]
-    assert counts == {"_local_scalar_dense": 1, "cpu": 1, "numpy": 1, "index": 1}
+        root["step_count"][[0, 1]]
+    assert counts == {"_local_scalar_dense": 1, "cpu": 1, "numpy": 1, "index": 1, "lift_fresh": 1}
 
 
 # -- one process, many ------------------------------------------------------------------------------------------------

@@ -89,11 +89,3 @@ def test_sharing_a_gpu_respects_what_the_user_has_set(monkeypatch: pytest.Monkey
     assert not dlpack.share_gpu()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert not dlpack.share_gpu()
-
-
-@pytest.mark.gpu
-def test_frames_on_the_gpu_are_shared() -> None:
-    array = jnp.ones((4, 3), jnp.uint8)
-    tensor = dlpack.to_torch(array)
-    assert tensor.is_cuda
-    assert tensor.data_ptr() == array.unsafe_buffer_pointer()
