@@ -15,9 +15,6 @@ from arcade_torch.tools.optional import need
 PACKAGES = {"gymnax": ("CartPole-v1", "Breakout-MinAtar"), "ale_py": ("ALE/Pong-v5",)}
 """Import name -> which of its environments are measured."""
 
-PIXELS = ("ALE/Pong-v5",)
-"""Those whose observations are pictures."""
-
 
 class Other(NamedTuple):
     """One environment of another package: its name, whether it draws, frames per second by number of envs."""
@@ -37,12 +34,12 @@ def bench_others(
 ) -> Iterator[Other]:
     """Measure the environments of installed packages."""
     for package in packages:
+        make = _gymnax if package == "gymnax" else _gymnasium
         for name in PACKAGES[package]:
-            rates = []
-            for count in batches:
-                measure = _gymnax(name, count) if package == "gymnax" else _gymnasium(name, count)
-                rates.append(interleaved({name: measure}, seconds, repeats)[name].rate_with_check)
-            yield Other(f"{package} {name.removeprefix('ALE/')}", name in PIXELS, rates)
+            measures = {str(count): Measure(make(name, count), _read, count) for count in batches}
+            found = interleaved(measures, seconds, repeats)
+            rates = [measured.rate_with_check for measured in found.values()]
+            yield Other(f"{package} {name.removeprefix('ALE/')}", package == "ale_py", rates)
 
 
 def _read(observation: Any) -> int:
@@ -50,7 +47,7 @@ def _read(observation: Any) -> int:
     return int(np.asarray(observation).view(np.uint8).astype(np.int64).sum())
 
 
-def _gymnax(name: str, count: int) -> Measure:
+def _gymnax(name: str, count: int) -> Any:
     """A vectorised and compiled step with auto-reset; new random actions and keys every step."""
     import jax
 
@@ -71,14 +68,14 @@ def _gymnax(name: str, count: int) -> Measure:
         carry[0], carry[1], observation, _ = step(*carry)
         return observation.block_until_ready()
 
-    return Measure(work, _read, count)
+    return work
 
 
-def _gymnasium(name: str, count: int) -> Measure:
+def _gymnasium(name: str, count: int) -> Any:
     """Gymnasium's synchronous vector of environments, as the paper ran Atari."""
     gymnasium = need("gymnasium")
     gymnasium.register_envs(need("ale_py"))
     env = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make(name)] * count)
     env.reset(seed=0)
     env.action_space.seed(0)
-    return Measure(lambda: env.step(env.action_space.sample())[0], _read, count)
+    return lambda: env.step(env.action_space.sample())[0]
