@@ -30,21 +30,21 @@ class Bench:
         results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device", "note") if name in about}
         for name, table in results["tables"].items():
-            _show(registry.TABLES[name].title, table["rows"])
+            title, key, _ = registry.TABLES[name]
+            columns, cells = list(table["rows"][0]), [list(map(format_value, row.values())) for row in table["rows"]]
+            names = next(place for place, column in enumerate(columns) if column not in key)
+            Table(title, columns, cells, left=names).show()
         print(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
-        if out is not None and not self._resumable():
+        if out is not None and not self.options.resumable:
             for path in _save(out, results):
                 print(path)
         return 0
 
-    def _resumable(self) -> bool:
-        """Whether the benchmark keeps its file itself."""
-        return getattr(self.options, "resumable", False)
-
     def resume_hint(self) -> str:
         """What an interruption left."""
-        kept = self._resumable()
-        return f"finished rows are in {self.options.out}; the same command goes on" if kept else "nothing was kept"
+        if self.options.resumable:
+            return f"finished rows are in {self.options.out}; the same command goes on"
+        return "nothing was kept"
 
 
 @dataclass
@@ -150,12 +150,3 @@ def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
         rows = [{**row, **results["machine"]} for row in table["rows"]]
         paths.append(write_csv(path, rows, list(rows[0])))
     return paths
-
-
-def _show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print a table; one with few rows and many columns is turned round."""
-    columns, cells = list(rows[0]), [list(map(format_value, row.values())) for row in rows]
-    if len(columns) > 12 and len(rows) < 12:
-        names = ["", *(" ".join(row[:3]) for row in cells)]
-        columns, cells = names, [list(line) for line in zip(columns, *cells, strict=True)]
-    Table(title, columns, cells).show()
