@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from arcade_torch.tools.optional import need
 
@@ -19,12 +19,13 @@ LINE_EVERY_S = 15.0
 class Speed:
     """Frames per second over a sliding window."""
 
+    window_s: float = WINDOW_S
     seen: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, now_s: float, frames: int) -> float:
         """Take a reading of a clock and of all frames so far; return the speed, 0 until there are two readings."""
         self.seen.append((now_s, frames))
-        while len(self.seen) > 2 and now_s - self.seen[0][0] > WINDOW_S:
+        while len(self.seen) > 2 and now_s - self.seen[0][0] > self.window_s:
             self.seen.popleft()
         span = now_s - self.seen[0][0]
         return max(0.0, (frames - self.seen[0][1]) / span) if span > 0 else 0.0
@@ -60,7 +61,7 @@ class Bars:
         self._tasks: dict[str, Any] = {}
         self._last_s = time.monotonic() - LINE_EVERY_S + first_line_s
 
-    def __enter__(self) -> "Bars":
+    def __enter__(self) -> Self:
         """Start to show."""
         if self.stream.isatty():
             rich = need("rich.progress")

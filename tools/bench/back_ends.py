@@ -77,6 +77,14 @@ def bench_back_ends(
                 forward, backward = BACK_ENDS[name]
                 h = forward(a, b, start, h0)
                 calls = (partial(forward, a, b, start, h0), partial(backward, a, start, h0, h, grad))
-                times = [device_ms(call, device, repeats) for call in calls]
-                shares = [copy / taken for copy, taken in zip(copies, times, strict=True)]
-                yield BackEndRow(name, length, numbers, *times, *shares, float((h.cpu() - exact).abs().max()))
+                forward_ms, backward_ms = (device_ms(call, device, repeats) for call in calls)
+                yield BackEndRow(
+                    name,
+                    length,
+                    numbers,
+                    forward_ms,
+                    backward_ms,
+                    forward_share=copies[0] / forward_ms,
+                    backward_share=copies[1] / backward_ms,
+                    error=float((h.cpu() - exact).abs().max()),
+                )

@@ -20,7 +20,6 @@ class Bench:
 
     name: str
     options: Any
-    argv: tuple[str, ...] = ()
 
     def run(self) -> int:
         """Measure, print, save."""
@@ -64,13 +63,12 @@ class BenchAll:
     """The file; overwritten."""
     page: Path | None = None
     """Markdown page of the tables; beside the file by default."""
-    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Measure and save."""
         if self.out.suffix != ".json":
             raise ValueError(f"--out must end in .json, got {self.out}")
-        modules = {name: registry.module_of(name) for name in self.benches}
+        modules: dict[str, Any] = {name: registry.module_of(name) for name in self.benches}
         options = {name: module.Options(**module.SIZES[self.size], out=None) for name, module in modules.items()}
         results = registry.measure(options, self.size, _log)
         print(write_json(self.out, results))
@@ -91,7 +89,6 @@ class BenchCompare:
     """The file to judge."""
     tolerance: float = 0.2
     """Share by which a number may be worse; machines that are not quiet need more."""
-    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Compare and print."""

@@ -1,7 +1,7 @@
 """``arcade-torch train``."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,12 +46,6 @@ class Train:
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
     argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
-    def folder(self) -> Path:
-        """The run folder."""
-        run = self.settings
-        name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
-        return self.out or Path("runs") / name
-
     def run(self) -> int:
         """Train."""
         from arcade_torch.agents import train
@@ -61,23 +55,21 @@ class Train:
 
         watch_parent()
         keep_freed_memory()
-        folder = self.folder()
+        run, film = self.settings, None
+        name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
+        folder = self.out or Path("runs") / name
+        if self.videos != "none":
+            from arcade_torch.tools.record.evaluations import EvaluationVideos
+
+            film = EvaluationVideos(folder / "videos", f".{self.videos}")
         wait_until_free(folder, self.wait)
         with TrainBar(str(folder)) as bar:
-            result = train(self.settings, folder, self.resume, bar.show, self._film(folder))
+            result = train(run, folder, self.resume, bar.show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
         print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
         print(f"finished: {result.run_dir}")
         return 0
-
-    def _film(self, folder: Path) -> Callable[[Any], None] | None:
-        """What films the agent at every evaluation."""
-        if self.videos == "none":
-            return None
-        from arcade_torch.tools.record.evaluations import EvaluationVideos
-
-        return EvaluationVideos(folder / "videos", f".{self.videos}")
 
     def resume_hint(self) -> str:
         """What to type after an interruption."""
@@ -108,7 +100,9 @@ def parse(argv: Sequence[str], prog: str) -> Train:
     parsed: Train = parse_options(Train, argv, prog, Train(base))
     settings = parsed.settings if file else preset(parsed.preset, **_given(parsed.settings, argv))
     options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
-    more = {key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()}
+    more: dict[str, Any] = {
+        key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()
+    }
     return dataclasses.replace(parsed, settings=dataclasses.replace(settings, **more))
 
 
@@ -128,7 +122,7 @@ def _given(settings: TrainConfig, argv: Sequence[str]) -> dict[str, Any]:
     for word in argv:
         group, _, name = word.partition("=")[0].removeprefix("--").replace("-", "_").rpartition(".")
         name = name.removeprefix("no_")
-        owner = getattr(settings, group, None) if group else settings
+        owner: Any = getattr(settings, group, None) if group else settings
         if word.startswith("--") and name in {item.name for item in dataclasses.fields(owner)}:
             (found.setdefault(group, {}) if group else found)[name] = getattr(owner, name)
     return found
