@@ -23,10 +23,10 @@ from arcade_torch.tools.options import parse
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
-EVERYWHERE = (
-    "With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory models;",
-    "--debug shows the traceback of an error.",
-)
+HELP = ("-h", "--help", "help")
+EVERYWHERE = """\
+With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory models;
+--debug shows the traceback of an error."""
 
 
 class Command(NamedTuple):
@@ -56,24 +56,23 @@ COMMANDS: dict[str, Command] = {
 def usage() -> str:
     """The page that ``arcade-torch --help`` prints."""
     width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items()]
-    return "\n".join(
-        [
-            "usage: arcade-torch COMMAND [options]",
-            "",
-            "POPGym Arcade for PyTorch: pixel games as MDP/POMDP twins, and what memory does in them.",
-            "",
-            *lines,
-            "",
-            "arcade-torch COMMAND --help explains a command and gives an example.",
-            *EVERYWHERE,
-            "--version prints the version.",
-        ]
-    )
+    commands = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    return f"""usage: arcade-torch COMMAND [options]
+
+POPGym Arcade for PyTorch: pixel games as MDP/POMDP twins, and what memory does in them.
+
+{commands}
+
+arcade-torch COMMAND --help explains a command and gives an example.
+{EVERYWHERE}
+--version prints the version."""
 
 
 def split_command(words: Sequence[str]) -> tuple[str, list[str]]:
     """Separate the name of the command from its options.
+
+    Raises:
+        ValueError: there is no such command; names the nearest.
 
     Example:
         >>> split_command(["analyze", "gap-bias", "runs/demo"])
@@ -83,19 +82,16 @@ def split_command(words: Sequence[str]) -> tuple[str, list[str]]:
         name = " ".join(words[:length])
         if len(words) >= length and name in COMMANDS:
             return name, list(words[length:])
-    groups = sorted({name.split()[0] for name in COMMANDS if " " in name})
-    if words[0] in groups:
-        members = [name.split()[1] for name in COMMANDS if name.startswith(words[0] + " ")]
-        near = difflib.get_close_matches(words[1], members, n=1, cutoff=0.5) if len(words) > 1 else []
-        if near:
-            raise ValueError(
-                f"unknown {words[0]} {words[1]!r}: did you mean {near[0]!r}? There are {', '.join(members)}"
-            )
-        got = f"not {words[1]!r}" if len(words) > 1 and not words[1].startswith("-") else "and which one is missing"
-        raise ValueError(f"arcade-torch {words[0]} is followed by {' or '.join(members)}, {got}")
-    near = difflib.get_close_matches(words[0], [*COMMANDS, *groups], n=1, cutoff=0.5)
+    group, *more = words
+    if members := [name.split()[1] for name in COMMANDS if name.startswith(f"{group} ")]:
+        if near := difflib.get_close_matches(more[0], members, n=1, cutoff=0.5) if more else []:
+            raise ValueError(f"unknown {group} {more[0]!r}: did you mean {near[0]!r}? There are {', '.join(members)}")
+        got = f"not {more[0]!r}" if more and not more[0].startswith("-") else "and which one is missing"
+        raise ValueError(f"arcade-torch {group} is followed by {' or '.join(members)}, {got}")
+    names = dict.fromkeys([*COMMANDS, *(name.split()[0] for name in COMMANDS)])
+    near = difflib.get_close_matches(group, names, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    raise ValueError(f"unknown command {words[0]!r}: {hint}commands are {', '.join(COMMANDS)}")
+    raise ValueError(f"unknown command {group!r}: {hint}commands are {', '.join(COMMANDS)}")
 
 
 def _say(text: str) -> None:
@@ -106,43 +102,28 @@ def _terminate(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _run(name: str, words: Sequence[str], state: dict[str, Any]) -> int:
+def _run(words: Sequence[str], state: dict[str, Any]) -> int:
+    name, options = split_command(words)
+    load_extensions(state["imports"])
     module = import_module(f"arcade_torch.tools.commands.{COMMANDS[name].module}")
     prog = f"arcade-torch {name}"
-    command = module.parse(words, prog) if hasattr(module, "parse") else parse(module.COMMAND, words, prog)
-    command.argv = tuple(words)
+    command = module.parse(options, prog) if hasattr(module, "parse") else parse(module.COMMAND, options, prog)
+    command.argv = tuple(options)
     state["command"] = command
     return int(command.run() or EXIT_OK)
 
 
-def _guarded(name: str, words: Sequence[str], imports: Sequence[str], debug: bool) -> int:
-    state: dict[str, Any] = {}
-    try:
-        load_extensions(imports)
-        return _run(name, words, state)
-    except SystemExit as stop:
-        if not stop.code:
-            print(*EVERYWHERE, sep="\n")
-        return stop.code if isinstance(stop.code, int) else EXIT_OK if stop.code is None else EXIT_FAILED
-    except KeyboardInterrupt:
-        hint = getattr(state.get("command"), "resume_hint", None)
-        _say("stopped; " + (hint() if hint else "nothing was left half written"))
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return EXIT_OK
-    except Exception as error:
-        if debug:
-            raise
-        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("arcade_torch"):
-            _say(missing_package_message(str(error.name)))
-            return EXIT_BAD_INPUT
-        if is_told(error):
-            _say(one_line(error))
-            return EXIT_FAILED if type(error).__name__ in WORK_FAILED else EXIT_BAD_INPUT
-        _say("this is a fault of arcade-torch; please report it with what follows")
-        traceback.print_exc()
-        return EXIT_FAILED
+def _report(error: Exception) -> int:
+    """Say what went wrong; returns the exit code."""
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("arcade_torch"):
+        _say(missing_package_message(str(error.name)))
+        return EXIT_BAD_INPUT
+    if is_told(error):
+        _say(one_line(error))
+        return EXIT_FAILED if type(error).__name__ in WORK_FAILED else EXIT_BAD_INPUT
+    _say("this is a fault of arcade-torch; please report it with what follows")
+    traceback.print_exc()
+    return EXIT_FAILED
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -155,32 +136,34 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 done, 1 something failed, 2 bad input, 130 interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
-    try:
-        imports, words = take_imports(words)
-    except ValueError as error:
-        _say(one_line(error))
-        return EXIT_BAD_INPUT
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(usage())
-        return EXIT_OK
-    if words[0] == "--version":
-        from arcade_torch import __version__
-
-        print(f"arcade-torch {__version__}")
-        return EXIT_OK
-    if len(words) == 2 and words[1] in ("-h", "--help") and any(name.startswith(words[0] + " ") for name in COMMANDS):
-        print(usage())
-        return EXIT_OK
-    try:
-        name, options = split_command(words)
-    except ValueError as error:
-        _say(one_line(error))
-        return EXIT_BAD_INPUT
+    debug, state = "--debug" in words, dict[str, Any]()
     previous = signal.signal(signal.SIGTERM, _terminate) if argv is None else None
     try:
-        return _guarded(name, options, imports, debug)
+        state["imports"], words = take_imports([word for word in words if word != "--debug"])
+        groups = {name.split()[0] for name in COMMANDS if " " in name}
+        if not words or words[0] in HELP or (words[0] in groups and len(words) == 2 and words[1] in HELP):
+            print(usage())
+        elif words[0] == "--version":
+            from arcade_torch import __version__
+
+            print(f"arcade-torch {__version__}")
+        else:
+            return _run(words, state)
+    except SystemExit as stop:
+        if not stop.code:
+            print(EVERYWHERE)
+        return stop.code if isinstance(stop.code, int) else EXIT_OK if stop.code is None else EXIT_FAILED
+    except KeyboardInterrupt:
+        hint = getattr(state.get("command"), "resume_hint", None)
+        _say("stopped; " + (hint() if hint else "nothing was left half written"))
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except Exception as error:
+        if debug:
+            raise
+        return _report(error)
     finally:
         if previous is not None:
             signal.signal(signal.SIGTERM, previous)
+    return EXIT_OK

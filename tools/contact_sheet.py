@@ -1,5 +1,6 @@
 """Pictures of games pixel by pixel: all of them at both sizes, or some moments of one, always both twins."""
 
+import io
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
@@ -13,12 +14,12 @@ from arcade_torch.tools.files import write_bytes
 from arcade_torch.tools.optional import need
 
 Picture = npt.NDArray[np.uint8]
-Moment = Callable[[], tuple[Picture, Picture]]
+Moment = Callable[[], list[Picture]]
 GAP = 8
 PAPER = 255
 
 
-def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> tuple[Picture, Picture]:
+def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Picture]:
     """Both twins of one moment in the middle of a game, played by the scripted player that sees the state."""
     from arcade_torch.envs_jax import make
 
@@ -33,8 +34,7 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
     moments = list(_walk(id, obs_size, seed, steps[-1]))
     if len(moments) <= steps[-1]:
         raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay below")
-    columns = [np.concatenate(_spaced(moments[step](), 0)) for step in steps]
-    return np.concatenate(_spaced(columns, 1), 1)
+    return _joined([_joined(moments[step](), 0) for step in steps], 1)
 
 
 def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
@@ -47,10 +47,8 @@ def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
     game = make(id, obs_size=obs_size)
     batched, player = BatchedGame(game), make_oracle(game) if "state" in game.oracles else RandomPlayer(seed)
 
-    def draw(batch: Any) -> tuple[Picture, Picture]:
-        twins = (batched.render(batch._replace(partial=np.array([hides]))) for hides in (False, True))
-        full, hidden = (np.asarray(frames)[0] for frames in twins)
-        return full, hidden
+    def draw(batch: Any) -> list[Picture]:
+        return [np.asarray(batched.render(batch._replace(partial=np.array([hides]))))[0] for hides in (False, True)]
 
     batch = batched.init(env_keys(seed, 1), np.zeros(1, bool))
     yield partial(draw, batch)
@@ -62,25 +60,14 @@ def _walk(id: str, obs_size: int, seed: int, steps: int) -> Iterator[Moment]:
         yield partial(draw, batch)
 
 
-def _spaced(pictures: Sequence[Picture], axis: int) -> list[Picture]:
-    """The pictures with a gap between each two along an axis."""
-    shape = list(pictures[0].shape)
-    shape[axis] = GAP
-    gap = np.full(shape, PAPER, np.uint8)
-    return [part for picture in pictures for part in (gap, picture)][1:]
-
-
 def sheet(ids: Sequence[str], columns: int = 2) -> Picture:
     """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
     cells = []
     for id in ids:
         frames = [frame for size in (256, 128) for frame in scene(id, size)]
-        cell = np.full((256 + GAP, sum(f.shape[1] + GAP for f in frames), 3), PAPER, np.uint8)
-        x = 0
-        for frame in frames:
-            cell[: frame.shape[0], x : x + frame.shape[1]] = frame
-            x += frame.shape[1] + GAP
-        cells.append(cell)
+        below = [((0, 256 + GAP - len(frame)), (0, GAP), (0, 0)) for frame in frames]
+        padded = [np.pad(frame, pad, constant_values=PAPER) for frame, pad in zip(frames, below, strict=True)]
+        cells.append(np.concatenate(padded, 1))
     cells += [np.full_like(cells[0], PAPER)] * (-len(cells) % columns)
     rows = [np.concatenate(cells[first : first + columns], 1) for first in range(0, len(cells), columns)]
     return np.concatenate(rows)
@@ -88,9 +75,13 @@ def sheet(ids: Sequence[str], columns: int = 2) -> Picture:
 
 def write_png(picture: Picture, path: Path) -> Path:
     """Write a picture as PNG, atomically and without loss."""
-    import io
-
-    image: Any = need("PIL.Image").fromarray(picture)
     buffer = io.BytesIO()
-    image.save(buffer, format="PNG", optimize=True)
+    need("PIL.Image").fromarray(picture).save(buffer, format="PNG", optimize=True)
     return write_bytes(path, buffer.getvalue())
+
+
+def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
+    """The pictures one after another along an axis, with a gap between each two."""
+    pad = [(GAP if i == axis else 0, 0) for i in range(3)]
+    rest = [np.pad(picture, pad, constant_values=PAPER) for picture in pictures[1:]]
+    return np.concatenate([pictures[0], *rest], axis)

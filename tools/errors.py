@@ -5,14 +5,8 @@ import opcode
 from arcade_torch.tools.optional import MissingPackage
 
 BAD_INPUT = (
-    ValueError,
-    TypeError,
-    FileNotFoundError,
-    FileExistsError,
-    PermissionError,
-    NotADirectoryError,
-    IsADirectoryError,
-    MissingPackage,
+    *(ValueError, TypeError, MissingPackage, FileNotFoundError, FileExistsError),
+    *(PermissionError, NotADirectoryError, IsADirectoryError),
 )
 """What the library raises for bad input, beside its own error types."""
 
@@ -28,26 +22,23 @@ def is_told(error: BaseException) -> bool:
     """
     if type(error).__module__.startswith("arcade_torch."):
         return True
-    if isinstance(error, ValueError | TypeError):
-        return _was_raised_by_us(error)
-    return isinstance(error, BAD_INPUT)
+    if not isinstance(error, ValueError | TypeError):
+        return isinstance(error, BAD_INPUT)
+    at = error.__traceback__
+    while at is not None and at.tb_next is not None:
+        at = at.tb_next
+    if at is None or not str(at.tb_frame.f_globals.get("__name__")).startswith("arcade_torch."):
+        return False
+    return at.tb_frame.f_code.co_code[at.tb_lasti] == opcode.opmap["RAISE_VARARGS"]
 
 
 def one_line(error: BaseException) -> str:
     """The message of an error without line breaks, or its type if it has none."""
+    if isinstance(error, FileNotFoundError) and error.filename is not None:
+        return f"{error.filename} does not exist"
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def reason(error: BaseException) -> str:
     """Why something failed, in one line."""
     return one_line(error) if is_told(error) else f"{type(error).__name__}: {one_line(error)}"
-
-
-def _was_raised_by_us(error: BaseException) -> bool:
-    at = error.__traceback__
-    while at is not None and at.tb_next is not None:
-        at = at.tb_next
-    if at is None:
-        return False
-    code, module = at.tb_frame.f_code.co_code, str(at.tb_frame.f_globals.get("__name__"))
-    return module.startswith("arcade_torch.") and code[at.tb_lasti] == opcode.opmap["RAISE_VARARGS"]

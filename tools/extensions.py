@@ -1,7 +1,6 @@
 """``--import``: a user's own games and memory models on the command line, in workers too."""
 
 import hashlib
-import importlib
 import importlib.util
 import os
 import shlex
@@ -10,16 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 FLAG = "--import"
-
 VARIABLE = "ARCADE_TORCH_IMPORT"
 """Environment variable that hands what was imported on to worker processes; entries separated like those of PATH."""
 
 
 def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Separate ``--import`` from a command line.
-
-    Args:
-        words: the command line without the program's name.
 
     Returns:
         What to import (files as absolute paths), and the remaining words.
@@ -54,10 +49,9 @@ def load_extensions(names: Sequence[str] = ()) -> None:
         FileNotFoundError: there is no such file or module.
         ValueError: it could not be imported; says why in one line.
     """
-    wanted = list(dict.fromkeys([*imported(), *names]))
-    for name in wanted:
-        _load(name)
-    if wanted:
+    if wanted := list(dict.fromkeys([*imported(), *names])):
+        for name in wanted:
+            _load(name)
         os.environ[VARIABLE] = os.pathsep.join(wanted)
 
 
@@ -68,8 +62,7 @@ def imported() -> list[str]:
 
 def command_line(words: Sequence[str]) -> str:
     """A line for a shell that runs ``arcade-torch`` with these words and the same imports."""
-    flags = [part for name in imported() for part in (FLAG, name)]
-    return shlex.join(["arcade-torch", *words, *flags])
+    return shlex.join(["arcade-torch", *words, *(part for name in imported() for part in (FLAG, name))])
 
 
 def _is_file(name: str) -> bool:
@@ -77,6 +70,8 @@ def _is_file(name: str) -> bool:
 
 
 def _load(name: str) -> None:
+    if _is_file(name) and not Path(name).is_file():
+        raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
     try:
         if _is_file(name):
             _load_file(Path(name))
@@ -86,8 +81,6 @@ def _load(name: str) -> None:
         if error.name and (name == error.name or name.startswith(f"{error.name}.")):
             raise FileNotFoundError(f"{FLAG} {name}: there is no module of that name; a file needs its .py") from error
         raise ValueError(f"{FLAG} {name}: it imports {error.name}, which is not installed") from error
-    except FileNotFoundError:
-        raise
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{FLAG} {name}: it could not be imported, {type(error).__name__}: {reason}") from error
@@ -95,18 +88,15 @@ def _load(name: str) -> None:
 
 def _load_file(path: Path) -> None:
     """Import a file under a name of its own, so that two files of one name do not meet."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{FLAG} {path}: there is no such file")
-    module_name = f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    if module_name in sys.modules:
+    name = f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name in sys.modules:
         return
-    spec = importlib.util.spec_from_file_location(module_name, path)
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ValueError("it is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
+    sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
+        spec.loader.exec_module(sys.modules[name])
     except BaseException:
-        del sys.modules[module_name]
+        del sys.modules[name]
         raise

@@ -1,38 +1,31 @@
-"""Reading and atomically writing the small files of runs, studies and analyses."""
+"""Reading and atomically writing the small files of studies, analyses and figures."""
 
 import csv
 import hashlib
 import io
 import json
 import os
-import tempfile
+import secrets
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.runs.files import read_json
+
+__all__ = ["cached_arrays", "read_csv", "read_json"]
+__all__ += ["write_between", "write_bytes", "write_csv", "write_json", "write_npz", "write_text"]
+
 
 def write_bytes(path: Path, data: bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never half of it.
-
-    Args:
-        path: where; missing folders are made.
-        data: the whole content.
-
-    Returns:
-        ``path``.
-    """
+    """Write a file so that a reader sees the old one or the new one, never half of it; missing folders are made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = path.with_name(f".{secrets.token_hex(8)}")  # others may write the same file on another machine
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
     return path
 
@@ -50,8 +43,7 @@ def write_between(page: Path, begin: str, end: str, text: str) -> Path:
         raise ValueError(f"{page} is not text in UTF-8: {error}") from error
     if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
         raise ValueError(f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes between them")
-    before, after = old.partition(begin)[0], old.partition(end)[2]
-    return write_text(page, f"{before}{begin}\n\n{text}\n\n{end}{after}")
+    return write_text(page, f"{old.partition(begin)[0]}{begin}\n\n{text}\n\n{end}{old.partition(end)[2]}")
 
 
 def write_json(path: Path, value: Any) -> Path:
@@ -59,37 +51,12 @@ def write_json(path: Path, value: Any) -> Path:
     return write_text(path, json.dumps(value, indent=2, default=str) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is not JSON; names the file.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path} does not exist") from None
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # no text, no JSON, a number of thousands of digits, nested too deeply
-        raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it from a copy") from error
-
-
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Path:
-    """Write rows as CSV atomically.
-
-    Args:
-        path: where.
-        rows: one mapping a line; a missing key or None gives an empty cell.
-        columns: the header, in order.
-    """
+    """Write rows as CSV atomically; a missing key or None gives an empty cell."""
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
-        writer.writerow(["" if row.get(name) is None else row[name] for name in columns])
+    writer = csv.DictWriter(buffer, columns, restval="", extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return write_text(path, buffer.getvalue())
 
 
@@ -102,22 +69,18 @@ def read_csv(path: Path) -> list[dict[str, str]]:
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            rows = [dict(row) for row in reader]
-            header = reader.fieldnames
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path} does not exist") from None
+            header, *rows = [row for row in csv.reader(file) if row] or [[]]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not CSV in UTF-8: {error}") from error
     if not header:
         raise ValueError(f"{path} is empty: expected CSV with a header line")
-    if any(None in row for row in rows):
-        raise ValueError(f"{path} has a line with more cells than its header names")
-    if any(None in row.values() for row in rows):
-        raise ValueError(f"{path} has a line with fewer cells than its header names")
     if len(set(header)) != len(header) or any(name.splitlines() not in ([name], []) for name in header):
         raise ValueError(f"{path} has a header that names a column twice, or over several lines")
-    return rows
+    for row in rows:
+        if len(row) != len(header):
+            which = "more" if len(row) > len(header) else "fewer"
+            raise ValueError(f"{path} has a line with {which} cells than its header names")
+    return [dict(zip(header, row, strict=True)) for row in rows]
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:

@@ -3,8 +3,8 @@
 import ctypes
 import platform
 
-_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # of <malloc.h>
-_TRIM_BYTES, _PAD_BYTES = 2**31 - 1, 2**28
+_SETTINGS = {-4: 0, -1: 2**31 - 1, -2: 2**28}
+"""Of <malloc.h>: M_MMAP_MAX, M_TRIM_THRESHOLD, M_TOP_PAD."""
 
 
 def keep_freed_memory() -> bool:
@@ -20,5 +20,4 @@ def keep_freed_memory() -> bool:
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt
-    settings = {_M_MMAP_MAX: 0, _M_TRIM_THRESHOLD: _TRIM_BYTES, _M_TOP_PAD: _PAD_BYTES}
-    return all(mallopt(name, value) == 1 for name, value in settings.items())
+    return all(mallopt(name, value) == 1 for name, value in _SETTINGS.items())

@@ -4,17 +4,8 @@ from importlib import import_module
 from typing import Any
 
 EXTRA_OF = {
-    "tyro": "tools",
-    "rich": "tools",
-    "tqdm": "tools",
-    "matplotlib": "tools",
-    "jinja2": "tools",
-    "PIL": "tools",
-    "pygame": "play",
-    "imageio_ffmpeg": "video",
-    "wandb": "loggers",
-    "tensorboard": "loggers",
-    "ray": "ray",
+    **dict.fromkeys(("tyro", "rich", "tqdm", "matplotlib", "jinja2", "PIL"), "tools"),
+    **{"pygame": "play", "imageio_ffmpeg": "video", "wandb": "loggers", "tensorboard": "loggers", "ray": "ray"},
 }
 """Import name -> the extra of arcade-torch that brings it."""
 
@@ -37,9 +28,6 @@ def missing_package_message(name: str) -> str:
 
 def need(name: str) -> Any:
     """Import and return an optional module.
-
-    Args:
-        name: import name.
 
     Raises:
         MissingPackage: it is not installed; names the extra that brings it.

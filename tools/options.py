@@ -8,34 +8,9 @@ from typing import Any
 
 from arcade_torch.tools.optional import need
 
-_RULE = re.compile(r"[\u2500-]{4,}")
-_FRAME = re.compile(r"^[\u2502\u256d\u2570|+]\s?|\s?[\u2502\u256e\u256f|+]$")
-_TITLE = re.compile(r"Unrecognized options|Value error|Required options|Invalid choice|Parsing error")
-
-
-def flatten_parser_message(text: str, prog: str) -> str:
-    """Turn the framed message of the option parser into one line.
-
-    Args:
-        text: what the parser wrote to stderr.
-        prog: the command, for example ``arcade-torch train``.
-    """
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    sections: list[list[str]] = [[]]
-    for raw in text.splitlines():
-        line = _FRAME.sub("", raw.strip()).strip()
-        if _RULE.fullmatch(line):
-            sections.append([])
-        elif line and line[:2] not in ("\u2500 ", "- "):  # the frame's title repeats what follows
-            sections[-1].append(line)
-    sections = [part for part in sections if part]
-    if sections and len(sections[0]) == 1 and len(sections) > 1 and _TITLE.fullmatch(sections[0][0]):
-        sections = sections[1:]  # a title without a frame
-    head = " ".join(sections[0]) if sections else "the options could not be read"
-    near = [part for part in sections[1:] if part[0].startswith("Perhaps you meant")]
-    if near and len(near[0]) > 1:
-        head += f"; perhaps you meant {near[0][1]}"
-    return f"{head.rstrip('.')} (see {prog} --help)"
+_FRAME = re.compile(r"\x1b\[[0-9;]*m|^ *[│╭╰|+] ?| ?[│╮╯|+] *$", re.MULTILINE)
+_RULE = re.compile(r"^ *[─-](?: |[─-]{3}).*$", re.MULTILINE)
+_TITLES = ("Unrecognized options", "Value error", "Required options", "Invalid choice", "Parsing error")
 
 
 def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> Any:
@@ -52,16 +27,28 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
         SystemExit: help was asked for.
     """
     tyro = need("tyro")
-    captured = StringIO()
+    captured, extra = StringIO(), {} if default is None else {"default": default}
     try:
         with redirect_stderr(captured):
-            extra = {} if default is None else {"default": default}
             config = (tyro.conf.FlagCreatePairsOff,)
             return tyro.cli(kind, args=list(words), prog=prog, config=config, registry=_registry(), **extra)
     except SystemExit as stop:
         if not stop.code:
             raise
         raise ValueError(flatten_parser_message(captured.getvalue(), prog)) from None
+
+
+def flatten_parser_message(text: str, prog: str) -> str:
+    """Turn the framed message of the option parser into one line.
+
+    Args:
+        text: what the parser wrote to stderr.
+        prog: the command, for example ``arcade-torch train``.
+    """
+    parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", text))]
+    said = [part for part in parts if part and part not in _TITLES] or ["the options could not be read"]
+    near = [part.split()[3] for part in said if part.startswith("Perhaps you meant: ")]
+    return said[0].rstrip(".") + "".join(f"; perhaps you meant {name}" for name in near) + f" (see {prog} --help)"
 
 
 def _registry() -> Any:
@@ -71,15 +58,14 @@ def _registry() -> Any:
 
     @registry.primitive_rule  # type: ignore[untyped-decorator]
     def whole(info: Any) -> Any:
-        if info.type is not int:
-            return None
-        return constructors.PrimitiveConstructorSpec(
+        spec = constructors.PrimitiveConstructorSpec(
             nargs=1,
             metavar="INT",
             instance_from_str=lambda parts: whole_number(parts[0]),
             is_instance=lambda value: type(value) is int,
             str_from_instance=lambda value: [str(value)],
         )
+        return spec if info.type is int else None
 
     return registry
 

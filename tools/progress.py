@@ -5,13 +5,12 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 from arcade_torch.tools.optional import need
 
 WINDOW_S = 30.0
 """Speed is measured over the last so many seconds."""
-
 LINE_EVERY_S = 15.0
 """Where the output is no terminal, a line is printed this often."""
 
@@ -24,12 +23,7 @@ class Speed:
     seen: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, now_s: float, frames: int) -> float:
-        """Take a reading and return the speed, 0 until there are two readings.
-
-        Args:
-            now_s: a clock that only moves forward.
-            frames: total so far.
-        """
+        """Take a reading of a clock and of all frames so far; return the speed, 0 until there are two readings."""
         self.seen.append((now_s, frames))
         while len(self.seen) > 2 and now_s - self.seen[0][0] > self.window_s:
             self.seen.popleft()
@@ -67,13 +61,13 @@ class Bars:
         self._tasks: dict[str, Any] = {}
         self._last_s = time.monotonic() - LINE_EVERY_S + first_line_s
 
-    def __enter__(self) -> "Bars":
+    def __enter__(self) -> Self:
         """Start to show."""
         if self.stream.isatty():
             rich = need("rich.progress")
-            console = need("rich.console").Console(file=self.stream)
             columns = [rich.TextColumn("{task.description}", markup=False), rich.BarColumn(bar_width=24)]
             columns += [rich.TaskProgressColumn(), rich.TextColumn("{task.fields[text]}", markup=False)]
+            console = need("rich.console").Console(file=self.stream)
             self._bars = rich.Progress(*columns, console=console, refresh_per_second=4)
             self._bars.start()
         return self
@@ -84,27 +78,26 @@ class Bars:
             self._bars.stop()
 
     def update(self, name: str, done: int, total: int | None, text: str = "", line: str = "") -> None:
-        """Show one step.
+        """Show how much of a part is done.
 
         Args:
-            name: what is worked on.
+            name: of the part.
             done: how much is done.
             total: of how much; None where nobody knows.
             text: behind the bar.
             line: what to print where there are no bars; ``name: done of total`` by default.
         """
+        now = time.monotonic()
         if self._bars is not None:
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=total, text=text)
             self._bars.update(self._tasks[name], completed=done, total=total, text=text)
-            return
-        now = time.monotonic()
-        if now - self._last_s >= LINE_EVERY_S or (line and total is not None and done >= total):
+        elif now - self._last_s >= LINE_EVERY_S or (line and total is not None and done >= total):
             self._last_s = now
-            print(line or f"{name}: {done} of {total}", file=self.stream, flush=True)
+            self.note(line or f"{name}: {done} of {total}")
 
     def note(self, text: str) -> None:
-        """Print a line above the bars."""
+        """Print a line, above the bars if there are any."""
         if self._bars is not None:
             self._bars.console.print(text, markup=False, highlight=False)
         else:
@@ -112,23 +105,12 @@ class Bars:
 
     def remove(self, name: str) -> None:
         """Forget a part."""
-        if self._bars is not None and name in self._tasks:
+        if name in self._tasks:
             self._bars.remove_task(self._tasks.pop(name))
 
 
-_SHOWN = {
-    "return {:.3f}": "train_return_ewm",
-    "of last episodes {:.3f}": "train_return_last",
-    "greedy {:.3f}": "eval_return",
-    "loss {:.3g}": "loss",
-    "epsilon {:.2f}": "epsilon",
-    "entropy {:.2f}": "entropy",
-    "lr {:.1e}": "lr",
-}
-
-
-class TrainBar:
-    """Shows the rows of ``metrics.csv`` as they come; use it as a context manager and give `update` to ``train``.
+class TrainBar(Bars):
+    """Shows the rows of ``metrics.csv`` as they come; use it as a context manager and give `show` to ``train``.
 
     Args:
         title: name of the run.
@@ -136,29 +118,28 @@ class TrainBar:
     """
 
     def __init__(self, title: str, stream: Any = None) -> None:
-        self.title, self.speed, self.bars = title, Speed(), Bars(stream, first_line_s=0.0)
+        super().__init__(stream, first_line_s=0.0)
+        self.title, self.speed = title, Speed()
 
-    def __enter__(self) -> "TrainBar":
-        """Start to show."""
-        self.bars.__enter__()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        """Stop."""
-        self.bars.__exit__()
-
-    def update(self, row: Mapping[str, Any]) -> None:
-        """Show one update.
-
-        Args:
-            row: of ``metrics.csv``, with ``total_frames``.
-        """
+    def show(self, row: Mapping[str, Any]) -> None:
+        """Show one update: a row of ``metrics.csv`` with ``total_frames``."""
         frames, total, reached = int(row["frames"]), int(row["total_frames"]), standing(row)
         speed = self.speed.update(time.monotonic(), frames)
         pace = f", {speed:,.0f} frames/s" if speed > 0 else ""
-        left = f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
-        line = f"{frames:,} of {total:,} frames{pace}{left}; {reached}"
-        self.bars.update(self.title, frames, total, f"{pace}{left}  {reached}".lstrip(", "), line)
+        pace += f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
+        line = f"{frames:,} of {total:,} frames{pace}; {reached}"
+        self.update(self.title, frames, total, f"{pace}  {reached}".lstrip(", "), line)
+
+
+_SHOWN = {
+    "train_return_ewm": "return {:.3f}",
+    "train_return_last": "of last episodes {:.3f}",
+    "eval_return": "greedy {:.3f}",
+    "loss": "loss {:.3g}",
+    "epsilon": "epsilon {:.2f}",
+    "entropy": "entropy {:.2f}",
+    "lr": "lr {:.1e}",
+}
 
 
 def standing(row: Mapping[str, Any]) -> str:
@@ -171,5 +152,4 @@ def standing(row: Mapping[str, Any]) -> str:
         >>> standing({"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "epsilon": 0.2, "lr": 5e-5})
         'return 0.500, loss 0.0123, epsilon 0.20, lr 5.0e-05'
     """
-    found = {words: row.get(key) for words, key in _SHOWN.items()}
-    return ", ".join(words.format(float(value)) for words, value in found.items() if value is not None)
+    return ", ".join(words.format(float(row[key])) for key, words in _SHOWN.items() if row.get(key) is not None)

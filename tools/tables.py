@@ -1,4 +1,4 @@
-"""Tables on the terminal."""
+"""Tables: on the terminal, in Markdown, as CSV."""
 
 import csv
 import os
@@ -33,46 +33,42 @@ class Table:
 
     def show(self) -> None:
         """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
-        terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
-        width = max(need("rich.console").Console().width if terminal else self._width(), NARROWEST)
-        console = need("rich.console").Console(highlight=False, markup=False, width=width)
-        groups = self._groups(width)
-        for number, group in enumerate(groups):
-            last = number == len(groups) - 1
-            console.print(self._part(group, self.title if not number else "", self.caption if last else ""))
-
-    def _widths(self) -> list[int]:
-        cells = [list(map(str, row)) for row in self.rows]
-        return [
-            max(len(line) for text in (name, *(row[i] for row in cells)) for line in (text.splitlines() or [""]))
-            for i, name in enumerate(self.columns)
+        lines = [list(map(str, line)) for line in (self.columns, *self.rows)]
+        widths = [
+            max(len(part) for cell in cells for part in cell.split("\n")) + 3 for cells in zip(*lines, strict=True)
         ]
-
-    def _width(self) -> int:
-        return sum(width + 3 for width in self._widths()) + 1
-
-    def _groups(self, width: int) -> list[list[int]]:
-        """Columns of each part, the naming ones first."""
-        widths, names = self._widths(), list(range(self.left))
-        used = sum(widths[i] + 3 for i in names) + 1
-        groups, room = [list(names)], width - used
+        console = need("rich.console").Console
+        terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
+        width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
+        names = list(range(self.left))
+        parts = [names]
         for i in range(self.left, len(self.columns)):
-            if widths[i] + 3 > room and len(groups[-1]) > self.left:
-                groups.append(list(names))
-                room = width - used
-            groups[-1].append(i)
-            room -= widths[i] + 3
-        return groups
+            if len(parts[-1]) > self.left and sum(widths[j] for j in (*parts[-1], i)) + 1 > width:
+                parts.append(names)
+            parts[-1] = [*parts[-1], i]
+        for part in parts:
+            title, caption = self.title if part is parts[0] else "", self.caption if part is parts[-1] else ""
+            table = need("rich.table").Table(title=title or None, caption=caption or None)
+            table.title_justify = table.caption_justify = "left"
+            for i in part:
+                table.add_column(lines[0][i], justify="left" if i < self.left else "right", overflow="fold")
+            for line in lines[1:]:
+                table.add_row(*(line[i] for i in part))
+            console(highlight=False, markup=False, width=width).print(table)
 
-    def _part(self, group: Sequence[int], title: str, caption: str) -> Any:
-        table: Any = need("rich.table").Table(
-            title=title or None, caption=caption or None, title_justify="left", caption_justify="left"
-        )
-        for i in group:
-            table.add_column(self.columns[i], justify="left" if i < self.left else "right", overflow="fold")
-        for row in self.rows:
-            table.add_row(*(str(row[i]) for i in group))
-        return table
+
+def format_value(value: Any) -> str:
+    """A cell: numbers with four digits or in whole thousands."""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value)
+
+
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int | None = None) -> str:
+    """A Markdown table; columns after the first ``left`` are aligned right."""
+    left = len(columns) if left is None else left
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (columns, *rows)]
+    return "\n".join([lines[0], "|---" * left + "|---:" * (len(columns) - left) + "|", *lines[1:]])
 
 
 def print_csv(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -81,10 +77,3 @@ def print_csv(rows: Sequence[Mapping[str, Any]]) -> None:
     writer = csv.DictWriter(sys.stdout, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-
-
-def show_table(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "", left: int = 1
-) -> None:
-    """Print a table to stdout; see `Table`."""
-    Table(title, columns, rows, caption, left).show()

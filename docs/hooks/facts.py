@@ -102,7 +102,7 @@ def cost(name: str) -> str:
     """Parameters, state and arithmetic of one cell, counted while the site is built."""
     from arcade_torch.models import make_memory
     from arcade_torch.models.presets import PRESETS
-    from arcade_torch.tools.bench.memories import memory_cost
+    from arcade_torch.tools.bench.memory import memory_cost
 
     lines = [
         "| one cell | parameters | state, numbers | state, bytes | multiply-adds a step |",

@@ -18,7 +18,7 @@ from arcade_torch.envs_jax import BatchedGame, env_keys, make
 from arcade_torch.envs_jax.registry import GAMES
 from arcade_torch.tools.bench.envs import read_all
 from arcade_torch.tools.bench.harness import Measure, Measured, interleaved, machine
-from arcade_torch.tools.tables import show_table
+from arcade_torch.tools.tables import Table
 from tests.parity.reference import PACKAGE, missing, published, resets, without_picture
 
 ENVS, SIZE = 128, 128
@@ -96,7 +96,7 @@ def main() -> int:
     twin = "POMDP" if options.partial else "MDP"
     made = ", ".join(f"{name} {value}" for name, value in {**machine(), PACKAGE: version(PACKAGE)}.items())
     caption = f"published {', '.join(UNFOLDED)} compiled without constant folding; {made}"
-    show_table(f"{twin} twins, Easy, {ENVS} envs, {SIZE} px, every frame consumed", COLUMNS, rows, caption=caption)
+    Table(f"{twin} twins, Easy, {ENVS} envs, {SIZE} px, every frame consumed", COLUMNS, rows, caption).show()
     return 0
 
 

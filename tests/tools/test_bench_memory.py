@@ -9,8 +9,8 @@ from arcade_torch.models import linear_scan, lru
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.back_ends import bench_back_ends
 from arcade_torch.tools.bench.harness import KINDS, REST, op_breakdown, peak_bytes
-from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, bench_saliency, forms, looped
-from arcade_torch.tools.bench.scans import FORMS, unbind_loop
+from arcade_torch.tools.bench.memory import LOOPS, TORCH_GRU, bench_saliency, forms
+from arcade_torch.tools.bench.scans import FORMS
 from arcade_torch.tools.files import read_csv
 
 
@@ -35,10 +35,10 @@ def test_a_model_and_the_same_with_its_loop_agree(name: str) -> None:
     assert compared[TORCH_GRU, "torch"](x, is_init).shape == (2, 20, 9)
 
 
-def test_the_loop_is_the_scan_inside_only() -> None:
-    with pytest.raises(RuntimeError), looped("lru"):
-        assert lru.linear_scan is unbind_loop
-        raise RuntimeError
+def test_a_loop_that_fails_leaves_the_scan_as_it_was() -> None:
+    loop = forms(["lru"], 1, 9)["lru", "loop"]
+    with pytest.raises(ValueError, match="must be"):
+        loop(torch.randn(2, 20, 8), torch.zeros(2, 20, dtype=torch.bool))
     assert lru.linear_scan is linear_scan
 
 

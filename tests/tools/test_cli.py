@@ -103,7 +103,7 @@ def test_a_corrupt_checkpoint_is_one_line(capsys: pytest.CaptureFixture[str], tm
 
 def test_a_corrupt_study_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     (tmp_path / "study.json").write_text("{")
-    assert "is not valid JSON" in one_error(capsys, ["report", str(tmp_path)])
+    assert "does not hold JSON" in one_error(capsys, ["report", str(tmp_path)])
     (tmp_path / "study.json").write_text('{"study": {"name": "x"}}')
     assert "does not describe a study" in one_error(capsys, ["report", str(tmp_path)])
 

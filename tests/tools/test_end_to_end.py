@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arcade_torch.tools import cli, players
-from arcade_torch.tools.bench.envs import NAMES, bench_envs, read_all
+from arcade_torch.tools import cli, keep_memory, players
+from arcade_torch.tools.bench.envs import read_all
+from arcade_torch.tools.figures.throughput import NEEDED
 from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.studies.folder import StudyFolder
 
@@ -119,16 +120,29 @@ def test_reference_returns_are_computed_once(tmp_path: Path, monkeypatch: pytest
     assert players.references("MineSweeperEasy", tmp_path, episodes=16) == found
 
 
-def test_the_benchmark_consumes_every_frame_it_counts() -> None:
-    rows = {row.measure: row for row in bench_envs(["MineSweeperEasy"], (128,), (2,), seconds=0.01, repeats=2)}
-    assert list(rows) == list(NAMES)
+def test_the_benchmark_consumes_every_frame_it_counts(tmp_path: Path) -> None:
+    words = ["--games", "MineSweeperEasy", "--batches", "2", "--seconds", "0.01", "--repeats", "2"]
+    assert cli.main(["bench", "envs", *words, "--out", str(tmp_path / "b.csv")]) == 0
+    rows = {row["measure"]: row for row in read_csv(tmp_path / "b.csv")}
+    assert list(rows) == ["step+draw", "step", "env", "collector", "fill", "copy"]
     for name in ("step+draw", "env", "collector"):
-        row = rows[name]
-        assert row.frames >= 4 and row.frames % 2 == 0 and row.checksum > 0
-        assert 0 < row.frames_per_s_with_check < row.frames_per_s
-        assert row.gb_per_s == pytest.approx(row.frames_per_s * 49_152 / 1e9)
-    assert rows["fill"].share_of_fill == 1 and rows["copy"].share_of_copy == 1
-    assert rows["step"].gb_per_s == 0
+        row = {key: float(rows[name][key]) for key in NEEDED if "frames" in key}
+        assert row["frames"] >= 4 and row["frames"] % 2 == 0 and int(rows[name]["checksum"]) > 0
+        assert 0 < row["frames_per_s_with_check"] < row["frames_per_s"]
+        assert float(rows[name]["gb_per_s"]) == pytest.approx(row["frames_per_s"] * 49_152 / 1e9, rel=1e-3)
+    assert float(rows["fill"]["share_of_fill"]) == float(rows["copy"]["share_of_copy"]) == 1
+    assert float(rows["step"]["gb_per_s"]) == 0
+
+
+@pytest.mark.parametrize(("words", "kept"), [([], "no"), (["--keep-memory"], "envs")])
+def test_the_benchmark_leaves_the_c_library_as_a_user_has_it_and_says_so(
+    words: list[str], kept: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[bool] = []
+    monkeypatch.setattr(keep_memory, "keep_freed_memory", lambda: calls.append(True))
+    few = ["--games", "SignpostEasy", "--batches", "1", "--seconds", "0.001", "--repeats", "1"]
+    assert cli.main(["bench", "envs", *few, *words]) == 0
+    assert f"keep_memory {kept}" in capsys.readouterr().out and bool(calls) is bool(words)
 
 
 def test_the_checksum_reads_every_byte() -> None:

@@ -21,7 +21,7 @@ def test_a_line_shows_speed_time_left_returns_loss_exploration_and_step_size() -
     stream = StringIO()
     with TrainBar("run", stream) as bar:
         bar.speed.update(-4.0, 0)  # so that there is a speed at the first row
-        bar.update(ROW)
+        bar.show(ROW)
     line = stream.getvalue()
     assert line.startswith("4,000 of 16,000 frames, ") and " frames/s, " in line and " left; return 0.250, " in line
     assert line.endswith("of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05\n")

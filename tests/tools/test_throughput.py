@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 
 from arcade_torch.tools import cli
-from arcade_torch.tools.bench import external_envs
 from arcade_torch.tools.figures import throughput
 from arcade_torch.tools.files import read_csv, write_csv
 
@@ -18,7 +17,6 @@ def write_bench(path: Path, **changes: Any) -> Path:
     rows = [
         {"game": game, "obs_size": 128, "num_envs": count, "measure": name, "frames": 10}
         | {"frames_per_s": 2 * rate * times * count, "frames_per_s_with_check": rate * times * count}
-        | throughput.this_machine()
         | changes
         for times, game in ((1, "AEasy"), (2, "BEasy"))
         for count in (1, 16)
@@ -27,9 +25,10 @@ def write_bench(path: Path, **changes: Any) -> Path:
     return write_csv(path, rows, list(rows[0]))
 
 
-def figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, list[dict[str, str]]]:
+def figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[dict[str, str]]:
     assert cli.main(["figure", "throughput", "--runs", str(tmp_path / "b.csv"), "--out", str(tmp_path)]) == cli.EXIT_OK
-    return capsys.readouterr().out, read_csv(tmp_path / "throughput.csv")
+    capsys.readouterr()
+    return read_csv(tmp_path / "throughput.csv")
 
 
 def rate(rows: list[dict[str, str]], series: str, kind: str, envs: int) -> float:
@@ -37,39 +36,13 @@ def rate(rows: list[dict[str, str]], series: str, kind: str, envs: int) -> float
     return next(float(row["frames_per_s"]) for row in rows if (row["series"], row["kind"], row["num_envs"]) == key)
 
 
-def test_rates_are_those_with_every_frame_consumed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(throughput, "installed", list)
+def test_rates_are_those_with_every_frame_consumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_bench(tmp_path / "b.csv")
-    text, rows = figure(tmp_path, capsys)
-    assert "not compared, not installed: gymnax, ale_py" in text
+    rows = figure(tmp_path, capsys)
     assert (tmp_path / "throughput.png").read_bytes().startswith(b"\x89PNG")
     assert rate(rows, "BEasy", "drawing", 16) == 3200 and rate(rows, "BEasy", "no drawing", 16) == 32000
     assert rate(rows, "compiled step", "mean or other", 1) == 150
     assert rate(rows, "writing the same bytes", "mean or other", 16) == 120_000
-
-
-def test_other_packages_join_only_on_the_machine_of_the_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(throughput, "installed", lambda: ["gymnax"])
-    fake = [external_envs.Other("gymnax CartPole-v1", False, [7.0, 9.0])]
-    monkeypatch.setattr(throughput, "bench_others", lambda packages, batches: iter(fake))
-    write_bench(tmp_path / "b.csv")
-    text, rows = figure(tmp_path, capsys)
-    assert "not compared, not installed: ale_py" in text
-    assert rate(rows, "gymnax CartPole-v1 (no pixels)", "mean or other", 16) == 9
-    write_bench(tmp_path / "b.csv", cores=4096)
-    text, rows = figure(tmp_path, capsys)
-    assert "measured elsewhere (its cores is '4096'" in text and not any("gymnax" in row["series"] for row in rows)
-
-
-@pytest.mark.parametrize("package", list(external_envs.PACKAGES))
-def test_other_packages_are_measured_where_they_are_installed(package: str) -> None:
-    pytest.importorskip(package)
-    for found in external_envs.bench_others([package], [1, 2], seconds=0.01, repeats=1):
-        assert len(found.rates) == 2 and min(found.rates) > 0
 
 
 def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,16 +2,15 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from functools import partial
 from statistics import median
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
 
 from arcade_torch.models.scan import BACK_ENDS, linear_scan_loop
+from arcade_torch.tools.bench.scans import random_scan
 
-RESETS = 0.02
-"""Share of the steps that open an episode."""
 FORWARD_TENSORS, BACKWARD_TENSORS = 3, 5
 """Tensors [B, T, H] that have to be read or written: a, b, h; and a, h, the gradients of h, a and b."""
 FLUSHED = 256 * 2**20
@@ -19,8 +18,7 @@ FLUSHED = 256 * 2**20
 queue the work, so that neither a warm cache nor the launch is measured."""
 
 
-@dataclass(frozen=True)
-class BackEndRow:
+class BackEndRow(NamedTuple):
     """One back end at one length."""
 
     back_end: str
@@ -62,51 +60,31 @@ def bench_back_ends(
     *,
     names: Sequence[str] = ("triton", "doubling", "serial"),
     repeats: int = 20,
-    tell: Callable[[str], None] = lambda text: None,
 ) -> Iterator[BackEndRow]:
     """Measure the operators themselves, without autograd, float32 and complex64."""
     for length in steps:
-        for dtype in (torch.float32, torch.complex64):
-            numbers = "complex" if dtype.is_complex else "real"
-            tell(f"back ends on {device}, T = {length}, {numbers}")
-            tensors = _tensors(length, batch, size, dtype, device)
-            copies = [
-                device_ms(_copy(count * tensors[0].numel() // 2, dtype, device), device, repeats)
-                for count in (FORWARD_TENSORS, BACKWARD_TENSORS)
-            ]
+        for dtype, numbers in ((torch.float32, "real"), (torch.complex64, "complex")):
+            a, b, start = (x.to(device) for x in random_scan(batch, length, size, dtype))
+            h0, grad = torch.randn_like(b[:, 0]), torch.randn_like(b)
+            double = torch.complex128 if dtype.is_complex else torch.float64
+            exact = linear_scan_loop(a.cpu().to(double), b.cpu().to(double), start.cpu(), h0.cpu().to(double))
+            copies = []
+            for tensors in (FORWARD_TENSORS, BACKWARD_TENSORS):  # a copy reads and writes
+                source = torch.zeros(tensors * b.numel() // 2, dtype=dtype, device=device)
+                target = torch.empty_like(source)
+                copies.append(device_ms(partial(target.copy_, source), device, repeats))
             for name in names:
-                yield _measure(name, tensors, copies, numbers, repeats)
-
-
-def _tensors(length: int, batch: int, size: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
-    """a with |a| < 1, b, start, h0 and the gradient that arrives."""
-    a, b, grad = (torch.randn(batch, length, size, dtype=dtype) for _ in "abg")
-    a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, length, size)
-    start, h0 = torch.rand(batch, length) < RESETS, torch.randn(batch, size, dtype=dtype)
-    return tuple(x.to(device) for x in (a, b, start, h0, grad))
-
-
-def _copy(count: int, dtype: torch.dtype, device: torch.device) -> Callable[[], object]:
-    source = torch.zeros(count, dtype=dtype, device=device)
-    target = torch.empty_like(source)
-    return lambda: target.copy_(source)
-
-
-def _measure(name: str, tensors: tuple[Tensor, ...], copies: Sequence[float], numbers: str, repeats: int) -> BackEndRow:
-    a, b, start, h0, grad = tensors
-    forward, backward = BACK_ENDS[name]
-    h = forward(a, b, start, h0)
-    double = torch.complex128 if h.is_complex() else torch.float64
-    exact = linear_scan_loop(a.cpu().to(double), b.cpu().to(double), start.cpu(), h0.cpu().to(double))
-    forward_ms = device_ms(lambda: forward(a, b, start, h0), h.device, repeats)
-    backward_ms = device_ms(lambda: backward(a, start, h0, h, grad), h.device, repeats)
-    return BackEndRow(
-        name,
-        b.shape[1],
-        numbers,
-        forward_ms,
-        backward_ms,
-        copies[0] / forward_ms,
-        copies[1] / backward_ms,
-        float((h.cpu() - exact).abs().max()),
-    )
+                forward, backward = BACK_ENDS[name]
+                h = forward(a, b, start, h0)
+                calls = (partial(forward, a, b, start, h0), partial(backward, a, start, h0, h, grad))
+                forward_ms, backward_ms = (device_ms(call, device, repeats) for call in calls)
+                yield BackEndRow(
+                    name,
+                    length,
+                    numbers,
+                    forward_ms,
+                    backward_ms,
+                    forward_share=copies[0] / forward_ms,
+                    backward_share=copies[1] / backward_ms,
+                    error=float((h.cpu() - exact).abs().max()),
+                )

@@ -4,9 +4,9 @@ Every frame is consumed. Frames are results of the compiled call, so they must b
 reads every byte. The checksum has a clock of its own: rates are given without it and with it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import cycle, product
 from typing import Any
 
 import jax
@@ -17,26 +17,20 @@ import torch
 import arcade_torch
 from arcade_torch.envs_jax import make, registered_ids
 from arcade_torch.envs_jax.batch import BatchedGame, env_keys
-from arcade_torch.tools.bench.harness import Measure, Measured, interleaved
+from arcade_torch.tools.bench.harness import Measure, interleaved
+from arcade_torch.tools.bench.registry import BenchOptions
 
 WINDOW_BYTES = 2**27
 """Pixels in a collector's window, at most, unless 4 steps need more."""
 
-NAMES = {
-    "step+draw": "compiled step, auto-reset, drawing",
-    "step": "the same without drawing",
-    "env": "ArcadeEnv.step_and_maybe_reset",
-    "collector": "ArcadeCollector.collect, random actions",
-    "fill": "plain fill of the same bytes",
-    "copy": "plain copy of the same bytes",
-}
-
 
 @dataclass
-class Options:
+class Options(BenchOptions):
     """Frames per second of games at several batch sizes, every frame consumed by a checksum.
 
-    Beside frames/s stand GB/s and the share of a plain fill and of a plain copy of the same bytes in the same run.
+    Measured are the compiled step with auto-reset (step+draw; step: without drawing), ArcadeEnv.step_and_maybe_reset
+    (env), ArcadeCollector.collect with random actions (collector), and a plain fill and a plain copy of the same bytes.
+    Beside frames/s stand GB/s and the share of that fill and that copy in the same run.
 
     Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
     """
@@ -51,8 +45,6 @@ class Options:
     """For each measure in each repeat."""
     repeats: int = 5
     """Turns; medians are shown."""
-    out: Path | None = None
-    """File for the numbers, .csv or .json; overwritten."""
 
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -62,91 +54,29 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
-    for row in bench_envs(games, options.sizes, options.batches, options.seconds, options.repeats, tell):
-        yield "envs", asdict(row)
+    if (count := min(options.batches)) < 1:
+        raise ValueError(f"a batch holds at least 1 env, got {count}")
+    for game, size in product(games, options.sizes):
+        make(game, obs_size=size)  # refuse what does not exist before anything is measured
+    for game, size, count in product(games, options.sizes, options.batches):
+        log(f"{game}, {size} px, {count} envs")
+        for row in measure_game(game, size, count, options.seconds, options.repeats):
+            yield "envs", row
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the result.
-
-    Attributes:
-        game: environment id.
-        obs_size: side of the frames, pixels.
-        num_envs: batch size.
-        measure: key of `NAMES`.
-        frames: frames made and consumed.
-        frames_per_s: median over repeats, checksum left out.
-        frames_per_s_with_check: the same with the checksum inside the clock.
-        gb_per_s: bytes of frames per second / 1e9 (0 where nothing is drawn).
-        share_of_fill: gb_per_s over that of the plain fill.
-        share_of_copy: gb_per_s over that of the plain copy.
-        checksum: over every byte of every frame (of every reward, where nothing is drawn), modulo 2**64.
-    """
-
-    game: str
-    obs_size: int
-    num_envs: int
-    measure: str
-    frames: int
-    frames_per_s: float
-    frames_per_s_with_check: float
-    gb_per_s: float
-    share_of_fill: float
-    share_of_copy: float
-    checksum: int
-
-
-def bench_envs(
-    games: Sequence[str],
-    sizes: Sequence[int] = (128,),
-    batches: Sequence[int] = (1, 16, 128, 512),
-    seconds: float = 0.5,
-    repeats: int = 5,
-    tell: Callable[[str], None] = lambda text: None,
-) -> list[Row]:
-    """Measure games at batch and picture sizes."""
-    for count in batches:
-        if count < 1:
-            raise ValueError(f"a batch holds at least 1 env, got {count}")
-    for game in games:
-        for size in sizes:
-            make(game, obs_size=size)
-    rows: list[Row] = []
-    for game in games:
-        for size in sizes:
-            for count in batches:
-                tell(f"{game}, {size} px, {count} envs")
-                rows += _configuration(game, size, count, seconds, repeats)
-    return rows
-
-
-def _configuration(game: str, size: int, count: int, seconds: float, repeats: int) -> list[Row]:
-    frame_bytes = size * size * 3
+def measure_game(game: str, size: int, count: int, seconds: float, repeats: int) -> Iterator[dict[str, Any]]:
+    """One row a measure; ``frames`` were made and consumed, ``gb_per_s`` is 0 where nothing is drawn."""
     measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
     found = interleaved(measures, seconds, repeats)
-    rate = {name: frame_bytes * result.rate / 1e9 for name, result in found.items()}
-    return [_row(game, size, count, name, found[name], rate) for name in NAMES]
-
-
-def _row(game: str, size: int, count: int, name: str, result: Measured, rate: dict[str, float]) -> Row:
-    drawn = rate[name] if name != "step" else 0.0
-    return Row(
-        game,
-        size,
-        count,
-        name,
-        result.units,
-        result.rate,
-        result.rate_with_check,
-        drawn,
-        drawn / rate["fill"],
-        drawn / rate["copy"],
-        result.checksum,
-    )
+    drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {"step": 0.0}
+    for name, result in found.items():
+        row: dict[str, Any] = {"game": game, "obs_size": size, "num_envs": count, "measure": name}
+        row |= {"frames": result.units, "frames_per_s": result.rate, "frames_per_s_with_check": result.rate_with_check}
+        row |= {"gb_per_s": drawn[name], **{f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}}
+        yield row | {"checksum": result.checksum}
 
 
 def read_all(frames: Any) -> int:
@@ -160,7 +90,8 @@ def _bare(game: str, size: int, count: int) -> dict[str, Measure]:
     batched = BatchedGame(make(game, obs_size=size))
     partial = jnp.arange(count) % 2 == 1
     state = {name: batched.init(env_keys(0, count), partial) for name in ("step+draw", "step")}
-    actions = _actions(count)
+    rng = np.random.default_rng(0)
+    actions = cycle([jnp.asarray(rng.integers(0, 5, count), jnp.int32) for _ in range(64)])  # made outside the clock
 
     @jax.jit
     def step(batch: Any, action: Any) -> Any:
@@ -175,18 +106,10 @@ def _bare(game: str, size: int, count: int) -> dict[str, Measure]:
         state["step"], reward = step(state["step"], next(actions))
         return reward.block_until_ready()
 
-    return {
-        "step+draw": Measure(draw_work, read_all, count),
-        "step": Measure(step_work, lambda reward: int(np.asarray(reward).view(np.int32).astype(np.int64).sum()), count),
-    }
+    def read_rewards(reward: Any) -> int:
+        return int(np.asarray(reward).view(np.int32).astype(np.int64).sum())
 
-
-def _actions(count: int) -> Any:
-    """Endless random actions, int32 [N]; made ahead, so that making them is not timed."""
-    rng = np.random.default_rng(0)
-    made = [jnp.asarray(rng.integers(0, 5, count), jnp.int32) for _ in range(64)]
-    while True:
-        yield from made
+    return {"step+draw": Measure(draw_work, read_all, count), "step": Measure(step_work, read_rewards, count)}
 
 
 def window_steps(size: int, count: int) -> int:
@@ -202,18 +125,16 @@ def window_steps(size: int, count: int) -> int:
 
 def _bridge(game: str, size: int, count: int) -> dict[str, Measure]:
     """The TorchRL environment and our collector."""
-    env = arcade_torch.make(game, num_envs=count, obs_size=size)
-    other = arcade_torch.make(game, num_envs=count, obs_size=size)
+    env, other = (arcade_torch.make(game, num_envs=count, obs_size=size) for _ in range(2))
     steps = window_steps(size, count)
     collector = arcade_torch.ArcadeCollector(other, None, frames_per_batch=count * steps)
     generator = torch.Generator().manual_seed(0)
-    actions = [torch.randint(5, (count,), generator=generator).to(env.device) for _ in range(64)]
-    kept: dict[str, Any] = {"td": env.reset(), "step": 0}
+    actions = cycle([torch.randint(5, (count,), generator=generator).to(env.device) for _ in range(64)])
+    now = [env.reset()]
 
     def env_work() -> Any:
-        kept["step"] += 1
-        _, kept["td"] = env.step_and_maybe_reset(kept["td"].set("action", actions[kept["step"] % 64]))
-        return kept["td"].get("pixels")
+        _, now[0] = env.step_and_maybe_reset(now[0].set("action", next(actions)))
+        return now[0].get("pixels")
 
     return {
         "env": Measure(env_work, read_all, count),
@@ -226,8 +147,8 @@ def _plain(size: int, count: int) -> dict[str, Measure]:
     device = "cuda" if torch.cuda.is_available() and jax.default_backend() == "gpu" else "cpu"
     target = torch.zeros(count, size, size, 3, dtype=torch.uint8, device=device)
     source = torch.randint(256, target.shape, dtype=torch.uint8, device=device)
-    value = iter(range(10**12))
+    value = cycle(range(256))
     return {
-        "fill": Measure(lambda: target.fill_(next(value) % 256), read_all, count),
+        "fill": Measure(lambda: target.fill_(next(value)), read_all, count),
         "copy": Measure(lambda: target.copy_(source), read_all, count),
     }

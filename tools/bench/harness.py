@@ -1,4 +1,4 @@
-"""What all benchmarks share: measures in turns, every result consumed, the machine, memory and kinds of operation.
+"""What all benchmarks share: measures in turns with every result consumed, the machine, memory, kinds of operation.
 
 Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is torch's, which waits for
 the device.
@@ -8,7 +8,8 @@ import os
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 from statistics import median
 from typing import Any
 
@@ -26,31 +27,9 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-@dataclass
-class Measured:
-    """What one measure did over all repeats.
-
-    Attributes:
-        rates: units per second of each repeat, the check of the results left out.
-        rates_with_check: the same with the check inside the clock.
-        units: how many were made and consumed in all timed repeats.
-        checksum: sum over everything that was made, modulo 2**64.
-    """
-
-    rates: list[float]
-    rates_with_check: list[float]
-    units: int = 0
-    checksum: int = 0
-
-    @property
-    def rate(self) -> float:
-        """Median units per second."""
-        return median(self.rates)
-
-    @property
-    def rate_with_check(self) -> float:
-        """Median units per second with the check inside the clock."""
-        return median(self.rates_with_check)
+def no_check(_: object) -> int:
+    """The check of eager torch, which computes all that it is asked for: there is nothing to consume."""
+    return 0
 
 
 @dataclass(frozen=True)
@@ -64,45 +43,73 @@ class Measure:
     """
 
     work: Callable[[], object]
-    check: Callable[[object], int]
-    units: int
+    check: Callable[[Any], int] = no_check
+    units: int = 1
 
 
-def no_check(_: object) -> int:
-    """The check of eager torch on a CPU, which computes all that it is asked for: there is nothing to consume."""
-    return 0
+@dataclass
+class Measured:
+    """What one measure did over all repeats.
+
+    Attributes:
+        rates: units per second of each repeat, the check of the results left out.
+        rates_with_check: the same with the check inside the clock.
+        units: how many were made and consumed in all timed repeats.
+        checksum: sum over everything that was made, modulo 2**64.
+    """
+
+    rates: list[float] = field(default_factory=list)
+    rates_with_check: list[float] = field(default_factory=list)
+    units: int = 0
+    checksum: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Median units per second."""
+        return median(self.rates)
+
+    @property
+    def rate_with_check(self) -> float:
+        """Median units per second with the check inside the clock."""
+        return median(self.rates_with_check)
+
+    @property
+    def best_ms(self) -> float:
+        """Milliseconds a unit in the best repeat."""
+        return 1e3 / max(self.rates)
 
 
 def interleaved(
-    measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 2
+    measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 3
 ) -> dict[str, Measured]:
-    """Time several measures in turns."""
-    if seconds <= 0 or repeats < 1:
-        raise ValueError(f"seconds must be above 0 and repeats at least 1, got {seconds} and {repeats}")
+    """Time several things in turns.
+
+    Args:
+        measures: name -> what to time.
+        seconds: for each measure in each repeat; at least one ``work`` is done.
+        repeats: number of turns.
+        warm_ups: how often each is done before, outside the clock.
+    """
+    from torch.utils.benchmark import timer
+
     for measure in measures.values():
         for _ in range(warm_ups):
             measure.check(measure.work())
-    found = {name: Measured([], []) for name in measures}
+    found = {name: Measured() for name in measures}
     for _ in range(repeats):
         for name, measure in measures.items():
-            _repeat(measure, found[name], seconds)
+            into, units, working, checking = found[name], 0, 0.0, 0.0
+            while units == 0 or working + checking < seconds:
+                start = timer()
+                result = measure.work()
+                middle = timer()
+                into.checksum = (into.checksum + measure.check(result)) % 2**64
+                end = timer()
+                working, checking, units = working + middle - start, checking + end - middle, units + measure.units
+            into.units += units
+            into.rates.append(units / working)
+            into.rates_with_check.append(units / (working + checking))
     return found
-
-
-def _repeat(measure: Measure, into: Measured, seconds: float) -> None:
-    from torch.utils.benchmark import timer
-
-    units, working, checking = 0, 0.0, 0.0
-    while units == 0 or working + checking < seconds:
-        start = timer()
-        result = measure.work()
-        middle = timer()
-        into.checksum = (into.checksum + measure.check(result)) % 2**64
-        end = timer()
-        working, checking, units = working + middle - start, checking + end - middle, units + measure.units
-    into.units += units
-    into.rates.append(units / working)
-    into.rates_with_check.append(units / (working + checking))
 
 
 def machine() -> dict[str, Any]:
@@ -113,12 +120,11 @@ def machine() -> dict[str, Any]:
     from arcade_torch.tools.versions import versions
 
     device = jax.devices()[0]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "jax_device": f"{device.platform} ({device.device_kind})",
         "torch_device": "cuda" if torch.cuda.is_available() else "cpu",
         "processor": platform.processor() or platform.machine(),
-        "cores": cores,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "torch_threads": torch.get_num_threads(),
         **versions(),
     }
@@ -136,11 +142,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
         work()
     events = [event for event in run.profiler.kineto_results.events() if event.name() == "[memory]"]
     events.sort(key=lambda event: event.start_ns())
-    held = most = 0
-    for event in events:
-        held += event.nbytes()
-        most = max(most, held)
-    return most
+    return max(accumulate((int(event.nbytes()) for event in events), initial=0))
 
 
 KINDS = {

@@ -1,25 +1,25 @@
-"""Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency."""
+"""Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency; costs."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from arcade_torch.models import fast_weights, lru, make_memory, matrix_scan_loop, memory_names, mingru
 from arcade_torch.tools.bench.back_ends import bench_back_ends
-from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, peak_bytes, torch_threads
-from arcade_torch.tools.bench.scans import bench_scans, unbind_loop
+from arcade_torch.tools.bench.harness import Measure, interleaved, peak_bytes, torch_threads
+from arcade_torch.tools.bench.registry import BenchOptions
+from arcade_torch.tools.bench.scans import RESETS, Run, bench_scans, both_passes, time_passes, unbind_loop
 
 TORCH_GRU = "torch.nn.GRU"
-RESETS = 0.02
-"""Share of the steps that open an episode (``torch.nn.GRU`` knows no starts and ignores them)."""
-
-Runs = Callable[[Tensor, Tensor], Tensor]
+"""It knows no starts and ignores them."""
+ACTING_ENVS, MINIBATCH_STEPS = 16, 132
+"""The paper's envs, and the steps of its minibatch of them all: 128 and 4 before them."""
 
 
 def _matrix_loop(*args: Any) -> tuple[Tensor, Tensor]:
@@ -36,11 +36,12 @@ LOOPS: dict[str, tuple[Any, str, Callable[..., Any]]] = {
 
 
 @dataclass
-class Options:
+class Options(BenchOptions):
     """Time and memory of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; of saliency.
 
-    Measures take turns; the best turn counts. Peak memory is what torch's allocator had handed out, the same on every
-    machine. With a CUDA device, a further table has the back ends of the scan there, as shares of the speed of a copy.
+    Measures take turns; the best turn counts. Peak memory is what torch's allocator had handed out in both passes above
+    what stood before (weights and input), the same on every machine. With a CUDA device, a further table has the back
+    ends of the scan there, as shares of the speed of a copy.
 
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
@@ -63,8 +64,6 @@ class Options:
     """For each measure in each repeat, at least one pass."""
     repeats: int = 3
     """Turns."""
-    out: Path | None = None
-    """File for the numbers: .json, or .csv with the name of the table added; overwritten."""
 
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -77,22 +76,69 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the tables ``models``, ``scans``, ``saliency`` and, with CUDA, ``back_ends``."""
-    if min((1, *options.steps, *options.layers, options.size, options.batch, options.threads, options.frames)) < 1:
+    batch, size, how = options.batch, options.size, (options.seconds, options.repeats)
+    if min((1, *options.steps, *options.layers, size, batch, options.threads, options.frames)) < 1:
         raise ValueError("steps, layers, size, batch, frames and threads must be at least 1")
-    how: dict[str, Any] = {"threads": options.threads, "seconds": options.seconds, "repeats": options.repeats}
-    names = options.memories or tuple(memory_names())
-    for row in bench_memory(names, options.steps, options.layers, options.size, options.batch, tell=tell, **how):
-        yield "models", asdict(row)
-    for scan in bench_scans(options.steps, options.batch, options.size, tell=tell, **how):
-        yield "scans", asdict(scan)
-    tell("saliency")
     with torch_threads(options.threads):
-        yield from (("saliency", row) for row in bench_saliency(options.frames, options.seconds, options.repeats))
+        for steps in options.steps:
+            for layers in options.layers:
+                log(f"memory models, T = {steps}, layers: {layers}")
+                compared = forms(options.memories or memory_names(), layers, size)
+                yield from (("models", row) for row in bench_models(compared, layers, (batch, steps, size), *how))
+        for steps in options.steps:
+            log(f"scans, T = {steps}")
+            yield from (("scans", row) for row in bench_scans(batch, steps, size, *how))
+        log("saliency")
+        yield from (("saliency", row) for row in bench_saliency(options.frames, *how))
     if torch.cuda.is_available():
-        for back_end in bench_back_ends(torch.device("cuda"), options.steps, options.batch, options.size, tell=tell):
-            yield "back_ends", asdict(back_end)
+        log("back ends on CUDA")
+        for row in bench_back_ends(torch.device("cuda"), options.steps, batch, size):
+            yield "back_ends", row._asdict()
+
+
+class Stack(nn.Module):
+    """Cells one above the other and nothing between, from their initial states: what ``torch.nn.GRU`` does too."""
+
+    def __init__(self, name: str, layers: int, size: int) -> None:
+        super().__init__()
+        self.cells = nn.ModuleList(make_memory(name, size, size) for _ in range(layers))
+
+    def forward(self, x: Tensor, is_init: Tensor) -> Tensor:
+        """[B, T, H] to [B, T, H]."""
+        for cell in self.cells:
+            x, _ = cell(x, cell.initial_state(len(x)), is_init)  # type: ignore[operator]
+        return x
+
+
+def forms(names: Sequence[str], layers: int, size: int) -> dict[tuple[str, str], Run]:
+    """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T]) to y."""
+    found: dict[tuple[str, str], Run] = {}
+    for name in names:
+        stack = Stack(name, layers, size)
+        found[name, "scan" if name in LOOPS else "own"] = stack
+        if name in LOOPS:
+            found[name, "loop"] = patch.object(*LOOPS[name])(stack.forward)
+    gru = nn.GRU(size, size, num_layers=layers, batch_first=True)
+    found[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
+    return found
+
+
+def _learn(y: Tensor) -> None:
+    y.square().mean().backward()
+
+
+def bench_models(
+    compared: dict[tuple[str, str], Run], layers: int, shape: tuple[int, int, int], seconds: float, repeats: int
+) -> Iterator[dict[str, Any]]:
+    """Models over whole sequences [B, T, H] in turns, one row each."""
+    inputs = (torch.randn(shape), torch.rand(shape[:2]) < RESETS)
+    times = time_passes(compared, _learn, inputs, seconds, repeats)
+    for (model, form), work in compared.items():
+        peak = peak_bytes(both_passes(work, _learn, inputs)) / 2**20
+        about = {"model": model, "form": form, "layers": layers, "steps": shape[1]}
+        yield about | times[model, form] | {"peak_mib": peak}
 
 
 def bench_saliency(frames: int, seconds: float, repeats: int) -> list[dict[str, Any]]:
@@ -115,129 +161,52 @@ def bench_saliency(frames: int, seconds: float, repeats: int) -> list[dict[str, 
         "two stages": partial(saliency, network, seen, actions, starts),
         "whole network": whole,
     }
-    found = interleaved({way: Measure(work, no_check, 1) for way, work in ways.items()}, seconds, repeats, warm_ups=1)
+    found = interleaved({way: Measure(work) for way, work in ways.items()}, seconds, repeats, warm_ups=1)
     return [
-        {"way": way, "frames": frames, "both_ms": 1e3 / max(found[way].rates), "peak_mib": peak_bytes(work) / 2**20}
+        {"way": way, "frames": frames, "both_ms": found[way].best_ms, "peak_mib": peak_bytes(work) / 2**20}
         for way, work in ways.items()
     ]
 
 
-@dataclass(frozen=True)
-class Row:
-    """What one model costs over a whole sequence.
+class MemoryCost(NamedTuple):
+    """What one cell needs, whatever the machine."""
 
-    Attributes:
-        model: name.
-        form: "scan" or "loop" for models that have both, "torch" for ``torch.nn.GRU``, else "own".
-        layers: cells one above the other.
-        steps: T.
-        forward_ms: milliseconds of the forward pass alone, best turn.
-        both_ms: of forward and backward pass.
-        peak_mib: most memory that torch's allocator had handed out at a time in both passes, above what stood before
-            (weights and input), MiB; see `peak_bytes`.
-    """
-
-    model: str
-    form: str
-    layers: int
-    steps: int
-    forward_ms: float
-    both_ms: float
-    peak_mib: float
+    parameters: int
+    state_numbers: int
+    """Numbers in the recurrent state of one env."""
+    state_bytes: int
+    products: int
+    """Multiply-adds in matrix products of one acting step (forward, one env); elementwise work is left out."""
 
 
-class Stack(nn.Module):
-    """Cells one above the other and nothing between, from their initial states: what ``torch.nn.GRU`` does too."""
-
-    def __init__(self, name: str, layers: int, size: int) -> None:
-        super().__init__()
-        self.cells = nn.ModuleList(make_memory(name, size, size) for _ in range(layers))
-
-    def forward(self, x: Tensor, is_init: Tensor) -> Tensor:
-        """[B, T, H] to [B, T, H]."""
-        for cell in self.cells:
-            x, _ = cell(x, cell.initial_state(len(x)), is_init)  # type: ignore[operator]
-        return x
-
-
-@contextmanager
-def looped(name: str) -> Iterator[None]:
-    """Inside, the model's scan is its plain loop."""
-    module, attribute, loop = LOOPS[name]
-    scan = getattr(module, attribute)
-    setattr(module, attribute, loop)
-    try:
-        yield
-    finally:
-        setattr(module, attribute, scan)
+def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
+    """Count what a memory model needs."""
+    state = memory.initial_state(1)  # type: ignore[operator]
+    leaves = list(state.values(True, True))
+    like = next(memory.parameters())
+    x, is_init = like.new_zeros(1, 1, input_size), torch.zeros(1, 1, dtype=torch.bool, device=like.device)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        memory(x, state, is_init)
+    numbers, size_in_bytes = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
+    return MemoryCost(
+        sum(p.numel() for p in memory.parameters()), numbers, size_in_bytes, counter.get_total_flops() // 2
+    )
 
 
-def forms(names: Sequence[str], layers: int, size: int) -> dict[tuple[str, str], Runs]:
-    """What is compared: (model, form) -> (x [B, T, H], is_init [B, T]) to y."""
-    found: dict[tuple[str, str], Runs] = {}
+def time_memories(
+    names: Sequence[str], size: int, *, seconds: float = 0.3, repeats: int = 3
+) -> dict[str, tuple[float, float]]:
+    """Microseconds of one cell for one step of one env, on one thread: acting (16 envs), learning (16 x 132 steps)."""
+    cells = {}
     for name in names:
-        stack = Stack(name, layers, size)
-        found[name, "scan" if name in LOOPS else "own"] = stack
-        if name in LOOPS:
-            found[name, "loop"] = _in_a_loop(name, stack)
-    gru = nn.GRU(size, size, num_layers=layers, batch_first=True)
-    found[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
-    return found
-
-
-def _in_a_loop(name: str, stack: Stack) -> Runs:
-    def run(x: Tensor, is_init: Tensor) -> Tensor:
-        with looped(name):
-            y: Tensor = stack(x, is_init)
-            return y
-
-    return run
-
-
-def bench_memory(
-    names: Sequence[str],
-    steps: Sequence[int] = (132, 1024),
-    layers: Sequence[int] = (1, 2),
-    size: int = 512,
-    batch: int = 16,
-    *,
-    threads: int = 1,
-    seconds: float = 0.3,
-    repeats: int = 3,
-    tell: Callable[[str], None] = lambda text: None,
-) -> Iterator[Row]:
-    """Measure models over whole sequences, in turns."""
-    with torch_threads(threads):
-        for length in steps:
-            x, is_init = torch.randn(batch, length, size), torch.rand(batch, length) < RESETS
-            for count in layers:
-                tell(f"memory models, T = {length}, layers: {count}")
-                compared = forms(names, count, size)
-                measures = {}
-                for key, run in compared.items():
-                    measures[f"{key} forward"] = Measure(_forward(run, x, is_init), no_check, 1)
-                    measures[f"{key} both"] = Measure(_both(run, x, is_init), no_check, 1)
-                found = interleaved(measures, seconds, repeats, warm_ups=1)
-                best = {key: 1e3 / max(measured.rates) for key, measured in found.items()}
-                for key, run in compared.items():
-                    peak = peak_bytes(_both(run, x, is_init)) / 2**20
-                    yield Row(*key, count, length, best[f"{key} forward"], best[f"{key} both"], peak)
-
-
-def _forward(run: Runs, x: Tensor, is_init: Tensor) -> Callable[[], object]:
-    @torch.no_grad()
-    def work() -> object:
-        return run(x, is_init)
-
-    return work
-
-
-def _both(run: Runs, x: Tensor, is_init: Tensor) -> Callable[[], object]:
-    x = x.clone().requires_grad_()
-
-    def work() -> object:
-        x.grad = None
-        run(x, is_init).square().mean().backward()
-        return x.grad
-
-    return work
+        memory = make_memory(name, size, size)
+        state = memory.initial_state(ACTING_ENVS)  # type: ignore[operator]
+        cells[name] = lambda x, is_init, memory=memory, state=state: memory(x, state, is_init)[0]
+    found = []
+    with torch_threads(1):
+        for steps in (1, MINIBATCH_STEPS):
+            inputs = (torch.randn(ACTING_ENVS, steps, size), torch.rand(ACTING_ENVS, steps) < RESETS)
+            found.append(time_passes(cells, _learn, inputs, seconds, repeats))
+    acting, learning = found
+    act, learn = 1e3 / ACTING_ENVS, 1e3 / (ACTING_ENVS * MINIBATCH_STEPS)
+    return {name: (act * acting[name]["forward_ms"], learn * learning[name]["both_ms"]) for name in names}

@@ -4,16 +4,16 @@ Every step shows one token, one-hot: 0 to 3 are the symbols, 4 to 7 distractors,
 its first step, then ``delay`` distractors, then asks. A quarter of the episodes end before, at any step, and the next
 one begins: windows hold starts in the middle. Only answers are scored; who remembers nothing gets one in four right.
 
-One setting serves every model at every delay (`Setting`): a memory block of one cell with its default options
+One setting serves every model at every delay: a memory block of one cell with its default options
 (`arcade_torch.models.MemoryBlock`) between the tokens and four logits, Adam. The curriculum: while training, half of
 the episodes wait for ``delay`` steps and the others for 1 to ``delay``, drawn evenly. Tests have the full delay alone.
 """
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -21,48 +21,26 @@ from torch import Tensor, nn
 
 from arcade_torch.models import MemoryBlock, memory_names
 from arcade_torch.tools.bench.harness import torch_threads
+from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.files import read_csv, write_between, write_csv
+from arcade_torch.tools.tables import markdown_table
 
 SYMBOLS, DISTRACTORS = 4, 4
 ASK = SYMBOLS + DISTRACTORS
 TOKENS = ASK + 1
-CHANCE = 1 / SYMBOLS
 CUT = 0.25
 """Share of the episodes that end before they ask."""
 UNLABELLED = -100  # what cross_entropy leaves out
-DELAYS = (8, 32, 96)
+SEQUENCES, LEARNING_RATE, MAX_NORM, CHECK_EVERY = 32, 3e-3, 1.0, 25
+"""Of a batch; of Adam; of the gradient; steps between two looks at whether it is solved."""
 SOLVED = 0.99
-FIRST_LOOK = 200  # answers in the test that decides whether the final one is worth its time
+FIRST_LOOK, ANSWERS = 200, 2000
+"""Answers in the test that decides whether the final one is worth its time, and in the final one, at least."""
 BEGIN, END = "<!-- recall -->", "<!-- end of recall -->"
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How all models are trained.
-
-    Attributes:
-        hidden_size: H.
-        rows: sequences in a batch.
-        learning_rate: of Adam.
-        clip: largest norm of the gradient.
-        seconds: budget of training, processor time.
-        check_every: steps between two looks at whether it is solved.
-        answers: number of fresh questions in the final test, at least.
-        seed: of weights and data.
-    """
-
-    hidden_size: int = 64
-    rows: int = 32
-    learning_rate: float = 3e-3
-    clip: float = 1.0
-    seconds: float = 60.0
-    check_every: int = 25
-    answers: int = 2000
-    seed: int = 0
-
-
 @dataclass
-class Options:
+class Options(BenchOptions):
     """Delayed recall: see one of four symbols, wait among distractors, name it when asked.
 
     Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget is spent; chance is
@@ -72,6 +50,7 @@ class Options:
     Example: arcade-torch bench recall lru attention --delays 8 32 --out recall.csv
     """
 
+    resumable: ClassVar[bool] = True
     memories: tuple[str, ...] = ()
     """Memory models; all of them, and attention with several windows, by default."""
     delays: tuple[int, ...] = (8, 32, 96)
@@ -93,35 +72,14 @@ SIZES: dict[str, dict[str, Any]] = {
     "quick": {"memories": ("lru", "mingru", "gru"), "delays": (8,), "seconds": 10.0},
     "full": {},
 }
-KEEPS_ITS_FILE = True
 
 
-def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Rows of the table ``recall``."""
-    if options.seconds <= 0 or options.hidden_size < 1 or not options.delays or min(options.delays) < 1:
-        raise ValueError(
-            "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
-            f"{options.seconds}, {options.hidden_size} and {options.delays}"
-        )
-    cases = [(entry, delay) for entry in entries(options.memories) for delay in options.delays]
-    cases += [] if options.memories else [case for case in CAPACITY if case[1] in options.delays]
-    setting = Setting(hidden_size=options.hidden_size, seconds=options.seconds, seed=options.seed)
-    rows = []
-    with torch_threads(1):
-        for row in measure_all(cases, setting, options.out, tell):
-            rows.append(row)
-            yield "recall", asdict(row)
-    if options.page is not None:
-        write_between(options.page, BEGIN, END, markdown(rows))
-
-
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """A model in the table: its name, number of cells one above the other, and options."""
 
     memory: str
     layers: int = 1
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = {}
 
     @property
     def label(self) -> str:
@@ -130,43 +88,19 @@ class Entry:
         return f"{self.memory}{options}" + (f", {self.layers} layers" if self.layers > 1 else "")
 
 
-@dataclass(frozen=True)
-class Recall:
-    """What one model reached at one delay.
-
-    Attributes:
-        model: label of the entry.
-        delay: steps between the symbol and the question.
-        hidden_size: width of the memory block.
-        seed: of weights and data.
-        accuracy: share of right answers on fresh data at the end, to four places.
-        answers: how many those were.
-        steps: of training, until 99 % of the answers were right or the budget was spent.
-        seconds: processor time of these steps, tests left out, to two places.
-        parameters: of the network.
-        state_numbers: numbers in its recurrent state.
-    """
+class Recall(NamedTuple):
+    """What one model reached at one delay: a row of the table."""
 
     model: str
     delay: int
     hidden_size: int
     seed: int
-    accuracy: float
+    accuracy: float  # share of right answers on fresh data at the end, to four places
     answers: int
-    steps: int
-    seconds: float
+    steps: int  # of training, until 99 % of the answers were right or the budget was spent
+    seconds: float  # processor time of these steps, tests left out, to two places
     parameters: int
     state_numbers: int
-
-    @property
-    def solved(self) -> bool:
-        """Whether 99 % of the final answers were right."""
-        return self.accuracy >= SOLVED
-
-
-def entries(names: Sequence[str] = ()) -> list[Entry]:
-    """One entry a model, with its default options; every registered one by default."""
-    return [Entry(name) for name in names or memory_names()]
 
 
 CAPACITY: tuple[tuple[Entry, int], ...] = (
@@ -179,9 +113,34 @@ CAPACITY: tuple[tuple[Entry, int], ...] = (
 windows of W steps reach L (W - 1) steps back: 31, 33, 32 and 46."""
 
 
-@dataclass(frozen=True)
-class Windows:
-    """A batch of sequences."""
+def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table ``recall``; those that the file holds already are not measured again."""
+    if options.seconds <= 0 or options.hidden_size < 1 or not options.delays or min(options.delays) < 1:
+        raise ValueError(
+            "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
+            f"{options.seconds}, {options.hidden_size} and {options.delays}"
+        )
+    cases = [(Entry(name), delay) for name in options.memories or memory_names() for delay in options.delays]
+    cases += [] if options.memories else [case for case in CAPACITY if case[1] in options.delays]
+    rows = read_recall(options.out) if options.out is not None and options.out.exists() else []
+    known = {row[:4]: row for row in rows}
+    asked = []
+    with torch_threads(1):
+        for entry, delay in cases:
+            key = (entry.label, delay, options.hidden_size, options.seed)
+            if key not in known:
+                log(f"{entry.label}, delay {delay}")
+                known[key] = train(entry, delay, options.hidden_size, options.seconds, options.seed)
+                if options.out is not None:
+                    write_csv(options.out, [row._asdict() for row in known.values()], Recall._fields)
+            asked.append(known[key])
+            yield "recall", known[key]._asdict()
+    if options.page is not None:
+        write_between(options.page, BEGIN, END, markdown(asked))
+
+
+class Windows(NamedTuple):
+    """A batch of sequences: tokens and answers int64 [B, T], is_init bool [B, T]."""
 
     tokens: Tensor
     is_init: Tensor
@@ -190,8 +149,6 @@ class Windows:
 
 def windows(rng: np.random.Generator, rows: int, delay: int, *, mixed: bool = False) -> Windows:
     """Draw sequences of 2 (delay + 2) steps, episode after episode."""
-    if delay < 1:
-        raise ValueError(f"a delay is at least 1 step, got {delay}")
     length = 2 * (delay + 2)
     tokens = SYMBOLS + rng.integers(DISTRACTORS, size=(rows, length))
     starts, answers = np.zeros((rows, length), bool), np.full((rows, length), UNLABELLED)
@@ -220,52 +177,38 @@ class Reader(nn.Module):
         self.block = MemoryBlock(TOKENS, hidden_size, entry.memory, layers=entry.layers, memory_options=options)
         self.head = nn.Linear(hidden_size, SYMBOLS)
 
-    def forward(self, batch: Windows) -> Tensor:
-        """Logits of the four symbols wherever one is asked for, float [answers, 4]."""
+    def forward(self, batch: Windows) -> tuple[Tensor, Tensor]:
+        """Where a symbol is asked for: logits of the four, float [answers, 4], and the right one, int64 [answers]."""
         x = nn.functional.one_hot(batch.tokens, TOKENS).to(self.head.weight.dtype)
         y, _ = self.block(x, self.block.initial_state(len(x)), batch.is_init)
-        logits: Tensor = self.head(y[batch.answers != UNLABELLED])
-        return logits
+        asked = batch.answers != UNLABELLED
+        return self.head(y[asked]), batch.answers[asked]
 
 
-def train(entry: Entry, delay: int, setting: Setting | None = None) -> Recall:
+def train(
+    entry: Entry, delay: int, hidden_size: int = 64, seconds: float = 60.0, seed: int = 0, answers: int = ANSWERS
+) -> Recall:
     """Train one model until it is right or the budget is spent, then test it on fresh data."""
-    setting = setting or Setting()
-    torch.manual_seed(setting.seed)
-    data, tests = (np.random.default_rng([setting.seed, delay, part]) for part in range(2))
-    reader = Reader(entry, setting.hidden_size)
-    optimizer = torch.optim.Adam(reader.parameters(), setting.learning_rate)
-    steps, spent = 0, 0.0
-    while spent < setting.seconds:
+    torch.manual_seed(seed)
+    data, tests = (np.random.default_rng([seed, delay, part]) for part in range(2))
+    reader = Reader(entry, hidden_size)
+    optimizer = torch.optim.Adam(reader.parameters(), LEARNING_RATE)
+    steps, spent, right, answered = 0, 0.0, 0.0, 0
+    while right < SOLVED and spent < seconds:
         began = time.process_time()
-        for _ in range(setting.check_every):
-            batch = windows(data, setting.rows, delay, mixed=True)
-            loss = nn.functional.cross_entropy(reader(batch), batch.answers[batch.answers != UNLABELLED])
+        for _ in range(CHECK_EVERY):
+            loss = nn.functional.cross_entropy(*reader(windows(data, SEQUENCES, delay, mixed=True)))
             optimizer.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(reader.parameters(), setting.clip)
+            nn.utils.clip_grad_norm_(reader.parameters(), MAX_NORM)
             optimizer.step()
-            steps += 1
-        spent += time.process_time() - began
-        if accuracy(reader, tests, delay, FIRST_LOOK)[0] >= SOLVED:
-            right, answers = accuracy(reader, tests, delay, setting.answers)
-            if right >= SOLVED:
-                break
-    else:
-        right, answers = accuracy(reader, tests, delay, setting.answers)
-    state = reader.block.initial_state(1)
-    return Recall(
-        entry.label,
-        delay,
-        setting.hidden_size,
-        setting.seed,
-        round(right, 4),
-        answers,
-        steps,
-        round(spent, 2),
-        sum(p.numel() for p in reader.parameters()),
-        sum(leaf.numel() for leaf in state.values(True, True)),
-    )
+        steps, spent = steps + CHECK_EVERY, spent + time.process_time() - began
+        if accuracy(reader, tests, delay, FIRST_LOOK)[0] >= SOLVED or spent >= seconds:
+            right, answered = accuracy(reader, tests, delay, answers)
+    parameters = sum(p.numel() for p in reader.parameters())
+    state = sum(leaf.numel() for leaf in reader.block.initial_state(1).values(True, True))
+    result = (round(right, 4), answered, steps, round(spent, 2), parameters, state)
+    return Recall(entry.label, delay, hidden_size, seed, *result)
 
 
 @torch.no_grad()
@@ -273,37 +216,17 @@ def accuracy(reader: Reader, rng: np.random.Generator, delay: int, answers: int)
     """Share of right answers to ``answers`` fresh questions or a few more, and how many they were."""
     right = asked = 0
     while asked < answers:
-        batch = windows(rng, 128, delay)
-        wanted = batch.answers[batch.answers != UNLABELLED]
-        right += int((reader(batch).argmax(-1) == wanted).sum())
+        logits, wanted = reader(windows(rng, 128, delay))
+        right += int((logits.argmax(-1) == wanted).sum())
         asked += len(wanted)
     return right / asked, asked
 
 
-def measure_all(
-    cases: Sequence[tuple[Entry, int]],
-    setting: Setting,
-    out: Path | None = None,
-    tell: Callable[[str], None] = lambda text: None,
-) -> Iterator[Recall]:
-    """One case after another; rows that the file holds already are not measured again."""
-    rows = read_recall(out) if out is not None and out.exists() else []
-    known = {(row.model, row.delay, row.hidden_size, row.seed): row for row in rows}
-    for entry, delay in cases:
-        key = entry.label, delay, setting.hidden_size, setting.seed
-        if key not in known:
-            tell(f"{entry.label}, delay {delay}")
-            known[key] = train(entry, delay, setting)
-            if out is not None:
-                write_csv(out, map(asdict, known.values()), [field.name for field in fields(Recall)])
-        yield known[key]
-
-
 def read_recall(path: Path) -> list[Recall]:
-    """The rows of a file that `measure_all` has written."""
-    kinds = {item.name: item.type for item in fields(Recall)}
+    """The rows of a file that an earlier run has written."""
+    kinds = Recall.__annotations__
     try:
-        return [Recall(**{name: kinds[name](row[name]) for name in kinds}) for row in read_csv(path)]  # type: ignore[operator]
+        return [Recall(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in read_csv(path)]
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path} is no table of delayed recall ({error}); choose another --out") from None
 
@@ -311,21 +234,16 @@ def read_recall(path: Path) -> list[Recall]:
 def markdown(rows: Sequence[Recall]) -> str:
     """The rows as a Markdown table: a line a model, a column a delay."""
     delays = sorted({row.delay for row in rows})
-    models = list(dict.fromkeys(row.model for row in rows))
     found = {(row.model, row.delay): row for row in rows}
-    lines = [
-        "| model | " + " | ".join(f"delay {delay}" for delay in delays) + " | parameters | state |",
-        "|---" * (len(delays) + 3) + "|",
-    ]
-    for model in models:
+    lines = []
+    for model, one in {row.model: row for row in rows}.items():
         cells = [_cell(found.get((model, delay))) for delay in delays]
-        any_row = next(row for row in rows if row.model == model)
-        lines.append(f"| `{model}` | {' | '.join(cells)} | {any_row.parameters:,} | {any_row.state_numbers:,} |")
-    return "\n".join(lines)
+        lines.append([f"`{model}`", *cells, f"{one.parameters:,}", f"{one.state_numbers:,}"])
+    return markdown_table(["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines)
 
 
 def _cell(row: Recall | None) -> str:
     if row is None:
         return ""
     effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
-    return f"{100 * row.accuracy:.1f} %" + (f" ({effort})" if row.solved else f" (not solved: {effort})")
+    return f"{100 * row.accuracy:.1f} %" + (f" ({effort})" if row.accuracy >= SOLVED else f" (not solved: {effort})")

@@ -7,16 +7,13 @@
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from arcade_torch.tools.files import read_json
+from typing import Any, ClassVar, NamedTuple
 
 FORMAT = 1
-
 
 BENCHES = {
     "envs": "frames per second of the games, every frame consumed",
@@ -24,95 +21,145 @@ BENCHES = {
     "memory": "time and memory of the memory models, of the scans behind them, and of saliency",
     "recall": "delayed recall: which model remembers one symbol for how long",
 }
-"""Name -> what it measures. A module of that name has ``Options``, ``SIZES`` and ``run(options, tell)``, which yields
-``(table, row)``."""
+"""Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`), ``SIZES`` and
+``run(options, log)``, which yields ``(table, row)``."""
 
 
-class Number(NamedTuple):
-    """A measured column: its unit, and whether a larger number is the better one."""
+@dataclass
+class BenchOptions:
+    """Options that every benchmark has."""
 
-    unit: str
-    more_is_better: bool
+    resumable: ClassVar[bool] = False
+    out: Path | None = None
+    """File for the numbers, .json or .csv (of several tables one file each, its name added); overwritten."""
+    keep_memory: bool = False
+    """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
 
 
 class Kind(NamedTuple):
-    """A table: what it measures, columns that say what a row is about, measured columns that are compared."""
+    """A table: what it measures, columns that say what a row is about, measured columns and their units."""
 
     title: str
     key: tuple[str, ...]
-    numbers: dict[str, Number]
+    numbers: dict[str, str]
 
 
-_RATE, _MS, _MIB = Number("frames/s", True), Number("ms", False), Number("MiB", False)
+MORE_IS_BETTER = ("frames/s", "share")
 TABLES: dict[str, Kind] = {
     "envs": Kind(
         "Environments: frames per second, every frame consumed",
         ("game", "obs_size", "num_envs", "measure"),
-        {"frames_per_s": _RATE},
+        {"frames_per_s": "frames/s"},
     ),
     "train": Kind(
         "Training with PQN: frames per second",
         ("network", "memory", "form", "num_envs", "num_steps"),
-        {"collect_fps": _RATE, "learn_fps": _RATE, "train_fps": _RATE},
+        dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s"),
     ),
     "models": Kind(
         "Memory models over whole sequences",
         ("model", "form", "layers", "steps"),
-        {"forward_ms": _MS, "both_ms": _MS, "peak_mib": _MIB},
+        {"forward_ms": "ms", "both_ms": "ms", "peak_mib": "MiB"},
     ),
-    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": _MS, "both_ms": _MS}),
-    "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": _MS, "peak_mib": _MIB}),
+    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": "ms", "both_ms": "ms"}),
+    "saliency": Kind(
+        "Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms", "peak_mib": "MiB"}
+    ),
     "back_ends": Kind(
-        "Back ends of the linear scan", ("back_end", "steps", "numbers"), {"forward_ms": _MS, "backward_ms": _MS}
+        "Back ends of the linear scan", ("back_end", "steps", "numbers"), {"forward_ms": "ms", "backward_ms": "ms"}
     ),
     "recall": Kind(
         "Delayed recall: right answers, and processor time until they were right",
         ("model", "delay", "hidden_size", "seed"),
-        {"accuracy": Number("share", True), "seconds": Number("s", False)},
+        {"accuracy": "share", "seconds": "s"},
     ),
 }
 """What a file may hold; whoever adds a benchmark adds its tables here."""
 
-Tell = Callable[[str], None]
+Log = Callable[[str], None]
 
 
 def module_of(name: str) -> Any:
-    """The module of a benchmark."""
+    """The module of a benchmark: ``Options``, ``SIZES``, ``run``."""
     return import_module(f"arcade_torch.tools.bench.{name}")
 
 
-def gather(rows: Iterable[tuple[str, dict[str, Any]]], size: str) -> dict[str, Any]:
-    """Rows of benchmarks in the form of a file; numbers with four digits."""
+def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[str, Any]:
+    """Run benchmarks one after another, those that keep freed memory last.
+
+    Args:
+        benches: name -> options.
+        size: what the file says of how much was measured.
+        log: told what is measured now.
+
+    Returns:
+        The content of a file, numbers with four digits.
+    """
     from arcade_torch.tools.bench.harness import machine
+    from arcade_torch.tools.keep_memory import keep_freed_memory
 
     tables: dict[str, Any] = {}
-    for name, row in rows:
-        plain = {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
-        tables.setdefault(name, {"rows": []})["rows"].append(plain)
-    return {"format": FORMAT, "machine": machine(), "size": size, "tables": tables}
+    kept = [name for name, options in benches.items() if options.keep_memory]
+    for name in sorted(benches, key=kept.__contains__):
+        if name in kept:
+            keep_freed_memory()
+        for table, row in module_of(name).run(benches[name], log):
+            tables.setdefault(table, {"rows": []})["rows"].append(
+                {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
+            )
+    about = machine() | {"keep_memory": ", ".join(kept) or "no"}
+    return {"format": FORMAT, "machine": about, "size": size, "tables": tables}
 
 
-def bench_all(size: str = "quick", names: Sequence[str] = (), tell: Tell = lambda text: None) -> dict[str, Any]:
-    """Run benchmarks one after another."""
-    if size not in ("tiny", "quick", "full"):
-        raise ValueError(f"unknown size {size!r}: allowed are tiny, quick, full")
-    if unknown := [name for name in names if name not in BENCHES]:
-        raise ValueError(f"unknown benchmark {unknown[0]!r}: allowed are {', '.join(BENCHES)}")
-    rows: list[tuple[str, dict[str, Any]]] = []
-    for name in names or BENCHES:
-        module = module_of(name)
-        rows += module.run(module.Options(**module.SIZES[size], out=None), tell)
-    return gather(rows, size)
+def read_results(path: Path) -> dict[str, Any]:
+    """Read a file of ``arcade-torch bench all``.
+
+    Raises:
+        ValueError: it is none, or a number in it is none.
+    """
+    from arcade_torch.tools.files import read_json
+
+    values = read_json(path)
+    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
+        raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
+    if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
+        raise ValueError(f"{path} does not say on which machine and at what size it was measured")
+    try:
+        _numbers(values)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return values
 
 
-@dataclass(frozen=True)
-class Change:
+def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
+    """Every measured number of a file by table, what its row is about, and column."""
+    found: dict[tuple[str, str, str], float] = {}
+    for name, table in results["tables"].items():
+        if name not in TABLES:
+            raise ValueError(f"unknown table {name!r}; known are {', '.join(TABLES)}")
+        rows, kind = table.get("rows") if isinstance(table, dict) else None, TABLES[name]
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"table {name} has no list of rows")
+        for row in rows:
+            if missing := [column for column in (*kind.key, *kind.numbers) if column not in row]:
+                raise ValueError(f"a row of table {name} has no {missing[0]}")
+            about = " ".join(", ".join(f"{column} {row[column]}" for column in kind.key).split())
+            for column in kind.numbers:
+                value = row[column]
+                if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e15:
+                    raise ValueError(f"{name}, {about}: {column} is {value!r}, wanted a number from 0 up")
+                if (name, about, column) in found:
+                    raise ValueError(f"table {name} has two rows for {about}")
+                found[name, about, column] = float(value)
+    return found
+
+
+class Change(NamedTuple):
     """One number in two files."""
 
     table: str
     row: str
     column: str
-    unit: str
     old: float | None
     new: float | None
     ratio: float
@@ -128,90 +175,31 @@ class Change:
     def line(self) -> str:
         """The change in words."""
         values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (self.old, self.new))
-        return f"{self.table}: {self.row}: {self.column} {values} {self.unit} (x {self.ratio:.2f})"
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """Read a file of ``arcade-torch bench all``."""
-    values = read_json(path)
-    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
-        raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
-    if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
-        raise ValueError(f"{path} does not say on which machine and at what size it was measured")
-    for name, table in values["tables"].items():
-        if name not in TABLES:
-            raise ValueError(f"{path} has an unknown table {name!r}; known are {', '.join(TABLES)}")
-        rows = table.get("rows") if isinstance(table, dict) else None
-        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-            raise ValueError(f"{path}: table {name} has no list of rows")
-        _check_rows(path, name, rows)
-    return values
-
-
-def _check_rows(path: Path, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    kind, seen = TABLES[name], set[str]()
-    for row in rows:
-        if missing := [column for column in (*kind.key, *kind.numbers) if column not in row]:
-            raise ValueError(f"{path}: a row of table {name} has no {missing[0]}")
-        for column in kind.numbers:
-            value = row[column]
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e15:
-                raise ValueError(
-                    f"{path}: {name}, {about(name, row)}: {column} is {value!r}, wanted a number from 0 up"
-                )
-        if about(name, row) in seen:
-            raise ValueError(f"{path}: table {name} has two rows for {about(name, row)}")
-        seen.add(about(name, row))
-
-
-def about(name: str, row: Mapping[str, Any]) -> str:
-    """What a row is about, in one line."""
-    return " ".join(", ".join(f"{column} {row[column]}" for column in TABLES[name].key).split())
+        unit = TABLES[self.table].numbers[self.column]
+        return f"{self.table}: {self.row}: {self.column} {values} {unit} (x {self.ratio:.2f})"
 
 
 def compare(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
     """Number by number, what became of an old file in a new one."""
-    before, after = dict(_numbers(old)), dict(_numbers(new))
-    found = []
-    for key in dict.fromkeys((*before, *after)):
-        table, row, column = key
-        number = TABLES[table].numbers[column]
-        ratio = _ratio(before.get(key), after.get(key), number.more_is_better)
-        found.append(Change(table, row, column, number.unit, before.get(key), after.get(key), ratio))
+    before, after, found = _numbers(old), _numbers(new), []
+    for key in before | after:
+        was, now, ratio = before.get(key), after.get(key), 1.0
+        if was is not None and now is not None and was != now:
+            better, worse = (now, was) if TABLES[key[0]].numbers[key[2]] in MORE_IS_BETTER else (was, now)
+            ratio = better / worse if worse else math.inf
+        found.append(Change(*key, was, now, ratio))
     return found
-
-
-def _numbers(results: Mapping[str, Any]) -> Iterator[tuple[tuple[str, str, str], float]]:
-    for name, table in results["tables"].items():
-        for row in table["rows"]:
-            for column in TABLES[name].numbers:
-                yield (name, about(name, row), column), float(row[column])
-
-
-def _ratio(old: float | None, new: float | None, more_is_better: bool) -> float:
-    if old is None or new is None or old == new:
-        return 1.0
-    better, worse = (new, old) if more_is_better else (old, new)
-    return better / worse if worse else math.inf
 
 
 def page(results: Mapping[str, Any]) -> str:
     """All tables as one Markdown page."""
+    from arcade_torch.tools.tables import format_value, markdown_table
+
     machine = ", ".join(f"{name} {value}" for name, value in results["machine"].items() if value)
     lines = ["# Benchmarks", "", f"`make bench`, size {results['size']}. {machine}.", ""]
     for name, table in results["tables"].items():
-        kind = TABLES[name]
-        lines += [f"## {kind.title}", ""]
-        heads = [*kind.key, *(f"{column} ({number.unit})" for column, number in kind.numbers.items())]
-        lines += ["| " + " | ".join(heads) + " |", "|---" * len(kind.key) + "|---:" * len(kind.numbers) + "|"]
-        for row in table["rows"]:
-            cells = [_cell(row[column]) for column in (*kind.key, *kind.numbers)]
-            lines.append("| " + " | ".join(cells) + " |")
-        lines.append("")
+        title, key, numbers = TABLES[name]
+        heads = [*key, *(f"{column} ({unit})" for column, unit in numbers.items())]
+        rows = [[format_value(row[column]) for column in (*key, *numbers)] for row in table["rows"]]
+        lines += [f"## {title}", "", markdown_table(heads, rows, left=len(key)), ""]
     return "\n".join(lines)
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-    return str(value).replace("|", "\\|")

@@ -4,17 +4,21 @@ Every form solves h_t = a_t h_{t-1} + b_t from zeros, real or complex, with star
 them do the same. The operator has a backward pass of its own; the others are differentiated by autograd.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from arcade_torch.models.scan import linear_scan, scan_doubling
-from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, torch_threads
+from arcade_torch.tools.bench.harness import Measure, interleaved
 
-Scan = Callable[[Tensor, Tensor], Tensor]
-CHOSEN = "serial operator (in use)"
+RESETS = 0.02
+"""Share of the steps that open an episode."""
+
+Run = Callable[..., Tensor]
+Key = TypeVar("Key")
 
 
 def unbind_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
@@ -48,75 +52,58 @@ def generic_associative_scan(a: Tensor, b: Tensor) -> Tensor:
     return h
 
 
-FORMS: dict[str, Scan] = {
-    CHOSEN: linear_scan,
+FORMS: dict[str, Run] = {
+    "serial operator (in use)": linear_scan,
     "loop over unbind": unbind_loop,
     "doubling": doubling,
     "torch's associative_scan, generic": generic_associative_scan,
 }
 
 
-@dataclass(frozen=True)
-class ScanRow:
-    """One form at one length."""
+def both_passes(run: Run, backward: Callable[[Tensor], None], inputs: tuple[Tensor, ...]) -> Callable[[], Tensor]:
+    """What does the forward and the backward pass; inputs that are not bool get gradients."""
+    leaves = [x.clone().requires_grad_(x.dtype != torch.bool) for x in inputs]
 
-    form: str
-    steps: int
-    numbers: str
-    forward_ms: float
-    both_ms: float
-    error: float
-
-
-def bench_scans(
-    steps: Sequence[int],
-    batch: int = 16,
-    size: int = 512,
-    *,
-    threads: int = 1,
-    seconds: float = 0.3,
-    repeats: int = 3,
-    tell: Callable[[str], None] = lambda text: None,
-) -> Iterator[ScanRow]:
-    """Time every form in turns."""
-    with torch_threads(threads):
-        for length in steps:
-            for dtype in (torch.float32, torch.complex64):
-                numbers = "complex" if dtype.is_complex else "real"
-                tell(f"scans, T = {length}, {numbers}")
-                yield from _forms(length, batch, size, dtype, numbers, seconds, repeats)
-
-
-def _forms(
-    length: int, batch: int, size: int, dtype: torch.dtype, numbers: str, seconds: float, repeats: int
-) -> list[ScanRow]:
-    a, b = (torch.randn(batch, length, size, dtype=dtype) for _ in "ab")
-    a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, length, size)
-    a[torch.rand(batch, length) < 0.02] = 0
-    double = torch.complex128 if dtype.is_complex else torch.float64
-    exact = linear_scan(a.to(double), b.to(double))
-    weight = torch.randn_like(b)
-    measures, errors = {}, {}
-    for name, form in FORMS.items():
-        errors[name] = float((form(a, b) - exact).abs().max())
-        measures[f"{name}, forward"] = Measure(_forward(form, a, b), no_check, 1)
-        measures[f"{name}, both"] = Measure(_both(form, a, b, weight), no_check, 1)
-    found = interleaved(measures, seconds, repeats, warm_ups=1)
-    best = {key: 1e3 / max(measured.rates) for key, measured in found.items()}
-    return [
-        ScanRow(name, length, numbers, best[f"{name}, forward"], best[f"{name}, both"], error)
-        for name, error in errors.items()
-    ]
-
-
-def _forward(form: Scan, a: Tensor, b: Tensor) -> Callable[[], object]:
-    @torch.no_grad()
-    def work() -> object:
-        return form(a, b)
+    def work() -> Tensor:
+        for leaf in leaves:
+            leaf.grad = None
+        out = run(*leaves)
+        backward(out)
+        return out
 
     return work
 
 
-def _both(form: Scan, a: Tensor, b: Tensor, weight: Tensor) -> Callable[[], object]:
-    leaves = [x.clone().requires_grad_() for x in (a, b)]
-    return lambda: torch.autograd.grad(form(*leaves), leaves, weight)
+def time_passes(
+    runs: Mapping[Key, Run],
+    backward: Callable[[Tensor], None],
+    inputs: tuple[Tensor, ...],
+    seconds: float,
+    repeats: int,
+) -> dict[Key, dict[str, float]]:
+    """Best milliseconds of the forward pass alone and of both passes, measured in turns."""
+    forward = {f"{key} forward": Measure(torch.no_grad()(partial(run, *inputs))) for key, run in runs.items()}
+    both = {f"{key} both": Measure(both_passes(run, backward, inputs)) for key, run in runs.items()}
+    found = interleaved(forward | both, seconds, repeats, warm_ups=1)
+    return {key: {f"{part}_ms": found[f"{key} {part}"].best_ms for part in ("forward", "both")} for key in runs}
+
+
+def random_scan(batch: int, steps: int, size: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """Random a with absolute values below 1, random b, and starts."""
+    a, b = (torch.randn(batch, steps, size, dtype=dtype) for _ in "ab")
+    return a / a.abs().clamp_min(1e-3) * torch.rand(batch, steps, size), b, torch.rand(batch, steps) < RESETS
+
+
+def bench_scans(batch: int, steps: int, size: int, seconds: float, repeats: int) -> Iterator[dict[str, Any]]:
+    """Every form in turns, one row each."""
+    for numbers, dtype, exact in (
+        ("real", torch.float32, torch.float64),
+        ("complex", torch.complex64, torch.complex128),
+    ):
+        a, b, start = random_scan(batch, steps, size, dtype)
+        a[start] = 0
+        weight, right = torch.randn_like(b), linear_scan(a.to(exact), b.to(exact))
+        times = time_passes(FORMS, partial(Tensor.backward, gradient=weight), (a, b), seconds, repeats)
+        for name, form in FORMS.items():
+            error = float((form(a, b) - right).abs().max())
+            yield {"form": name, "steps": steps, "numbers": numbers, **times[name], "error": error}

@@ -4,7 +4,6 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,7 +11,8 @@ import torch
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.training import Trainer
-from arcade_torch.tools.bench.harness import Measure, interleaved, no_check, op_breakdown, torch_threads
+from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown, torch_threads
+from arcade_torch.tools.bench.registry import BenchOptions
 
 FORMS: dict[str, dict[str, bool]] = {
     "eager": {},
@@ -24,11 +24,11 @@ FORMS: dict[str, dict[str, bool]] = {
 
 
 @dataclass
-class Options:
+class Options(BenchOptions):
     """Frames per second of training with PQN: collecting, learning, both, and where the time of learning goes.
 
     The trainer of arcade-torch train is timed with the numbers of the presets of that name: paper has 16 envs x 128
-    steps and 64 gradient steps an update, small 64 x 32 and 32.
+    steps and 64 gradient steps an update, small 64 x 32 and 32. Freed memory is kept, as there.
 
     Example: arcade-torch bench train --networks small --memories lru gru --threads 1 --out runs/train.csv
     """
@@ -51,8 +51,8 @@ class Options:
     """Passes; the median counts."""
     note: str = ""
     """Said about the machine in the result, for example that it was not idle."""
-    out: Path | None = None
-    """File for the numbers, .csv or .json; overwritten."""
+    keep_memory: bool = True
+    """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
 
 
 SIZES: dict[str, dict[str, Any]] = {
@@ -62,7 +62,7 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
+def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``train``."""
     for name, least in (("grad_steps", 1), ("repeats", 1), ("threads", 0)):
         if getattr(options, name) < least:
@@ -71,7 +71,7 @@ def run(options: Options, tell: Callable[[str], None]) -> Iterator[tuple[str, di
     configs = [_config(network, memory, form, options) for network, memory, form in plans]
     with torch_threads(options.threads or torch.get_num_threads()):
         for config, (_, _, form) in zip(configs, plans, strict=True):
-            tell(f"{config.network} network, {config.memory}, {form}")
+            log(f"{config.network} network, {config.memory}, {form}")
             trainer = Trainer(config)
             try:
                 yield "train", _measure(trainer, form, options)
@@ -91,25 +91,29 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
 
 
 def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
-    numbers, kept = trainer.config.learner, [trainer.collector.collect()]
+    config, window = trainer.config.learner, [trainer.collector.collect()]
 
     def collect() -> None:
-        kept[:] = [trainer.collector.collect()]  # overwrites the window before
+        window[:] = [trainer.collector.collect()]  # overwrites the window before
 
     learner, every = trainer.learner, trainer.learner.minibatches
     learner.config = dataclasses.replace(learner.config, epochs=1)
     learner.__dict__["minibatches"] = lambda rows: itertools.islice(every(rows), options.grad_steps)
 
     def learn() -> None:
-        learner.update(kept[0], 0)
+        learner.update(window[0], 0)
 
-    frames = numbers.frames_per_update
-    share = frames * options.grad_steps / numbers.grad_steps_per_update  # of an update's frames that a pass learns
-    measures = {"collect": Measure(collect, no_check, frames), "learn": Measure(learn, no_check, round(share))}
-    found = interleaved(measures, 1e-9, options.repeats, warm_ups=1)
+    frames, every_step = config.frames_per_update, config.grad_steps_per_update
+    learned = round(frames * options.grad_steps / every_step)  # of an update's frames in a pass
+    found = interleaved(
+        {"collect": Measure(collect, units=frames), "learn": Measure(learn, units=learned)},
+        seconds=1e-9,
+        repeats=options.repeats,
+        warm_ups=1,
+    )
     collect_fps, learn_fps = found["collect"].rate, found["learn"].rate
     row: dict[str, Any] = {"network": trainer.config.network, "memory": trainer.config.memory, "form": form}
     row |= {"parameters": sum(p.numel() for p in trainer.network.parameters())}
-    row |= {"num_envs": numbers.num_envs, "num_steps": numbers.num_steps, "grad_steps": numbers.grad_steps_per_update}
+    row |= {"num_envs": config.num_envs, "num_steps": config.num_steps, "grad_steps": every_step}
     row |= {"collect_fps": collect_fps, "learn_fps": learn_fps, "train_fps": 1 / (1 / collect_fps + 1 / learn_fps)}
     return row | {f"learning: {kind}": value for kind, value in op_breakdown(learn).items()}

@@ -1,7 +1,6 @@
 """``arcade-torch bench NAME``, ``bench all`` and ``bench compare``."""
 
 import sys
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import tyro
 from arcade_torch.tools.bench import registry
 from arcade_torch.tools.files import write_csv, write_json, write_text
 from arcade_torch.tools.options import parse as parse_options
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.tables import Table, format_value
 
 
 @dataclass
@@ -21,31 +20,30 @@ class Bench:
 
     name: str
     options: Any
-    argv: tuple[str, ...] = ()
 
     def run(self) -> int:
         """Measure, print, save."""
-        from arcade_torch.tools.keep_memory import keep_freed_memory
-
-        out, module = self.options.out, registry.module_of(self.name)
+        out, about = self.options.out, vars(self.options)
         if out is not None and out.suffix not in (".csv", ".json"):
             raise ValueError(f"--out must end in .csv or .json, got {out}")
-        keep_freed_memory()  # as in training
-        results = registry.gather(module.run(self.options, _tell), "one")
-        about = vars(self.options)
+        results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device", "note") if name in about}
         for name, table in results["tables"].items():
-            _show(registry.TABLES[name].title, table["rows"])
+            title, key, _ = registry.TABLES[name]
+            columns, cells = list(table["rows"][0]), [list(map(format_value, row.values())) for row in table["rows"]]
+            names = next(place for place, column in enumerate(columns) if column not in key)
+            Table(title, columns, cells, left=names).show()
         print(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
-        if out is not None and not hasattr(module, "KEEPS_ITS_FILE"):
+        if out is not None and not self.options.resumable:
             for path in _save(out, results):
                 print(path)
         return 0
 
     def resume_hint(self) -> str:
         """What an interruption left."""
-        kept = hasattr(registry.module_of(self.name), "KEEPS_ITS_FILE")
-        return f"finished rows are in {self.options.out}; the same command goes on" if kept else "nothing was kept"
+        if self.options.resumable:
+            return f"finished rows are in {self.options.out}; the same command goes on"
+        return "nothing was kept"
 
 
 @dataclass
@@ -59,22 +57,20 @@ class BenchAll:
 
     size: Literal["tiny", "quick", "full"] = "quick"
     """How much: tiny takes half a minute and proves nothing, quick about ten minutes, full an hour or more."""
-    benches: tuple[str, ...] = ()
-    """Which of envs, train, memory, recall; all by default."""
+    benches: tuple[Literal["envs", "train", "memory", "recall"], ...] = ("envs", "train", "memory", "recall")
+    """Which of them."""
     out: Path = Path("results/bench.json")
     """The file; overwritten."""
     page: Path | None = None
     """Markdown page of the tables; beside the file by default."""
-    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Measure and save."""
-        from arcade_torch.tools.keep_memory import keep_freed_memory
-
         if self.out.suffix != ".json":
             raise ValueError(f"--out must end in .json, got {self.out}")
-        keep_freed_memory()
-        results = registry.bench_all(self.size, self.benches, _tell)
+        modules: dict[str, Any] = {name: registry.module_of(name) for name in self.benches}
+        options = {name: module.Options(**module.SIZES[self.size], out=None) for name, module in modules.items()}
+        results = registry.measure(options, self.size, _log)
         print(write_json(self.out, results))
         print(write_text(self.page or self.out.with_suffix(".md"), registry.page(results)))
         return 0
@@ -93,28 +89,26 @@ class BenchCompare:
     """The file to judge."""
     tolerance: float = 0.2
     """Share by which a number may be worse; machines that are not quiet need more."""
-    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
     def run(self) -> int:
         """Compare and print."""
         if not 0 < self.tolerance < 1:
             raise ValueError(f"--tolerance must lie between 0 and 1, got {self.tolerance}")
         old, new = registry.read_results(self.old), registry.read_results(self.new)
-        differs = [
-            f"{name} {old['machine'].get(name)} and {new['machine'].get(name)}"
-            for name in ("processor", "cores", "jax_device", "torch_threads")
-            if old["machine"].get(name) != new["machine"].get(name)
-        ]
-        if differs:
+        pairs = {
+            name: (old["machine"].get(name), new["machine"].get(name))
+            for name in ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
+        }
+        if differs := [f"{name} {was} and {now}" for name, (was, now) in pairs.items() if was != now]:
             print(f"not the same machine: {', '.join(differs)}")
-        changes = registry.compare(old, new)
-        count = Counter(change.verdict(self.tolerance) for change in changes)
+        changes: dict[str, list[registry.Change]] = {name: [] for name in ("same", "worse", "better", "missing", "new")}
+        for change in registry.compare(old, new):
+            changes[change.verdict(self.tolerance)].append(change)
         for verdict in ("worse", "missing", "better", "new"):
-            for change in changes:
-                if change.verdict(self.tolerance) == verdict:
-                    print(f"{verdict}: {change.line()}")
-        print(", ".join(f"{count[name]} {name}" for name in ("same", "worse", "better", "missing", "new")))
-        return 1 if count["worse"] else 0
+            for change in changes[verdict]:
+                print(f"{verdict}: {change.line()}")
+        print(", ".join(f"{len(found)} {verdict}" for verdict, found in changes.items()))
+        return 1 if changes["worse"] else 0
 
 
 COMMAND = Bench
@@ -134,14 +128,12 @@ def parse(words: Sequence[str], prog: str) -> Any:
     name = prog.split()[-1]
     if name in _OTHERS:
         return parse_options(_OTHERS[name], words, prog)
-    kind = registry.module_of(name).Options
-    first = next((i for i, word in enumerate(words) if word.startswith("-")), len(words))
-    if first and name in ("memory", "recall"):
+    if words and not words[0].startswith("-") and name in ("memory", "recall"):
         words = ["--memories", *words]
-    return Bench(name, parse_options(kind, words, prog))
+    return Bench(name, parse_options(registry.module_of(name).Options, words, prog))
 
 
-def _tell(text: str) -> None:
+def _log(text: str) -> None:
     print(f"measuring {text}", file=sys.stderr, flush=True)
 
 
@@ -155,20 +147,3 @@ def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
         rows = [{**row, **results["machine"]} for row in table["rows"]]
         paths.append(write_csv(path, rows, list(rows[0])))
     return paths
-
-
-def _show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print a table; one with few rows and many columns is turned round."""
-    columns, cells = list(rows[0]), [[_cell(value) for value in row.values()] for row in rows]
-    if len(columns) > 12 and len(rows) < 12:
-        columns, cells = (
-            ["", *(" ".join(row[:3]) for row in cells)],
-            [list(line) for line in zip(columns, *cells, strict=True)],
-        )
-    Table(title, columns, cells).show()
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-    return str(value)

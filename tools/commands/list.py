@@ -1,7 +1,6 @@
 """``arcade-torch list``."""
 
 import inspect
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -43,16 +42,18 @@ class List:
     """File for baselines (baselines.csv by default) or sheet (games.png)."""
 
     def run(self) -> int:
-        """Print the tables."""
-        if self.what == "baselines":
-            self._baselines()
-        if self.what == "sheet":
-            self._sheet()
-        if self.what in ("all", "envs"):
-            _environments()
-        if self.what in ("all", "memories"):
-            _memories(self.measure)
+        """Print the tables, or draw."""
+        parts = {"baselines": self._baselines, "sheet": self._sheet, "envs": _environments, "memories": self._memories}
+        for name in ("envs", "memories") if self.what == "all" else (self.what,):
+            parts[name]()
         return 0
+
+    def resume_hint(self) -> str:
+        """What to type after an interruption."""
+        return f"finished rows are in {self._table()}; the same command goes on with the others"
+
+    def _table(self) -> Path:
+        return self.out or Path("baselines.csv")
 
     def _baselines(self) -> None:
         from arcade_torch.envs_jax import registered_ids, resolve_id
@@ -73,9 +74,6 @@ class List:
         if self.page is not None:
             print(f"\nwritten into {write_between(self.page, players.BEGIN, players.END, table)}")
 
-    def _table(self) -> Path:
-        return self.out or Path("baselines.csv")
-
     def _sheet(self) -> None:
         from arcade_torch.envs_jax import registered_ids, resolve_id
         from arcade_torch.tools.contact_sheet import sheet, strip, write_png
@@ -87,9 +85,21 @@ class List:
         picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
         print(write_png(picture, self.out or Path("games.png")).resolve())
 
-    def resume_hint(self) -> str:
-        """What to type after an interruption."""
-        return f"finished rows are in {self._table()}; the same command goes on with the others"
+    def _memories(self) -> None:
+        from arcade_torch.models import make_memory, memory_names
+        from arcade_torch.models.presets import PRESETS
+
+        rows = []
+        for name in memory_names():
+            kind = type(make_memory(name, 1, 1))
+            says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
+            rows.append((name, says.strip().partition("\n")[0]))
+        Table("memory models", ("name", "what it is"), rows, left=2).show()
+        for of, size in (("the paper's network", PAPER_SIZE), ("the small network", PRESETS["small"].hidden_size)):
+            _costs(f"one cell of {of}, {size} wide", size, self.measure)
+        print("multiply-adds: in matrix products, one step of one env, acting")
+        if self.measure:
+            print("us: microseconds for one step of one env; acting: 16 envs; learning: both passes, 16 x 132 steps")
 
 
 COMMAND = List
@@ -104,42 +114,17 @@ def _environments() -> None:
     print("each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, 3]; 5 actions")
 
 
-def _memories(measure: bool) -> None:
-    from arcade_torch.models import make_memory, memory_names
-    from arcade_torch.models.presets import PRESETS
-
-    rows = []
-    for name in memory_names():
-        kind = type(make_memory(name, 1, 1))
-        says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
-        rows.append((name, says.strip().partition("\n")[0]))
-    Table("memory models", ("name", "what it is"), rows, left=2).show()
-    names: Sequence[str] = memory_names()
-    _costs("one cell of the paper's network", PAPER_SIZE, measure, names)
-    _costs("the cell of the small network", PRESETS["small"].hidden_size, measure, names)
-    print("multiply-adds: in matrix products, one step of one env, acting")
-    if measure:
-        print(
-            "us: microseconds for one step of one env; acting with 16 envs, learning (both passes) from 16 x 132 steps"
-        )
-
-
-def _costs(title: str, size: int, measure: bool, names: Sequence[str]) -> None:
+def _costs(title: str, size: int, measure: bool) -> None:
     """One line a memory model at one width."""
-    from arcade_torch.models import make_memory
-    from arcade_torch.tools.bench.memories import memory_cost, time_memories
+    from arcade_torch.models import make_memory, memory_names
+    from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
     columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
-    rows = []
-    for name in names:
-        cost = memory_cost(make_memory(name, size, size), size)
-        numbers = (cost.parameters, cost.state_numbers, cost.state_bytes, cost.products)
-        rows.append([name, *(f"{number:,}" for number in numbers)])
+    names = memory_names()
+    rows = [[name, *(f"{number:,}" for number in memory_cost(make_memory(name, size, size), size))] for name in names]
     if measure:
         times = time_memories(names, size)
         columns += ["acting us", "learning us", "to the LRU's"]
-        for row, name in zip(rows, names, strict=True):
-            time = times[name]
-            ratio = time.learning / times["lru"].learning
-            row += [f"{time.acting:.1f}", f"{time.learning:.1f}", f"{ratio:.2f}"]
-    Table(f"{title}, {size} wide", columns, rows).show()
+        for row, (acting, learning) in zip(rows, times.values(), strict=True):
+            row += [f"{acting:.1f}", f"{learning:.1f}", f"{learning / times['lru'][1]:.2f}"]
+    Table(title, columns, rows).show()

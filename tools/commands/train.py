@@ -1,7 +1,7 @@
 """``arcade-torch train``."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,12 +46,6 @@ class Train:
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
     argv: tyro.conf.Suppress[tuple[str, ...]] = ()
 
-    def folder(self) -> Path:
-        """The run folder."""
-        run = self.settings
-        name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
-        return self.out or Path("runs") / name
-
     def run(self) -> int:
         """Train."""
         from arcade_torch.agents import train
@@ -61,23 +55,21 @@ class Train:
 
         watch_parent()
         keep_freed_memory()
-        folder = self.folder()
+        run, film = self.settings, None
+        name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
+        folder = self.out or Path("runs") / name
+        if self.videos != "none":
+            from arcade_torch.tools.record.evaluations import EvaluationVideos
+
+            film = EvaluationVideos(folder / "videos", f".{self.videos}")
         wait_until_free(folder, self.wait)
         with TrainBar(str(folder)) as bar:
-            result = train(self.settings, folder, self.resume, bar.update, self._film(folder))
+            result = train(run, folder, self.resume, bar.show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
         print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
         print(f"finished: {result.run_dir}")
         return 0
-
-    def _film(self, folder: Path) -> Callable[[Any], None] | None:
-        """What films the agent at every evaluation."""
-        if self.videos == "none":
-            return None
-        from arcade_torch.tools.record.evaluations import EvaluationVideos
-
-        return EvaluationVideos(folder / "videos", f".{self.videos}")
 
     def resume_hint(self) -> str:
         """What to type after an interruption."""
@@ -102,20 +94,16 @@ def parse(argv: Sequence[str], prog: str) -> Train:
     name, file = _peek(argv, "--preset"), _peek(argv, "--config")
     if name is not None and file is not None:
         raise ValueError("give --preset or --config to start from, not both")
-    if file is not None:
-        base = _read_config(Path(file))
-    else:  # the preset's numbers depend on these two, and the help shows them
-        decisive = {key: value for key in ("env", "algorithm") if (value := _peek(argv, f"--{key}"))}
-        base = preset(name or "paper", **decisive)
+    # A preset's numbers depend on these two, and the help shows them.
+    decisive = {key: value for key in ("env", "algorithm") if (value := _peek(argv, f"--{key}"))}
+    base = preset(name or "paper", **decisive) if file is None else _read_config(Path(file))
     parsed: Train = parse_options(Train, argv, prog, Train(base))
-    given = {word[2:].partition("=")[0].replace("-", "_") for word in argv if word.startswith("--")}
-    changes = _changes(base, parsed.settings, given, "")
-    for key, pairs in (("env_options", parsed.env_option), ("network_options", parsed.network_option)):
-        if pairs:
-            changes[key] = {**getattr(base, key), **dict(map(name_and_value, pairs))}
-    if file is not None:
-        return dataclasses.replace(parsed, settings=TrainConfig.from_dict(_merged(base.to_dict(), changes)))
-    return dataclasses.replace(parsed, settings=preset(parsed.preset, **changes))
+    settings = parsed.settings if file else preset(parsed.preset, **_given(parsed.settings, argv))
+    options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
+    more: dict[str, Any] = {
+        key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()
+    }
+    return dataclasses.replace(parsed, settings=dataclasses.replace(settings, **more))
 
 
 def _read_config(file: Path) -> TrainConfig:
@@ -128,29 +116,21 @@ def _read_config(file: Path) -> TrainConfig:
         raise ValueError(f"{file} holds no config: {error}") from error
 
 
-def _merged(old: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    tables = {key: _merged(old[key], value) for key, value in changes.items() if isinstance(value, dict)}
-    return {**old, **changes, **tables}
-
-
-def _changes(base: Any, parsed: Any, given: set[str], prefix: str) -> dict[str, Any]:
-    """Fields that were given or differ, nested dataclasses as dictionaries."""
+def _given(settings: TrainConfig, argv: Sequence[str]) -> dict[str, Any]:
+    """The fields that were given, be it with the value of the preset; those of a learner as a dictionary."""
     found: dict[str, Any] = {}
-    for item in dataclasses.fields(base):
-        old, new = getattr(base, item.name), getattr(parsed, item.name)
-        if dataclasses.is_dataclass(old):
-            inner = _changes(old, new, given, f"{prefix}{item.name}.")
-            if inner:
-                found[item.name] = inner
-        elif old != new or prefix + item.name in given:
-            found[item.name] = new
+    for word in argv:
+        group, _, name = word.partition("=")[0].removeprefix("--").replace("-", "_").rpartition(".")
+        name = name.removeprefix("no_")
+        owner: Any = getattr(settings, group, None) if group else settings
+        if word.startswith("--") and name in {item.name for item in dataclasses.fields(owner)}:
+            (found.setdefault(group, {}) if group else found)[name] = getattr(owner, name)
     return found
 
 
 def _peek(argv: Sequence[str], flag: str) -> str | None:
-    for index, word in enumerate(argv):
-        if word == flag and index + 1 < len(argv):
-            return argv[index + 1]
-        if word.startswith(flag + "="):
-            return word.partition("=")[2]
+    """The value of an option, before options are read."""
+    for word, following in zip(argv, [*argv[1:], None], strict=True):
+        if word == flag or word.startswith(flag + "="):
+            return following if word == flag else word.partition("=")[2]
     return None

@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.bench.external_envs import PACKAGES, bench_others, installed
 from arcade_torch.tools.figures.registry import Made, Options, Progress
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, SPARE_COLOURS, drawing, footnote, inches, save
 from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.versions import versions
 
 NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "frames_per_s_with_check")
-MACHINE = ("platform", "processor", "cores", "jax_device", "jax")
 OURS = {"step+draw": "compiled step", "env": "ArcadeEnv", "collector": "ArcadeCollector"}
 LIMIT = "fill"
 
@@ -29,7 +26,7 @@ class Series:
 
 
 def make(options: Options, progress: Progress | None) -> Made:
-    """The figure ``throughput``: our games with and without drawing; and our mean beside other packages.
+    """The figure ``throughput``: our games with and without drawing, and their mean by layer.
 
     ``options.runs`` is the one file; rates have the checksum over every frame inside the clock.
     """
@@ -39,8 +36,6 @@ def make(options: Options, progress: Progress | None) -> Made:
     here = [row for row in rows if int(row["obs_size"]) == sizes[0]]
     notes = [f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"] * (len(sizes) > 1)
     games = list(dict.fromkeys(str(row["game"]) for row in here))
-    others, why = _others(here)
-    notes += why
     drawn = {game: series(here, game, "step+draw") for game in games}
     plain = {game: series(here, game, "step") for game in games}
     means = [mean_series(here, games, measure, name) for measure, name in OURS.items()]
@@ -58,10 +53,8 @@ def make(options: Options, progress: Progress | None) -> Made:
         for mean, marker in zip(means, ("*", "v", "o"), strict=True):
             _line(right, mean, "#0072b2", marker, "-", f"{mean.name}, mean of {len(games)}")
         _line(right, limit, NEUTRAL, "", "--", limit.name)
-        for place, other in enumerate(others):
-            _line(right, other, SPARE_COLOURS[1 + place % 6], MARKERS[1 + place % 7], "-", other.name)
         _axes(left, here, "this package's games")
-        _axes(right, here, "their mean, and other packages" if others else "their mean, by layer")
+        _axes(right, here, "their mean, by layer")
         left.set_ylabel("frames/s")
         first = here[0]
         footnote(
@@ -70,7 +63,7 @@ def make(options: Options, progress: Progress | None) -> Made:
             f"{first.get('jax_device', 'unknown device')}, {first.get('cores', '?')} cores, "
             f"arcade-torch {first.get('arcade-torch', '?')} ({first.get('commit') or 'no commit'})",
         )
-        numbers = _rows(drawn, plain, [*means, limit, *others])
+        numbers = _rows(drawn, plain, [*means, limit])
         return Made(save(options, "throughput", figure, numbers), notes, rows=numbers)
 
 
@@ -122,33 +115,6 @@ def _one_file(paths: Sequence[Path]) -> Path:
     if paths[0].is_dir():
         raise ValueError(f"{paths[0]} is a folder: give the CSV file that `arcade-torch bench envs --out` wrote")
     return paths[0]
-
-
-def _others(rows: Sequence[dict[str, str]]) -> tuple[list[Series], list[str]]:
-    """Other packages, measured now if they are installed and this is the machine of the file."""
-    there = installed()
-    absent = [name for name in PACKAGES if name not in there]
-    notes = [f"not compared, not installed: {', '.join(absent)}"] if absent else []
-    if not there:
-        return [], notes
-    now = this_machine()
-    differs = [name for name in MACHINE if rows[0].get(name, "") != now[name]]
-    if differs:
-        name = differs[0]
-        what = f"its {name} is {rows[0].get(name, '')!r}, here it is {now[name]!r}"
-        return [], [*notes, f"not compared: the file was measured elsewhere ({what}); measure again"]
-    batches = sorted({int(row["num_envs"]) for row in rows})
-    found = []
-    for name, pixels, rates in bench_others(there, batches):
-        found.append(Series(name if pixels else f"{name} (no pixels)", np.array(batches), np.array(rates)))
-    return found, notes
-
-
-def this_machine() -> dict[str, str]:
-    """What a file of this machine would say, for `MACHINE`."""
-    from arcade_torch.tools.bench.harness import machine
-
-    return {name: str(value) for name, value in (machine() | versions()).items() if name in MACHINE}
 
 
 def _line(axis: Any, one: Series, colour: str, marker: str, style: str, label: str | None) -> None:
