@@ -79,7 +79,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     """
     if name not in _PRESETS:
         raise ValueError(f"unknown preset {name!r}; presets: {', '.join(preset_names())}")
-    algorithm, env = changes.get("algorithm", "pqn"), str(changes.get("env", TrainConfig.env))
+    algorithm, env = str(changes.get("algorithm", "pqn")), str(changes.get("env", TrainConfig.env))
     values = dict(_PRESETS[name])
     if name == "reference" and algorithm == "ppo":
         values["network_options"] = {"skip": "none", "use_last_action": False}
