@@ -151,7 +151,7 @@ def make_optimizer(
     if kind == "adam":
         return torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True, capturable=cuda)
     if not cuda:
-        return FusedRAdam(parameters, lr=learning_rate)
+        return FusedRAdam(parameters, lr=lr, fused=True)
     return torch.optim.RAdam(parameters, lr=lr, foreach=True, capturable=True)
 
 
@@ -161,15 +161,8 @@ class FusedRAdam(torch.optim.Adam):
     RAdam's step is Adam's with a step size that depends on the number of steps alone; in the first five steps, where
     the variance is not yet known, it is one along the mean of the gradients.
 
-    Args:
-        parameters: float32 or float64, on a CPU.
-        lr: step size.
-
     Source: Liu et al., arXiv 1908.03265, algorithm 2; equal to ``torch.optim.RAdam``.
     """
-
-    def __init__(self, parameters: list[nn.Parameter], lr: float) -> None:
-        super().__init__(parameters, lr=lr, fused=True)
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
