@@ -185,43 +185,41 @@ def _rows(
     seed: int,
     with_iqm: bool = True,
 ) -> tuple[tuple[AgentRow, ...], dict[str, Array], dict[str, Array]]:
-    raw = {key: cells[key] for key in ((a, t, twin) for a in agents for t in tasks for twin in TWINS)}
-    scaled = {key: normalise(key[1], values) for key, values in raw.items()}
-    base = agents[0]
+    """A row an agent, the memory-free one first; and the draws of Gap and of the POMDP return of each."""
     found: dict[tuple[str, str], dict[str, tuple[float, Array]]] = {}  # values and draws
     for i, agent in enumerate(agents):
         for j, twin in enumerate(TWINS):
-            # The stream depends on the place of the agent's twin alone: raw, normalised and IQM share its draws.
-            parts = {}
-            for name, source in (("raw", raw), ("mean", scaled)):
-                drawn = resampled(
-                    [source[agent, task, twin] for task in tasks], draws, np.random.default_rng([seed, i, j])
-                )
-                parts[name] = (_mean(source, agent, tasks, twin), mean_over_tasks(drawn))
-            middle = float(iqm([scaled[agent, task, twin] for task in tasks]))
-            parts["iqm"] = (middle, iqm(drawn) if with_iqm else np.full(1, np.nan))
-            found[agent, twin] = parts
+            raw = [cells[agent, task, twin] for task in tasks]
+            drawn_raw = resampled(raw, draws, np.random.default_rng([seed, i, j]))
+            scaled, drawn = (
+                [normalise(task, each) for task, each in zip(tasks, every, strict=True)] for every in (raw, drawn_raw)
+            )
+            found[agent, twin] = {
+                "raw": (_mean(raw), mean_over_tasks(drawn_raw)),
+                "mean": (_mean(scaled), mean_over_tasks(drawn)),
+                "iqm": (float(iqm(scaled)), iqm(drawn) if with_iqm else np.full(1, np.nan)),
+            }
+    counts = {key: tuple(len(cells[key[0], task, key[1]]) for task in tasks) for key in found}
     rows, gaps, pomdps = [], {}, {}
+    free, free_seeds = found[agents[0], "full"]["mean"], min(counts[agents[0], "full"])
     for agent in agents:
         full, partial = found[agent, "full"], found[agent, "partial"]
-        counts = {twin: tuple(len(raw[agent, task, twin]) for task in tasks) for twin in TWINS}
-        least = min(counts["full"] + counts["partial"])
-        free, base_least = found[base, "full"]["mean"], min(len(raw[base, task, "full"]) for task in tasks)
+        seeds = min(counts[agent, "full"] + counts[agent, "partial"])
         gaps[agent], pomdps[agent] = full["mean"][1] - partial["mean"][1], partial["mean"][1]
         values = {"mdp_raw": full["raw"], "pomdp_raw": partial["raw"], "mdp": full["mean"], "pomdp": partial["mean"]}
         values |= {"mdp_iqm": full["iqm"], "pomdp_iqm": partial["iqm"]}
         values["gap"] = (full["mean"][0] - partial["mean"][0], gaps[agent])
-        intervals = {name: percentile_interval(*pair, confidence, least > 1) for name, pair in values.items()}
-        intervals["bias"] = percentile_interval(
-            full["mean"][0] - free[0], full["mean"][1] - free[1], confidence, min(least, base_least) > 1
-        )
-        coverage = measured_coverage(counts["full"], counts["partial"], confidence) if least > 1 else float("nan")
-        rows.append(AgentRow(agent, least, coverage=coverage, **intervals))
+        intervals = {name: percentile_interval(*pair, confidence, seeds > 1) for name, pair in values.items()}
+        bias = full["mean"][0] - free[0], full["mean"][1] - free[1]
+        intervals["bias"] = percentile_interval(*bias, confidence, min(seeds, free_seeds) > 1)
+        both = counts[agent, "full"], counts[agent, "partial"]
+        coverage = measured_coverage(*both, confidence) if seeds > 1 else float("nan")
+        rows.append(AgentRow(agent, seeds, coverage=coverage, **intervals))
     return tuple(rows), gaps, pomdps
 
 
-def _mean(source: Cells, agent: str, tasks: Sequence[str], twin: str) -> float:
-    return float(np.mean([source[agent, task, twin].mean() for task in tasks]))
+def _mean(cells: Sequence[Array]) -> float:
+    return float(np.mean([cell.mean() for cell in cells]))
 
 
 def _plain(row: AgentRow, without: str) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Returns on one scale, by the rule that reproduces the paper's text."""
 
 import re
-from typing import NamedTuple, overload
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,8 @@ SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
 """Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already."""
 
 DIFFICULTIES = ("Easy", "Medium", "Hard")
+
+Value = TypeVar("Value", float, NDArray[np.float64])
 
 
 class Task(NamedTuple):
@@ -27,22 +29,13 @@ def split_id(env_id: str) -> Task:
         Task(game='MineSweeper', difficulty='Easy')
     """
     name = re.sub(r"-v\d+$", "", env_id)
-    for difficulty in DIFFICULTIES:
-        if name.endswith(difficulty):
-            return Task(_canonical(name.removesuffix(difficulty)), difficulty)
-    return Task(_canonical(name), "")
+    difficulty = next((level for level in DIFFICULTIES if name.endswith(level)), "")
+    game = name.removesuffix(difficulty)
+    return Task("NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game, difficulty)
 
 
-def _canonical(game: str) -> str:
-    return "NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game
-
-
-@overload
-def normalise(env_id: str, value: float) -> float: ...
-@overload
-def normalise(env_id: str, value: NDArray[np.float64]) -> NDArray[np.float64]: ...
-def normalise(env_id: str, value: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Map a return to [0, 1]: (x + 1) / 2 for five games, x for the others.
+def normalise(env_id: str, value: Value) -> Value:
+    """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for five games, x for the others.
 
     Args:
         env_id: environment id, with or without version.
