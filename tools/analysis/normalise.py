@@ -1,7 +1,7 @@
 """Returns on one scale, by the rule that reproduces the paper's text."""
 
 import re
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +14,15 @@ DIFFICULTIES = ("Easy", "Medium", "Hard")
 Value = TypeVar("Value", float, NDArray[np.float64])
 
 
-class Task(NamedTuple):
-    """A game at a difficulty; ``difficulty`` is empty for an id of another shape."""
-
-    game: str
-    difficulty: str
-
-
-def split_id(env_id: str) -> Task:
-    """Game and difficulty of an environment id.
+def game_of(env_id: str) -> str:
+    """The game of an environment id, without difficulty and version.
 
     Example:
-        >>> split_id("MineSweeperEasy-v0")
-        Task(game='MineSweeper', difficulty='Easy')
+        >>> game_of("MineSweeperEasy-v0")
+        'MineSweeper'
     """
-    name = re.sub(r"-v\d+$", "", env_id)
-    difficulty = next((level for level in DIFFICULTIES if name.endswith(level)), "")
-    game = name.removesuffix(difficulty)
-    return Task("NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game, difficulty)
+    game = re.sub(rf"({'|'.join(DIFFICULTIES)})?(-v\d+)?$", "", env_id)
+    return "NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game
 
 
 def normalise(env_id: str, value: Value) -> Value:
@@ -50,4 +41,4 @@ def normalise(env_id: str, value: Value) -> Value:
         >>> normalise("TetrisEasy-v0", -0.5), normalise("CartPoleEasy-v0", 0.5)
         (0.25, 0.5)
     """
-    return (value + 1) / 2 if split_id(env_id).game in SIGNED_GAMES else value
+    return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value

@@ -9,7 +9,7 @@ import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
-from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, split_id
+from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, game_of
 from arcade_torch.tools.files import read_csv
 
 PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
@@ -82,7 +82,7 @@ def _deviations() -> dict[tuple[str, str], list[tuple[str, float]]]:
     """(agent, twin) -> normalised standard deviations over seeds, with the game of each."""
     found: dict[tuple[str, str], list[tuple[str, float]]] = {}
     for row in read_csv(PAPER_RETURNS):
-        game = split_id(row["env"]).game
+        game = game_of(row["env"])
         scale = 0.5 if game in SIGNED_GAMES else 1.0
         for twin, column in (("full", "mdp_std"), ("partial", "pomdp_std")):
             found.setdefault((row["model"], twin), []).append((game, scale * float(row[column])))

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -65,9 +65,7 @@ class Window:
         return replace(self, **cut, ended=False)
 
 
-def greedy_window(
-    agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_STEPS, keep: int | None = None
-) -> Window:
+def greedy_window(agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_STEPS) -> Window:
     """Play one greedy episode and return what the agent saw.
 
     Args:
@@ -75,22 +73,18 @@ def greedy_window(
         env: ``ArcadeEnv`` with one environment.
         seed: of the episode.
         max_steps: the episode is cut after this many steps.
-        keep: the window holds the last so many steps (its ``state`` is the one before them); all by default.
 
     Returns:
         The window. The frame after the ending action is never part of it.
 
     Raises:
-        ValueError: the env is not a batch of one, or a length is below 1.
+        ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
     if tuple(env.batch_size) != (1,):
         raise ValueError(f"a window is played in a batch of one environment, got batch size {list(env.batch_size)}")
-    if max_steps < 1 or (keep is not None and keep < 1):
-        raise ValueError(f"max_steps and keep must be at least 1, got {max_steps} and {keep}")
-    size = keep or max_steps
-    (window,), (length,) = play(agent, env, seed=seed, keep=size, max_steps=max_steps)
-    if length > size:
-        (window,), _ = play(agent, env, seed=seed, keep=size, max_steps=max_steps, first=[int(length) - size])
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    (window,), _ = play(agent, env, seed=seed, keep=max_steps, max_steps=max_steps)
     return window
 
 
@@ -151,13 +145,6 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
     return last if length <= cap else int(rng.integers(cap - 1, length))
 
 
-class Played(NamedTuple):
-    """One episode of every env of a batch: what was kept of each, and all lengths int64 [N]."""
-
-    windows: list[Window]
-    lengths: NDArray[np.int64]
-
-
 @torch.no_grad()
 def play(
     agent: Any,
@@ -167,7 +154,7 @@ def play(
     keep: int,
     max_steps: int | None = None,
     first: Sequence[int] | None = None,
-) -> Played:
+) -> tuple[list[Window], NDArray[np.int64]]:
     """Play the first episode of every env of a batch greedily.
 
     Args:
@@ -179,7 +166,7 @@ def play(
         first: index of the first frame to keep, one for every env; 0 by default.
 
     Returns:
-        Windows and lengths. The frame after an ending action is never part of a window.
+        A window of each episode, and all lengths int64 [N]. The frame after an ending action is never part of a window.
     """
     size = int(env.batch_size[0])
     starts = torch.as_tensor([0] * size if first is None else first)
@@ -211,7 +198,7 @@ def play(
         seen = {name: value if name == "pixels" else value.reshape(-1) for name, value in kept[row, :steps].items()}
         whole = bool(ended[row]) and begin + steps == length
         windows.append(Window(seen.pop("pixels"), **seen, state=states[row], ended=whole, seed=seed, row=row))
-    return Played(windows, lengths.numpy())
+    return windows, lengths.numpy()
 
 
 def resolve_agent(agent: Any, env: Any = None, observability: Twin | None = None) -> tuple[Any, Any]:
