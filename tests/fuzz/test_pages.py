@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 
 from arcade_torch.tools.bench.registry import compare, page, read_results
-from arcade_torch.tools.figures.registry import make_figure
+from arcade_torch.tools.figures.registry import ScoreOptions, make_figure
 from arcade_torch.tools.reports.build import report
 from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -163,7 +163,7 @@ def test_hostile_names_are_drawn_as_they_are(
                 values["config"]["memory"] = evil
             config.write_text(json.dumps(values))
         out = tmp_path_factory.mktemp("drawn")
-        attempt("figure: hostile names", lambda: make_figure("gap-bias", runs=(study.root,), out=out))
+        attempt("figure: hostile names", lambda: make_figure("gap-bias", ScoreOptions((study.root,), out)))
     finally:
         _repair(study.root, before)
 

@@ -106,7 +106,7 @@ def test_benchmarks_are_drawn_from_a_table_or_it_is_refused(files: Path, seed: i
         games = list(dict.fromkeys(row["game"] for row in rows))
         for game in games:
             series(rows, game, "step+draw")
-        mean_series(rows, games, "step+draw", "mean")
+        mean_series(rows, games, "step+draw")
 
     attempt("figure throughput: reading", read)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from arcade_torch.tools import gap_and_bias
 from arcade_torch.tools.analysis.bootstrap import measured_coverage, percentile_interval, resampled_means
 from arcade_torch.tools.analysis.gap_bias import GapBias
-from arcade_torch.tools.analysis.normalise import normalise, split_id
+from arcade_torch.tools.analysis.normalise import game_of, normalise
 from arcade_torch.tools.runs import Score, read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
@@ -63,7 +63,7 @@ def test_five_games_are_mapped_and_five_are_not(value: float) -> None:
 
 
 def test_an_alias_is_the_same_game() -> None:
-    assert split_id("NoisyPoleEasy-v0").game == "NoisyCartPole" == split_id("NoisyCartPoleEasy").game
+    assert game_of("NoisyPoleEasy-v0") == "NoisyCartPole" == game_of("NoisyCartPoleEasy")
 
 
 def scores(values: dict[tuple[str, str], list[float]], game: str = "CartPoleEasy") -> list[Score]:

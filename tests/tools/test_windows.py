@@ -11,6 +11,7 @@ import arcade_torch
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import greedy_window, saliency
+from arcade_torch.tools.analysis.windows import play
 
 GAME = "MineSweeperEasy"
 
@@ -65,13 +66,15 @@ def test_an_episode_that_is_too_long_is_cut_and_says_so(env: Any) -> None:
 
 
 def test_the_end_of_an_episode_can_be_kept_alone_with_the_state_before_it(env: Any) -> None:
-    whole, end = greedy_window(Scripted([0]), env, seed=3), greedy_window(Scripted([0]), env, seed=3, keep=4)
+    whole = greedy_window(Scripted([0]), env, seed=3)
+    (end,), _ = play(Scripted([0]), env, seed=3, keep=4, first=[whole.n - 3])
     assert torch.equal(whole.frames[-4:], end.frames) and int(end.state["count"]) == whole.n - 3
     assert not end.is_init.any()
 
 
 def test_the_saliency_of_a_kept_end_is_that_of_the_whole_episode(env: Any, agent: Agent) -> None:
-    whole, end = (greedy_window(agent, env, seed=3, max_steps=12, keep=keep) for keep in (None, 4))
+    whole = greedy_window(agent, env, seed=3, max_steps=12)
+    (end,), _ = play(agent, env, seed=3, keep=4, max_steps=12, first=[whole.n - 3])
     full, part = (saliency(agent, w.frames, w.last_action, w.is_init, w.state) for w in (whole, end))
     np.testing.assert_allclose(part.output, full.output, atol=1e-5)
     np.testing.assert_allclose(part.maps, full.maps[-4:], rtol=1e-3, atol=1e-6 * full.maps.max())

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,21 +31,12 @@ class Interval:
 
 
 def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> list[Array]:
-    """The seeds of each task, resampled with replacement.
-
-    Args:
-        cells: for each task the scores of its seeds, float64 [n_seeds].
-        draws: number of resamples D.
-        rng: source of the draws.
-
-    Returns:
-        For each task float64 [D, n_seeds].
-    """
+    """The seeds of each task, float64 [n_seeds], resampled with replacement to [draws, n_seeds]."""
     return [cell[rng.integers(len(cell), size=(draws, len(cell)))] for cell in cells]
 
 
 def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> Array:
-    """Means over tasks of resampled seeds, float64 [D]; arguments as for `resampled`."""
+    """Means over tasks of resampled seeds, float64 [draws]."""
     return mean_over_tasks(resampled(cells, draws, rng))
 
 
@@ -64,21 +56,22 @@ def iqm(cells: Sequence[Array]) -> Array:
 
 
 def percentile_interval(value: float, draws: Array, confidence: float, known: bool = True) -> Interval:
-    """Percentile interval of bootstrap draws.
-
-    Args:
-        value: the estimate itself.
-        draws: float64 [D].
-        confidence: for example 0.95.
-        known: False where too few seeds stand behind the draws; the ends become NaN.
-    """
+    """Percentile interval of an estimate from its bootstrap draws; its ends are NaN where ``known`` is false."""
     if not known:
         return Interval(value, float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(value, float(low), float(high))
 
 
-def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> tuple[Array, Array, Array]:
+class Estimate(NamedTuple):
+    """Means over seeds and both ends of their intervals, arrays of one shape."""
+
+    mean: Array
+    low: Array
+    high: Array
+
+
+def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
     """Mean over seeds and its percentile interval, cell by cell.
 
     Args:
@@ -88,19 +81,33 @@ def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed:
         seed: of the draws.
 
     Returns:
-        Mean and both ends of the interval, each [...]; the ends are NaN where fewer than two seeds have a value, the
-        mean is NaN where none has.
+        Arrays [...]; the ends are NaN where fewer than two seeds have a value, the mean is NaN where none has.
     """
     flat = values.reshape(values.shape[0], -1)
     found = np.full((3, flat.shape[1]), np.nan)
     for cell in range(flat.shape[1]):
         known = flat[np.isfinite(flat[:, cell]), cell]
         if known.size:
-            resampled = resampled_means([known], draws, np.random.default_rng(seed)) if known.size > 1 else known
-            interval = percentile_interval(float(known.mean()), resampled, confidence, known.size > 1)
+            drawn = resampled_means([known], draws, np.random.default_rng(seed)) if known.size > 1 else known
+            interval = percentile_interval(float(known.mean()), drawn, confidence, known.size > 1)
             found[:, cell] = interval.value, interval.low, interval.high
-    mean, low, high = found.reshape(3, *values.shape[1:])
-    return mean, low, high
+    return Estimate(*found.reshape(3, *values.shape[1:]))
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Values of every seed [n_seeds, ...], their mean and its interval, each [...]."""
+
+    seeds: Array
+    mean: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(cls, values: Sequence[Array], confidence: float = 0.95) -> "Pooled":
+        """Pool the arrays of some seeds; see `over_seeds`."""
+        seeds = np.array(values)
+        return cls(seeds, *over_seeds(seeds, confidence))
 
 
 def seed_coverage(seeds: int, confidence: float = 0.95) -> float:

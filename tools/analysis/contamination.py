@@ -21,13 +21,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.tools.analysis.gradients import encode_frames
-from arcade_torch.tools.analysis.perturbation import disturbed_frames, replayed, shuffle_order
-from arcade_torch.tools.analysis.policy import Policy, Target, evaluation, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.resolve import resolve_agent
-from arcade_torch.tools.analysis.windows import MAX_STEPS, Window, greedy_windows
+from arcade_torch.tools.analysis.policy import Policy, Target, outputs, policy_of, resolve
+from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_windows, resolve_agent
 
+Progress = Callable[[int, int], None]
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 SIGMAS = (0.1, 0.3, 1.0)
 """Standard deviations of the noise, on the [0, 1] scale."""
@@ -37,6 +36,12 @@ DELAYS = (0, 1, 2, 5, 10, 20, 50, 100)
 
 POINTS_AN_EPISODE = 4
 """Start points drawn from one trajectory."""
+
+FIRST, LAST = 1, 10
+"""A shuffle permutes the frames behind the first of these, up to the last."""
+
+WHITE = 255.0
+"""Pixel value that stands for 1."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +80,10 @@ class Contamination:
 
     def mean(self, measure: Literal["flip", "change", "kl"]) -> Floats:
         """Mean over start points, float64 [S, K]; NaN where there is none."""
-        values: Floats = getattr(self, measure)
-        count = np.isfinite(values).sum(axis=0)
-        total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        values = np.ma.masked_invalid(getattr(self, measure))
+        return np.asarray(values.mean(axis=0).filled(np.nan))
 
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Ints:
         """Start points behind every mean, int64 [S, K]."""
         return np.asarray(np.isfinite(self.flip).sum(axis=0), dtype=np.int64)
 
@@ -95,10 +98,10 @@ def contamination(
     clip: bool = False,
     feedback: bool = False,
     seed: int = 0,
-    observability: Literal["full", "partial"] | None = None,
+    observability: Twin | None = None,
     cap: int = MAX_STEPS,
     target: Target = "auto",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Contamination:
     """Noise on one past observation, for a grid of strengths and delays.
 
@@ -124,35 +127,32 @@ def contamination(
     """
     if not sigmas or min(sigmas) < 0:
         raise ValueError(f"sigmas must be numbers of at least 0, got {list(sigmas)}")
-    grid = _Grid(np.array(sigmas, dtype=np.float64), _delays(delays))
+    strengths = np.array(sigmas, dtype=np.float64)
 
-    def disturb(policy: Policy, window: Window, features: Tensor, rng: np.random.Generator, wanted: int) -> _Rows:
+    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> _Versions:
         places = np.sort(rng.choice(window.n, min(wanted, window.n), replace=False))
-        noisy = disturbed_frames(window.frames, places, grid.sigmas, clip, int(rng.integers(2**62)))
-        rows = features.repeat(1 + noisy.shape[0], 1, 1)
-        index = torch.as_tensor(np.repeat(places, len(grid.sigmas)))
-        rows[torch.arange(1, 1 + noisy.shape[0]), index] = encode_frames(policy.encode, noisy)
-        return _Rows(rows, places, places)
+        noisy = disturbed_frames(window.frames, places, strengths, clip, int(rng.integers(2**62)))
+        return _noisy_versions(policy, window, places, noisy)
 
-    options = _Options(starts, POINTS_AN_EPISODE, feedback, seed, cap, target, 2)
-    return _measure("noise", agent, env, observability, grid, options, disturb, clip, progress)
+    how = _How("noise", strengths, delays, starts, POINTS_AN_EPISODE, 2, feedback, clip, seed, cap, target)
+    return _measure(agent, env, observability, how, disturb, progress)
 
 
 def shuffled_beginning(
     agent: Any,
     env: Any = None,
     *,
-    first: int = 1,
-    last: int = 10,
+    first: int = FIRST,
+    last: int = LAST,
     delays: Sequence[int] = DELAYS,
     starts: int = 200,
     feedback: bool = False,
     identity: bool = False,
     seed: int = 0,
-    observability: Literal["full", "partial"] | None = None,
+    observability: Twin | None = None,
     cap: int = MAX_STEPS,
     target: Target = "auto",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Contamination:
     """Permute the frames first + 1 ... last of a trajectory and keep all others.
 
@@ -160,19 +160,12 @@ def shuffled_beginning(
     draw conclusions on MDPs only.
 
     Args:
-        agent: as for `contamination`.
-        env: as for `contamination`.
+        agent: as for `contamination`, and so are ``env`` and all options that do not stand here.
         first: index of the last frame of the beginning that stays.
         last: index of the last permuted frame.
         delays: steps from frame ``last`` to the decision.
         starts: permutations P, one a trajectory.
-        feedback: as for `contamination`.
         identity: use the identity in place of random permutations, which must change nothing.
-        seed: as for `contamination`.
-        observability: as for `contamination`.
-        cap: as for `contamination`.
-        target: as for `contamination`.
-        progress: as for `contamination`.
 
     Returns:
         Arrays; ``sigmas`` is one NaN.
@@ -182,118 +175,105 @@ def shuffled_beginning(
     """
     if first < 0 or last < first + 2:
         raise ValueError(f"frames first + 1 to last must be at least two, got first = {first} and last = {last}")
-    grid = _Grid(np.array([np.nan]), _delays(delays))
 
-    def disturb(policy: Policy, window: Window, features: Tensor, rng: np.random.Generator, wanted: int) -> _Rows:
+    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> _Versions:
         order = np.arange(window.n + 1) if identity else shuffle_order(window.n + 1, first, last, rng)
-        rows = torch.cat([features, features[:, torch.as_tensor(order)]])
-        return _Rows(rows, np.array([last]), np.array([first]))
+        return _shuffled_versions(policy, window, order, first, last)
 
-    options = _Options(starts, 1, feedback, seed, cap, target, last + 1)
-    return _measure("shuffle", agent, env, observability, grid, options, disturb, False, progress)
+    how = _How("shuffle", np.array([np.nan]), delays, starts, 1, last + 1, feedback, False, seed, cap, target)
+    return _measure(agent, env, observability, how, disturb, progress)
 
 
 @dataclass(frozen=True)
-class _Grid:
+class _How:
+    """Options of both measures, and how many points an episode gives and how many frames it needs."""
+
+    kind: str
     sigmas: Floats
-    delays: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Options:
+    delays: Sequence[int]
     starts: int
     per_window: int
+    shortest: int
     feedback: bool
+    clip: bool
     seed: int
     cap: int
     target: Target
-    shortest: int
 
 
 @dataclass(frozen=True)
-class _Rows:
-    """Features [1 + points * S, T, E], the undisturbed row first; where decisions count from; where to free actions."""
+class _Versions:
+    """Features [1 + points * S, T, E], the undisturbed row first; where delays count from; the first changed frame."""
 
     features: Tensor
-    places: NDArray[np.int64]
-    touched: NDArray[np.int64]
-
-
-def _delays(delays: Sequence[int]) -> NDArray[np.int64]:
-    if not delays or min(delays) < 0:
-        raise ValueError(f"delays must be whole numbers of at least 0, got {list(delays)}")
-    return np.array(sorted(set(delays)), dtype=np.int64)
-
-
-Disturb = Callable[[Policy, Window, Tensor, np.random.Generator, int], _Rows]
+    places: Ints
+    changed: int
 
 
 @torch.no_grad()
 def _measure(
-    kind: str,
     agent: Any,
     env: Any,
-    observability: Literal["full", "partial"] | None,
-    grid: _Grid,
-    options: _Options,
-    disturb: Disturb,
-    clip: bool,
-    progress: Callable[[int, int], None] | None,
+    observability: Twin | None,
+    how: _How,
+    disturb: Callable[[Policy, Window, np.random.Generator, int], _Versions],
+    progress: Progress | None,
 ) -> Contamination:
-    if options.starts < 1:
-        raise ValueError(f"starts must be at least 1, got {options.starts}")
+    if not how.delays or min(how.delays) < 0:
+        raise ValueError(f"delays must be whole numbers of at least 0, got {list(how.delays)}")
+    if how.starts < 1:
+        raise ValueError(f"starts must be at least 1, got {how.starts}")
     player, env = resolve_agent(agent, env, observability)
-    what = resolve(player, options.target)
+    what = resolve(player, how.target)
     if what == "value":
         raise ValueError("contamination compares actions: target must be q, logits or probs, not value")
-    policy, parts = policy_of(player), []
-    points: list[tuple[int, int]] = []
-    skipped, error = 0, 0.0
-    rng = np.random.default_rng([options.seed, 1])
-    episodes = 4 * -(-options.starts // options.per_window) + 16
-    windows = greedy_windows(player, env, episodes=episodes, seed=options.seed, cap=options.cap)
-    with evaluation(policy):
-        for number, window in enumerate(windows):
-            if window.n + 1 < max(2, options.shortest):
+    delays = np.unique(np.array(how.delays, dtype=np.int64))
+    policy, parts, points = policy_of(player), list[tuple[Floats, ...]](), list[tuple[int, int]]()
+    skipped, error, rng = 0, 0.0, np.random.default_rng([how.seed, 1])
+    episodes = 4 * -(-how.starts // how.per_window) + 16
+    with policy.evaluating():
+        for number, w in enumerate(greedy_windows(player, env, episodes=episodes, seed=how.seed, cap=how.cap)):
+            if w.n + 1 < max(2, how.shortest):
                 skipped += 1
                 continue
-            features = encode_frames(policy.encode, window.frames)[None]
-            wanted = min(options.per_window, options.starts - len(points))
-            rows = disturb(policy, window, features, rng, wanted)
-            raw = replayed(policy, window, rows.features, rows.touched, options.feedback)
-            parts.append(_compare(player, what, raw, rows.places, grid))
-            error = max(error, _clean_error(policy, window, features, rows, raw[0], options.feedback))
-            points += [(number, int(place)) for place in rows.places]
+            versions = disturb(policy, w, rng, min(how.per_window, how.starts - len(points)))
+            raw = replayed(policy, w, versions.features, versions.changed, how.feedback)
+            parts.append(_compare(player, what, raw, versions.places[:, None, None] + delays, len(how.sigmas)))
+            # What the machinery itself does: a frame in the middle is replaced by itself, encoded alone.
+            again, middle = versions.features[:1].clone(), w.n // 2
+            again[0, middle] = policy.features(w.frames[middle : middle + 1])[0]
+            same = replayed(policy, w, again, versions.changed, how.feedback)[0]
+            error = max(error, float((same - raw[0]).abs().max()))
+            points += [(number, int(place)) for place in versions.places]
             if progress is not None:
-                progress(len(points), options.starts)
-            if len(points) >= options.starts:
+                progress(len(points), how.starts)
+            if len(points) >= how.starts:
                 break
     if not parts:
-        raise ValueError(f"none of {skipped} episodes was long enough: {options.shortest} frames are needed")
-    flip, change, kl = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        raise ValueError(f"none of {skipped} episodes was long enough: {how.shortest} frames are needed")
+    flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
     found = np.array(points, dtype=np.int64)
     return Contamination(
-        kind, grid.sigmas, grid.delays, flip, change, kl, found, error, skipped, what, options.feedback, clip
+        how.kind, how.sigmas, delays, flip, change, kl, found, error, skipped, what, how.feedback, how.clip
     )
 
 
-def _compare(model: Any, what: str, raw: Tensor, places: NDArray[np.int64], grid: _Grid) -> tuple[Floats, ...]:
-    """Flip, relative change and KL of rows 1... against row 0, each [points, S, K]."""
-    shape = len(places), len(grid.sigmas), len(grid.delays)
-    steps = np.broadcast_to(places[:, None, None] + grid.delays, shape)
+def _compare(model: Any, what: str, raw: Tensor, decisions: Ints, sigmas: int) -> tuple[Floats, ...]:
+    """Flip, relative change and KL of rows 1... against row 0 at steps [points, 1, K], each [points, S, K]."""
+    shape = len(decisions), sigmas, decisions.shape[-1]
+    steps = np.broadcast_to(decisions, shape)
     known = torch.as_tensor(steps < raw.shape[1])
     index = torch.as_tensor(np.minimum(steps, raw.shape[1] - 1)).reshape(-1)
     rows = torch.arange(1, raw.shape[0]).reshape(shape[:2])[..., None].expand(shape).reshape(-1)
-    before, after = raw[0, index], raw[rows, index]
     scalars = outputs(model, what)
-    a, b = (_centred(scalars(out).double().cpu()) for out in (before, after))
+    a, b = (_centred(scalars(out).double().cpu()) for out in (raw[0, index], raw[rows, index]))
     spread = a.amax(-1) - a.amin(-1)
     change = torch.where(spread > 0, (b - a).abs().amax(-1) / spread, torch.nan)
     flip = (a.argmax(-1) != b.argmax(-1)).double()
     kl = torch.full_like(flip, torch.nan)
     if what in ("logits", "probs"):
         logits = outputs(model, "logits")
-        p, q = (logits(out).double().cpu().log_softmax(-1) for out in (before, after))
+        p, q = (logits(out).double().cpu().log_softmax(-1) for out in (raw[0, index], raw[rows, index]))
         kl = (p.exp() * (p - q)).sum(-1)
     return tuple(torch.where(known, v.reshape(shape), torch.nan).numpy() for v in (flip, change, kl))
 
@@ -302,9 +282,114 @@ def _centred(values: Tensor) -> Tensor:
     return values - values.mean(-1, keepdim=True)
 
 
-def _clean_error(policy: Policy, window: Window, features: Tensor, rows: _Rows, clean: Tensor, feedback: bool) -> float:
-    """What the machinery itself does: a frame in the middle is replaced by itself, encoded alone."""
-    middle = window.n // 2
-    again = features.clone()
-    again[0, middle] = encode_frames(policy.encode, window.frames[middle : middle + 1])[0]
-    return float((replayed(policy, window, again, rows.touched, feedback)[0] - clean).abs().max())
+def disturbed_frames(frames: Tensor, places: Ints, sigmas: Floats, clip: bool, seed: int) -> Tensor:
+    """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame share its draw."""
+    generator = torch.Generator().manual_seed(seed)
+    chosen = frames[torch.as_tensor(places)].to(torch.float32)
+    noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
+    scale = torch.as_tensor(WHITE * sigmas, dtype=torch.float32, device=chosen.device)
+    noisy = (chosen[:, None] + scale[:, None, None, None] * noise[:, None]).flatten(0, 1)
+    return noisy.clamp(0.0, WHITE) if clip else noisy
+
+
+def _noisy_versions(policy: Policy, window: Window, places: Ints, noisy: Tensor) -> _Versions:
+    """A version for each noisy frame, those of one place in a row."""
+    rows = policy.features(window.frames).repeat(1 + len(noisy), 1, 1)
+    index = torch.as_tensor(places.repeat(len(noisy) // len(places)))
+    rows[torch.arange(1, 1 + len(noisy)), index] = policy.features(noisy)
+    return _Versions(rows, places, int(places.min()))
+
+
+def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -> Ints:
+    """Indices of ``total`` frames with those from first + 1 to last in another order."""
+    if not 0 <= first <= last - 2 or last >= total:
+        raise ValueError(f"cannot permute frames {first + 1} to {last} of {total}")
+    order = np.arange(total)
+    part = order[first + 1 : last + 1]
+    while (order == np.arange(total)).all():  # the identity is no shuffle
+        order[first + 1 : last + 1] = rng.permutation(part)
+    return order
+
+
+def _shuffled_versions(policy: Policy, window: Window, order: Ints, first: int, last: int) -> _Versions:
+    features = policy.features(window.frames)
+    return _Versions(torch.stack([features, features[torch.as_tensor(order)]]), np.array([last]), first)
+
+
+@torch.no_grad()
+def replayed(policy: Policy, window: Window, features: Tensor, changed: int, feedback: bool) -> Tensor:
+    """What the memory says at every step of several versions of a trajectory that differ from frame ``changed`` on."""
+    count = features.shape[0]
+    state: Any = policy.initial_state(1) if window.state is None else window.state
+    if state is not None:
+        state = state.expand(count, *state.shape[1:]).clone()
+    actions, starts = window.last_action.expand(count, -1), window.is_init.bool().expand(count, -1)
+    if not feedback:
+        return policy.remember(features, actions, starts, state)[0]
+    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions lead there.
+    head = slice(changed + 1)
+    out, state = policy.remember(features[:, head], actions[:, head], starts[:, head], state)
+    parts = [out]
+    for t in range(changed + 1, features.shape[1]):
+        out, state = policy.remember(features[:, t : t + 1], policy.greedy(out[:, -1:]), starts[:, t : t + 1], state)
+        parts.append(out)
+    return torch.cat(parts, 1)
+
+
+@dataclass(frozen=True)
+class Examples:
+    """One trajectory, undisturbed and disturbed in several ways: pictures, and what the agent then thought.
+
+    Attributes:
+        frames: uint8 [R, F, S, S, 3], some frames of each version; row 0 is undisturbed.
+        names: int [R, F], the index of each frame.
+        values: float64 [R, A] at the last step: relative Q-values (minus their mean), or probabilities.
+        labels: [R], what was done.
+        target: which outputs.
+        n: index of the last step.
+    """
+
+    frames: NDArray[np.uint8]
+    names: Ints
+    values: Floats
+    labels: tuple[str, ...]
+    target: str
+    n: int
+
+
+@torch.no_grad()
+def examples(model: Any, window: Window, hits: Sequence[int] = (), seed: int = 0) -> Examples:
+    """What noise of strength 1 on one frame each does to the decision on the last frame of a window.
+
+    Args:
+        model: see `policy_of`.
+        window: the trajectory.
+        hits: index of the noisy frame of each version; without any, the early frames are shuffled instead.
+        seed: of the noise, or the order.
+
+    Raises:
+        ValueError: a hit lies outside the window, or the window is too short for a shuffle.
+    """
+    if hits and not 0 <= min(hits) <= max(hits) <= window.n:
+        raise ValueError(f"hits must be indices from 0 to {window.n}, got {list(hits)}")
+    policy, target = policy_of(model), resolve(model, "auto")
+    with policy.evaluating():
+        if hits:
+            noisy = disturbed_frames(window.frames, np.array(hits), np.array([1.0]), False, seed)
+            versions = _noisy_versions(policy, window, np.array(hits), noisy)
+            names = [[0, hit, window.n] for hit in (hits[0], *hits)]
+            pictures = window.frames[torch.tensor(names)]
+            for row, hit in enumerate(hits):
+                changed = torch.tensor(names[row + 1]) == hit
+                pictures[row + 1, changed] = noisy[row].clamp(0, WHITE).round().to(torch.uint8)
+            labels = ("clean", *(f"noise on frame {hit}" for hit in hits))
+        else:
+            order = shuffle_order(window.n + 1, FIRST, LAST, np.random.default_rng(seed))
+            versions = _shuffled_versions(policy, window, order, FIRST, LAST)
+            late = list(range(max(LAST + 1, window.n - 2), window.n + 1))
+            names = [[*early, *late] for early in (range(FIRST + 1, FIRST + 4), order[FIRST + 1 : FIRST + 4].tolist())]
+            pictures, labels = window.frames[torch.tensor(names)], ("clean", "shuffled beginning")
+        raw = replayed(policy, window, versions.features, versions.changed, False)[:, -1]
+    values = outputs(model)(raw).double().cpu()
+    values = values if target == "probs" else _centred(values)
+    return Examples(pictures.cpu().numpy(), np.array(names), values.numpy(), labels, target, window.n)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
+from arcade_torch.tools.analysis.bootstrap import Array, Pooled, over_seeds
 from arcade_torch.tools.studies.folder import RunFolder
 
 POINTS = 120
@@ -13,17 +13,13 @@ POINTS = 120
 
 
 @dataclass(frozen=True)
-class Curve:
-    """One agent on one task, averaged over seeds."""
+class Curve(Pooled):
+    """One agent on one task: returns at some frames, pooled over seeds."""
 
     agent: str
     game: str
     observability: str
     frames: Array
-    mean: Array
-    low: Array
-    high: Array
-    seeds: Array
 
 
 def curves_of_runs(
@@ -40,10 +36,17 @@ def curves_of_runs(
         One curve a group whose runs have logged something at frames that all of them reached.
     """
     found = []
-    for (agent, game, twin), runs in groups.items():
+    for task, runs in groups.items():
         histories = [history for run in runs if (history := _history(run, kind))[0].size]
-        if histories and (curve := _curve(agent, game, twin, histories, kind, confidence)).frames.size:
-            found.append(curve)
+        if not histories:
+            continue
+        end = min(frames[-1] for frames, _ in histories)
+        start = max(frames[0] for frames, _ in histories)
+        longest = max((frames for frames, _ in histories), key=len)
+        grid = longest[(longest >= start) & (longest <= end)] if kind == "eval" else np.linspace(start, end, POINTS)
+        if grid.size:
+            seeds = np.array([np.interp(grid, frames, values) for frames, values in histories])
+            found.append(Curve(seeds, *over_seeds(seeds, confidence), *task, grid))
     return found
 
 
@@ -55,15 +58,3 @@ def _history(run: RunFolder, kind: str) -> tuple[Array, Array]:
         return frames, np.array([float(row[column]) for row in rows])
     except ValueError as error:
         raise ValueError(f"{run.path / name} is damaged: {error}") from None
-
-
-def _curve(
-    agent: str, game: str, twin: str, histories: Sequence[tuple[Array, Array]], kind: str, confidence: float
-) -> Curve:
-    end = min(frames[-1] for frames, _ in histories)
-    start = max(frames[0] for frames, _ in histories)
-    longest = max((frames for frames, _ in histories), key=len)
-    grid = longest[(longest >= start) & (longest <= end)] if kind == "eval" else np.linspace(start, end, POINTS)
-    seeds = np.array([np.interp(grid, frames, values) for frames, values in histories])
-    mean, low, high = over_seeds(seeds, confidence)
-    return Curve(agent, game, twin, grid, mean, low, high, seeds)

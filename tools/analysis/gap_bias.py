@@ -22,7 +22,7 @@ from arcade_torch.tools.analysis.bootstrap import (
     percentile_interval,
     resampled,
 )
-from arcade_torch.tools.analysis.normalise import normalise, split_id
+from arcade_torch.tools.analysis.normalise import game_of, normalise
 from arcade_torch.tools.runs import Score, Source, find_baseline, read_scores
 
 TWINS = ("full", "partial")
@@ -82,8 +82,7 @@ class GapBias:
     confidence: float
     draws: int
     without: Mapping[str, tuple[AgentRow, ...]] = field(default_factory=dict)
-    _gap_draws: Mapping[str, Array] = field(default_factory=dict, repr=False)
-    _pomdp_draws: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    _draws: Mapping[tuple[str, str], Array] = field(default_factory=dict, repr=False)
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
@@ -94,15 +93,16 @@ class GapBias:
 
     def gap_difference(self, first: str, second: str) -> Interval:
         """Gap(first) - Gap(second) with an interval from the same draws."""
-        return self._difference(self._gap_draws, self.row(first).gap, self.row(second).gap, first, second)
+        return self._difference("gap", first, second)
 
     def pomdp_difference(self, first: str, second: str) -> Interval:
         """Normalised POMDP return of first minus that of second."""
-        return self._difference(self._pomdp_draws, self.row(first).pomdp, self.row(second).pomdp, first, second)
+        return self._difference("pomdp", first, second)
 
-    def _difference(self, draws: Mapping[str, Array], a: Interval, b: Interval, first: str, second: str) -> Interval:
-        known = not (np.isnan(a.low) or np.isnan(b.low))
-        return percentile_interval(a.value - b.value, draws[first] - draws[second], self.confidence, known)
+    def _difference(self, name: str, first: str, second: str) -> Interval:
+        a, b = (getattr(self.row(agent), name) for agent in (first, second))
+        draws = self._draws[first, name] - self._draws[second, name]
+        return percentile_interval(a.value - b.value, draws, self.confidence, not np.isnan(a.low + b.low))
 
     def table(self) -> list[dict[str, Any]]:
         """Plain rows, for a CSV file; games left out stand in column ``without``."""
@@ -152,14 +152,14 @@ def gap_and_bias(
     tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]
     if not tasks:
         raise ValueError("no task has finished runs of every agent on both twins: nothing to compare yet")
-    rows, gaps, pomdps = _rows(cells, agents, tasks, draws, confidence, seed)
-    games = list(dict.fromkeys(split_id(task).game for task in tasks))
+    rows, kept = _rows(cells, agents, tasks, draws, confidence, seed)
+    games = list(dict.fromkeys(game_of(task) for task in tasks))
     without = {}
     for game in games if len(games) > 1 else []:
-        rest = [task for task in tasks if split_id(task).game != game]
+        rest = [task for task in tasks if game_of(task) != game]
         without[game] = _rows(cells, agents, rest, draws, confidence, seed, with_iqm=False)[0]
     dropped = tuple(game for game in every if game not in tasks)
-    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, gaps, pomdps)
+    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, kept)
 
 
 Cells = dict[tuple[str, str, str], Array]
@@ -184,44 +184,42 @@ def _rows(
     confidence: float,
     seed: int,
     with_iqm: bool = True,
-) -> tuple[tuple[AgentRow, ...], dict[str, Array], dict[str, Array]]:
-    raw = {key: cells[key] for key in ((a, t, twin) for a in agents for t in tasks for twin in TWINS)}
-    scaled = {key: normalise(key[1], values) for key, values in raw.items()}
-    base = agents[0]
+) -> tuple[tuple[AgentRow, ...], dict[tuple[str, str], Array]]:
+    """A row an agent, the memory-free one first; and (agent, ``gap`` or ``pomdp``) -> draws."""
     found: dict[tuple[str, str], dict[str, tuple[float, Array]]] = {}  # values and draws
     for i, agent in enumerate(agents):
         for j, twin in enumerate(TWINS):
-            # The stream depends on the place of the agent's twin alone: raw, normalised and IQM share its draws.
-            parts = {}
-            for name, source in (("raw", raw), ("mean", scaled)):
-                drawn = resampled(
-                    [source[agent, task, twin] for task in tasks], draws, np.random.default_rng([seed, i, j])
-                )
-                parts[name] = (_mean(source, agent, tasks, twin), mean_over_tasks(drawn))
-            middle = float(iqm([scaled[agent, task, twin] for task in tasks]))
-            parts["iqm"] = (middle, iqm(drawn) if with_iqm else np.full(1, np.nan))
-            found[agent, twin] = parts
-    rows, gaps, pomdps = [], {}, {}
+            raw = [cells[agent, task, twin] for task in tasks]
+            drawn_raw = resampled(raw, draws, np.random.default_rng([seed, i, j]))
+            scaled, drawn = (
+                [normalise(task, each) for task, each in zip(tasks, every, strict=True)] for every in (raw, drawn_raw)
+            )
+            found[agent, twin] = {
+                "raw": (_mean(raw), mean_over_tasks(drawn_raw)),
+                "mean": (_mean(scaled), mean_over_tasks(drawn)),
+                "iqm": (float(iqm(scaled)), iqm(drawn) if with_iqm else np.full(1, np.nan)),
+            }
+    counts = {key: tuple(len(cells[key[0], task, key[1]]) for task in tasks) for key in found}
+    rows, kept = list[AgentRow](), dict[tuple[str, str], Array]()
+    free, free_seeds = found[agents[0], "full"]["mean"], min(counts[agents[0], "full"])
     for agent in agents:
         full, partial = found[agent, "full"], found[agent, "partial"]
-        counts = {twin: tuple(len(raw[agent, task, twin]) for task in tasks) for twin in TWINS}
-        least = min(counts["full"] + counts["partial"])
-        free, base_least = found[base, "full"]["mean"], min(len(raw[base, task, "full"]) for task in tasks)
-        gaps[agent], pomdps[agent] = full["mean"][1] - partial["mean"][1], partial["mean"][1]
+        seeds = min(counts[agent, "full"] + counts[agent, "partial"])
+        kept[agent, "gap"], kept[agent, "pomdp"] = full["mean"][1] - partial["mean"][1], partial["mean"][1]
         values = {"mdp_raw": full["raw"], "pomdp_raw": partial["raw"], "mdp": full["mean"], "pomdp": partial["mean"]}
         values |= {"mdp_iqm": full["iqm"], "pomdp_iqm": partial["iqm"]}
-        values["gap"] = (full["mean"][0] - partial["mean"][0], gaps[agent])
-        intervals = {name: percentile_interval(*pair, confidence, least > 1) for name, pair in values.items()}
-        intervals["bias"] = percentile_interval(
-            full["mean"][0] - free[0], full["mean"][1] - free[1], confidence, min(least, base_least) > 1
-        )
-        coverage = measured_coverage(counts["full"], counts["partial"], confidence) if least > 1 else float("nan")
-        rows.append(AgentRow(agent, least, coverage=coverage, **intervals))
-    return tuple(rows), gaps, pomdps
+        values["gap"] = (full["mean"][0] - partial["mean"][0], kept[agent, "gap"])
+        intervals = {name: percentile_interval(*pair, confidence, seeds > 1) for name, pair in values.items()}
+        bias = full["mean"][0] - free[0], full["mean"][1] - free[1]
+        intervals["bias"] = percentile_interval(*bias, confidence, min(seeds, free_seeds) > 1)
+        both = counts[agent, "full"], counts[agent, "partial"]
+        coverage = measured_coverage(*both, confidence) if seeds > 1 else float("nan")
+        rows.append(AgentRow(agent, seeds, coverage=coverage, **intervals))
+    return tuple(rows), kept
 
 
-def _mean(source: Cells, agent: str, tasks: Sequence[str], twin: str) -> float:
-    return float(np.mean([source[agent, task, twin].mean() for task in tasks]))
+def _mean(cells: Sequence[Array]) -> float:
+    return float(np.mean([cell.mean() for cell in cells]))
 
 
 def _plain(row: AgentRow, without: str) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Returns on one scale, by the rule that reproduces the paper's text."""
 
 import re
-from typing import NamedTuple, overload
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,38 +11,22 @@ SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
 
 DIFFICULTIES = ("Easy", "Medium", "Hard")
 
-
-class Task(NamedTuple):
-    """A game at a difficulty; ``difficulty`` is empty for an id of another shape."""
-
-    game: str
-    difficulty: str
+Value = TypeVar("Value", float, NDArray[np.float64])
 
 
-def split_id(env_id: str) -> Task:
-    """Game and difficulty of an environment id.
+def game_of(env_id: str) -> str:
+    """The game of an environment id, without difficulty and version.
 
     Example:
-        >>> split_id("MineSweeperEasy-v0")
-        Task(game='MineSweeper', difficulty='Easy')
+        >>> game_of("MineSweeperEasy-v0")
+        'MineSweeper'
     """
-    name = re.sub(r"-v\d+$", "", env_id)
-    for difficulty in DIFFICULTIES:
-        if name.endswith(difficulty):
-            return Task(_canonical(name.removesuffix(difficulty)), difficulty)
-    return Task(_canonical(name), "")
-
-
-def _canonical(game: str) -> str:
+    game = re.sub(rf"({'|'.join(DIFFICULTIES)})?(-v\d+)?$", "", env_id)
     return "NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game
 
 
-@overload
-def normalise(env_id: str, value: float) -> float: ...
-@overload
-def normalise(env_id: str, value: NDArray[np.float64]) -> NDArray[np.float64]: ...
-def normalise(env_id: str, value: float | NDArray[np.float64]) -> float | NDArray[np.float64]:
-    """Map a return to [0, 1]: (x + 1) / 2 for five games, x for the others.
+def normalise(env_id: str, value: Value) -> Value:
+    """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for five games, x for the others.
 
     Args:
         env_id: environment id, with or without version.
@@ -57,4 +41,4 @@ def normalise(env_id: str, value: float | NDArray[np.float64]) -> float | NDArra
         >>> normalise("TetrisEasy-v0", -0.5), normalise("CartPoleEasy-v0", 0.5)
         (0.25, 0.5)
     """
-    return (value + 1) / 2 if split_id(env_id).game in SIGNED_GAMES else value
+    return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value

@@ -1,14 +1,15 @@
 """The paper's published returns: its table of aggregates, with the intervals that its standard deviations allow."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
-from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, split_id
+from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, game_of
 from arcade_torch.tools.files import read_csv
 
 PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
@@ -18,8 +19,7 @@ SEEDS = 5
 """Seeds (people, for human) behind every published mean."""
 
 
-@dataclass(frozen=True)
-class Spread:
+class Spread(NamedTuple):
     """Errors of an aggregate over tasks."""
 
     sem: float
@@ -56,26 +56,33 @@ def paper_table() -> PaperTable:
     Intervals are normal and 95 %, from the published standard deviations, with independent tasks; errors of Gap and
     Bias add in quadrature, as both sides are separate runs.
     """
-    table = gap_and_bias(PAPER_RETURNS, draws=1)
-    deviations = _deviations()
-    base = table.baseline
-    rows = tuple(_with_intervals(row, deviations, base, "") for row in table.rows)
-    without = {
-        game: tuple(_with_intervals(row, deviations, base, game) for row in part)
-        for game, part in table.without.items()
-    }
-    errors = {
-        twin: {row.agent: _spread(deviations[row.agent, twin], "") for row in table.rows}
-        for twin in ("full", "partial")
-    }
-    return PaperTable(replace(table, rows=rows, without=without), errors["full"], errors["partial"])
+    table, deviations = gap_and_bias(PAPER_RETURNS, draws=1), _deviations()
+
+    def errors(twin: str, without: str = "") -> dict[str, Spread]:
+        return {row.agent: _spread(deviations[row.agent, twin], without) for row in table.rows}
+
+    def widened(rows: Sequence[AgentRow], without: str = "") -> tuple[AgentRow, ...]:
+        full, partial = errors("full", without), errors("partial", without)
+        base = full[table.baseline].half_width
+        found = []
+        for row in rows:
+            mdp, pomdp = full[row.agent].half_width, partial[row.agent].half_width
+            bias = 0.0 if row.agent == table.baseline else float(np.hypot(mdp, base))
+            halves = {"mdp": mdp, "pomdp": pomdp, "gap": float(np.hypot(mdp, pomdp)), "bias": bias}
+            values = {name: (getattr(row, name).value, half) for name, half in halves.items()}
+            intervals: Any = {name: Interval(x, x - half, x + half) for name, (x, half) in values.items()}
+            found.append(replace(row, seeds=SEEDS, **intervals))
+        return tuple(found)
+
+    without = {game: widened(part, game) for game, part in table.without.items()}
+    return PaperTable(replace(table, rows=widened(table.rows), without=without), errors("full"), errors("partial"))
 
 
 def _deviations() -> dict[tuple[str, str], list[tuple[str, float]]]:
     """(agent, twin) -> normalised standard deviations over seeds, with the game of each."""
     found: dict[tuple[str, str], list[tuple[str, float]]] = {}
     for row in read_csv(PAPER_RETURNS):
-        game = split_id(row["env"]).game
+        game = game_of(row["env"])
         scale = 0.5 if game in SIGNED_GAMES else 1.0
         for twin, column in (("full", "mdp_std"), ("partial", "pomdp_std")):
             found.setdefault((row["model"], twin), []).append((game, scale * float(row[column])))
@@ -86,24 +93,3 @@ def _spread(deviations: list[tuple[str, float]], without: str) -> Spread:
     kept = np.array([value for game, value in deviations if game != without])
     half = 1.96 * np.sqrt((kept**2 / SEEDS).sum()) / kept.size
     return Spread(float(kept.mean() / np.sqrt(SEEDS * kept.size)), float(half))
-
-
-def _with_intervals(
-    row: AgentRow, deviations: Mapping[tuple[str, str], list[tuple[str, float]]], base: str, without: str
-) -> AgentRow:
-    full = _spread(deviations[row.agent, "full"], without).half_width
-    partial = _spread(deviations[row.agent, "partial"], without).half_width
-    other = _spread(deviations[base, "full"], without).half_width
-    bias = 0.0 if row.agent == base else float(np.hypot(full, other))
-    return replace(
-        row,
-        seeds=SEEDS,
-        mdp=_around(row.mdp.value, full),
-        pomdp=_around(row.pomdp.value, partial),
-        gap=_around(row.gap.value, float(np.hypot(full, partial))),
-        bias=_around(row.bias.value, bias),
-    )
-
-
-def _around(value: float, half: float) -> Interval:
-    return Interval(value, value - half, value + half)

@@ -1,24 +1,30 @@
 """Pixel saliency: how the decision at step n depends on every pixel seen at steps t <= n.
 
-``S(o_t) = sum_a || d Q(s_n, a) / d o_t ||^2``, the norm taken over colour channels at each pixel. Computed in two
-stages, see ``gradients``.
+``S(o_t) = sum_a || d Q(s_n, a) / d o_t ||^2``, the norm taken over colour channels at each pixel.
+
+Computed in two stages of ``torch.autograd``, as the encoder works frame by frame: memory and head are differentiated
+once with respect to the features, which gives the Jacobian J [outputs, frames, features]; then J is multiplied with the
+Jacobian of the encoder, some frames at a time. Memory use is that of one chunk; frames whose rows of J are exactly zero
+are skipped.
 
 Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation differentiates the sum over actions
 instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.tools.analysis.gradients import Norm, Reduce, encode_frames, frame_norms, memory_jacobian
-from arcade_torch.tools.analysis.policy import Target, evaluation, outputs, policy_of, resolve
+from arcade_torch.tools.analysis.policy import Policy, Target, outputs, policy_of, resolve
+from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, episode_window
 
-__all__ = ["Norm", "Reduce", "Saliency", "Target", "frame_gradients", "saliency"]
+Reduce = Literal["per_action", "sum"]
+Norm = Literal["l2sq", "l2", "l1"]
 
 
 @dataclass(frozen=True)
@@ -87,11 +93,30 @@ def saliency(
         ValueError: a shape does not fit, n is out of range, or an option has an unknown value.
         TypeError: ``model`` has none of the forms above.
     """
-    steps, last_action, is_init = _window(frames, last_action, is_init, n)
-    maps, totals, output = frame_gradients(
-        model, frames[:steps], last_action, is_init, state, reduce, norm, target, chunk, dtype, maps=True
-    )
-    assert maps is not None
+    for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
+        if value not in get_args(kind):
+            raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
+    if chunk < 1:
+        raise ValueError(f"chunk must be at least 1, got {chunk}")
+    if frames.ndim != 4:
+        raise ValueError(f"frames must have shape [T, H, W, C], got {list(frames.shape)}")
+    total = frames.shape[0]
+    if not -total <= n < total:
+        raise ValueError(f"n = {n} is outside a window of {total} frames")
+    zeros = torch.zeros(total, dtype=torch.int64, device=frames.device)
+    actions, starts = (zeros if given is None else given.reshape(-1) for given in (last_action, is_init))
+    for name, given in (("last_action", actions), ("is_init", starts)):
+        if given.shape[0] != total:
+            raise ValueError(f"{name} must have one entry a frame ({total}), got {given.shape[0]}")
+    steps = n % total + 1
+    policy, scalars = policy_of(model), outputs(model, target)
+    with policy.evaluating(), torch.enable_grad():
+        features = policy.features(frames[:steps], chunk, dtype)
+        before = policy.initial_state(1) if state is None else state
+        jacobian, output = _memory_jacobian(
+            policy, scalars, features, actions[:steps], starts[:steps].bool(), before, reduce
+        )
+        maps, totals = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
     return Saliency(
         maps.to(torch.float32).cpu().numpy(),
         totals.double().cpu().numpy(),
@@ -103,45 +128,95 @@ def saliency(
     )
 
 
-def frame_gradients(
-    model: Any,
-    frames: Tensor,
+def _memory_jacobian(
+    policy: Policy,
+    scalars: Callable[[Tensor], Tensor],
+    features: Tensor,
     last_action: Tensor,
     is_init: Tensor,
     state: Any,
     reduce: Reduce,
-    norm: Norm,
-    target: Target,
-    chunk: int,
-    dtype: torch.dtype = torch.float32,
-    maps: bool = False,
-) -> tuple[Tensor | None, Tensor, Tensor]:
-    """Both stages for the last of some frames; arguments as in `saliency`."""
-    for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
-        if value not in get_args(kind):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
-    if chunk < 1:
-        raise ValueError(f"chunk must be at least 1, got {chunk}")
-    policy, scalars = policy_of(model), outputs(model, target)
-    with evaluation(policy), torch.enable_grad():
-        features = encode_frames(policy.encode, frames, chunk, dtype)
-        jacobian, output = memory_jacobian(policy, scalars, features, last_action, is_init, state, reduce)
-        pixels, totals = frame_norms(policy.encode, frames, jacobian, norm, chunk, dtype, maps)
-    return pixels, totals, output
+) -> tuple[Tensor, Tensor]:
+    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs at the last step by the features, and these outputs [A]."""
+    leaf = features.clone().requires_grad_()
+    out, _ = policy.remember(leaf[None], last_action[None], is_init[None], state)
+    values = scalars(out[:, -1])[0]
+    rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
+    found: Tensor | None = None
+    if values.requires_grad:
+        try:
+            (found,) = torch.autograd.grad(
+                values, leaf, rows, retain_graph=True, is_grads_batched=True, allow_unused=True
+            )
+        except RuntimeError:  # an operator without a batching rule
+            each = [torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True) for row in rows]
+            found = torch.stack([gradient for (gradient,) in each])
+    return leaf.new_zeros(len(rows), *leaf.shape) if found is None else found, values.detach()
 
 
-def _window(frames: Tensor, last_action: Tensor | None, is_init: Tensor | None, n: int) -> tuple[int, Tensor, Tensor]:
-    """Number of frames that matter, and the other inputs cut to them."""
-    if frames.ndim != 4:
-        raise ValueError(f"frames must have shape [T, H, W, C], got {list(frames.shape)}")
-    total = frames.shape[0]
-    if not -total <= n < total:
-        raise ValueError(f"n = {n} is outside a window of {total} frames")
-    steps = n % total + 1
-    device = frames.device
-    actions = torch.zeros(total, dtype=torch.int64, device=device) if last_action is None else last_action.reshape(-1)
-    starts = torch.zeros(total, dtype=torch.bool, device=device) if is_init is None else is_init.reshape(-1)
-    for name, value in (("last_action", actions), ("is_init", starts)):
-        if value.shape[0] != total:
-            raise ValueError(f"{name} must have one entry a frame ({total}), got {value.shape[0]}")
-    return steps, actions[:steps], starts[:steps].bool()
+def _frame_norms(
+    policy: Policy, frames: Tensor, jacobian: Tensor, norm: Norm, chunk: int, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """Norms of the gradients by the frames, summed over the outputs: of pixels [T, H, W], and of whole frames [T]."""
+    per_pixel, per_frame = (jacobian.new_zeros(shape, dtype=dtype) for shape in (frames.shape[:3], len(frames)))
+    reached = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
+    for index in reached.split(chunk):
+        part = frames[index].to(dtype).requires_grad_()
+        features = policy.encode(part)
+        for row in jacobian[:, index].to(features):
+            (gradient,) = torch.autograd.grad(features, part, row, retain_graph=True, materialize_grads=True)
+            pixels = gradient.abs().sum(-1) if norm == "l1" else gradient.square().sum(-1)
+            total = pixels.sum((1, 2))
+            per_frame[index] += total.sqrt() if norm == "l2" else total
+            per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
+    return per_pixel, per_frame
+
+
+@dataclass(frozen=True)
+class EpisodeSaliency(Saliency):
+    """Saliency of the last decision of an episode, with what was seen and done.
+
+    Attributes:
+        frames: uint8 [n + 1, H, W, 3].
+        action: int64 [n + 1], chosen on each frame.
+    """
+
+    frames: NDArray[np.uint8]
+    action: NDArray[np.int64]
+
+
+def episode_saliency(
+    agent: Any,
+    *,
+    seed: int = 0,
+    max_steps: int = MAX_STEPS,
+    show: int = 1,
+    tries: int = 1,
+    observability: Twin | None = None,
+    reduce: Reduce = "per_action",
+    norm: Norm = "l2sq",
+    target: Target = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> EpisodeSaliency:
+    """Saliency of the last decision of a greedy episode in the agent's own game.
+
+    Args:
+        agent: an agent of this package.
+        seed: of the first episode; each further one takes the next.
+        max_steps: episodes are cut after this many steps.
+        show: frames that are wanted: episodes are played until one has as many; else the longest counts.
+        tries: at most so many episodes.
+        observability: another twin than the one trained on.
+        reduce: as for `saliency`, and so are ``norm`` and ``target``.
+        progress: called once, with (1, 1).
+    """
+    windows: list[Window] = []
+    while len(windows) < tries and not (windows and windows[-1].n + 1 >= show):
+        at = seed + len(windows)
+        windows.append(episode_window(agent, seed=at, observability=observability, max_steps=max_steps))
+    w = max(windows, key=lambda window: window.n)
+    how: Any = {"reduce": reduce, "norm": norm, "target": target}
+    found = saliency(agent, w.frames, w.last_action, w.is_init, w.state, **how)
+    if progress is not None:
+        progress(1, 1)
+    return EpisodeSaliency(**vars(found), frames=w.frames.cpu().numpy(), action=w.action.cpu().numpy())

@@ -23,16 +23,8 @@ import torch
 from torch import Tensor, nn
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
-Encode = Callable[[Tensor], Tensor]
-Remember = Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
-Outputs = Callable[[Tensor], Tensor]
-
 TARGETS = ("q", "logits", "probs", "value")
 """Outputs that can be asked for by name."""
-
-
-def _no_state(batch_size: int) -> None:
-    return None
 
 
 def read_plain(out: Tensor, what: str) -> Tensor:
@@ -56,9 +48,9 @@ class Policy:
         module: put into evaluation mode while an analysis runs.
     """
 
-    encode: Encode
-    remember: Remember
-    initial_state: Callable[[int], Any] = _no_state
+    encode: Callable[[Tensor], Tensor]
+    remember: Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
+    initial_state: Callable[[int], Any] = lambda batch_size: None
     read: Callable[[Tensor, str], Tensor] = read_plain
     offers: tuple[str, ...] = TARGETS
     module: nn.Module | None = None
@@ -74,6 +66,23 @@ class Policy:
         features = self.encode(obs["pixels"]).unsqueeze(1)
         out, state = self.remember(features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state)
         return self.greedy(out[:, 0]), {}, state
+
+    @torch.no_grad()
+    def features(self, frames: Tensor, chunk: int = 16, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Features [T, E] of frames [T, H, W, C] without a graph, ``chunk`` frames at a time."""
+        return torch.cat([self.encode(part.to(dtype)) for part in frames.split(chunk)])
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Evaluation mode for a while; the mode before comes back."""
+        training = self.module is not None and self.module.training
+        if self.module is not None:
+            self.module.eval()
+        try:
+            yield
+        finally:
+            if self.module is not None:
+                self.module.train(training)
 
 
 def policy_of(model: Any) -> Policy:
@@ -103,7 +112,11 @@ def policy_of(model: Any) -> Policy:
 
 
 def resolve(model: Any, what: str) -> str:
-    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities."""
+    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities.
+
+    Raises:
+        ValueError: ``what`` is none of `TARGETS`, or this model does not offer it.
+    """
     if what not in get_args(Target):
         raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {what!r}")
     names = policy_of(model).offers
@@ -114,31 +127,12 @@ def resolve(model: Any, what: str) -> str:
     return what
 
 
-def outputs(model: Any, what: str = "auto") -> Outputs:
-    """How the scalars that an analysis looks at follow from what ``remember`` returns.
+def outputs(model: Any, what: str = "auto") -> Callable[[Tensor], Tensor]:
+    """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns, [..., R].
 
     Args:
         model: see `policy_of`.
         what: ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
-
-    Returns:
-        A function [..., R] -> [..., K].
-
-    Raises:
-        ValueError: see `resolve`.
     """
     policy, name = policy_of(model), resolve(model, what)
     return lambda out: policy.read(out, name)
-
-
-@contextmanager
-def evaluation(policy: Policy) -> Iterator[None]:
-    """Evaluation mode for a while; the mode before comes back."""
-    training = policy.module is not None and policy.module.training
-    if policy.module is not None:
-        policy.module.eval()
-    try:
-        yield
-    finally:
-        if policy.module is not None and training:
-            policy.module.train()

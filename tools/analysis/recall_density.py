@@ -1,7 +1,7 @@
 """Recall density: how the gradient of a decision is spread over the past of its episode.
 
 For a trajectory o_0 ... o_n let ``g_t = sum_a || d Q(s_n, a) / d o_t ||_1`` and ``delta_t = g_t / sum_i g_i``. The
-density is the mean of delta over trajectories, in bins of normalised time (``binning``) or sampled at points as in the
+density is the mean of delta over trajectories, in bins of normalised time (`binned`) or sampled at points as in the
 paper. On an MDP an ideal agent has all mass on the last frame. The last action is no pixel: what is remembered through
 it does not show.
 
@@ -9,21 +9,26 @@ Source: POPGym Arcade (ICML 2026), recall density. Differs from its published co
 each trajectory), in whole episodes instead of ten steps, and in gradients of single actions instead of their sum.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.analysis.binning import mean_mass, mean_points
-from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, Target, frame_gradients
-from arcade_torch.tools.analysis.policy import resolve
-from arcade_torch.tools.analysis.resolve import resolve_agent
-from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Window, greedy_windows
+from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, saliency
+from arcade_torch.tools.analysis.policy import Target, resolve
+from arcade_torch.tools.analysis.windows import (
+    MAX_STEPS,
+    MIN_STEPS,
+    End,
+    Twin,
+    Window,
+    greedy_windows,
+    resolve_agent,
+)
 
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,8 @@ class RecallDensity:
     """Recall density of one checkpoint.
 
     Attributes:
-        shares: one float64 [n_i + 1] a trajectory, delta of every frame, oldest first; each sums to 1.
+        deltas: float64, delta of every frame, oldest first, one trajectory after the other; each sums to 1.
+        lengths: int64 [m], frames of each trajectory.
         ended: bool [m], whether the trajectory ends with the decision that ended its episode.
         dropped: trajectories left out because they have fewer than three frames.
         silent: trajectories left out because all their gradients vanish.
@@ -41,7 +47,8 @@ class RecallDensity:
         target: what was differentiated.
     """
 
-    shares: tuple[Array, ...]
+    deltas: Array
+    lengths: NDArray[np.int64]
     ended: NDArray[np.bool_]
     dropped: int
     silent: int
@@ -51,24 +58,24 @@ class RecallDensity:
     target: str
 
     @property
-    def lengths(self) -> NDArray[np.int64]:
-        """int64 [m], frames of each trajectory."""
-        return np.array([share.size for share in self.shares], dtype=np.int64)
+    def shares(self) -> tuple[Array, ...]:
+        """One float64 [n_i + 1] a trajectory."""
+        return tuple(np.split(self.deltas, np.cumsum(self.lengths)[:-1])) if self.lengths.size else ()
 
     def mass(self, bins: int) -> Array:
         """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1."""
-        return mean_mass(self._some(), bins)
+        return np.asarray(np.mean([binned(share, bins) for share in self._some()], axis=0))
 
     def points(self, taus: Array) -> Array:
         """The paper's point-sampled curve at ``taus`` in [0, 1]; does not integrate to 1."""
-        return mean_points(self._some(), taus)
+        return np.asarray(np.mean([point_sampled(share, taus) for share in self._some()], axis=0))
 
     def last_share(self) -> float:
         """Mean share of the last frame."""
         return float(np.mean([share[-1] for share in self._some()]))
 
     def _some(self) -> tuple[Array, ...]:
-        if not self.shares:
+        if not self.lengths.size:
             raise ValueError(
                 f"no trajectory is left: {self.dropped} had fewer than {MIN_STEPS} frames, "
                 f"{self.silent} no gradient at all; play more episodes"
@@ -82,14 +89,14 @@ def recall_density(
     *,
     episodes: int = 100,
     seed: int = 0,
-    observability: Literal["full", "partial"] | None = None,
+    observability: Twin | None = None,
     end: End = "last",
     cap: int = MAX_STEPS,
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
     chunk: int = 8,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> RecallDensity:
     """Recall density of an agent over whole greedy episodes.
 
@@ -139,38 +146,66 @@ def density_of_windows(
         model: see `policy_of`.
         windows: consumed one by one. A start flag inside one leaves exactly nothing on the frames before it.
         end: kept as a note.
-        norm: see `recall_density`.
-        reduce: see `recall_density`.
-        target: see `recall_density`.
-        chunk: see `recall_density`.
+        norm: see `recall_density`, also for ``reduce``, ``target`` and ``chunk``.
         progress: called with the number of windows done.
-
-    Returns:
-        Arrays.
     """
     shares, ended, dropped, silent = [], [], 0, 0
-    for count, window in enumerate(windows, start=1):
-        if window.n + 1 < MIN_STEPS:
+    for count, w in enumerate(windows, start=1):
+        if w.n + 1 < MIN_STEPS:
             dropped += 1
         else:
-            _, totals, _ = frame_gradients(
-                model,
-                window.frames,
-                window.last_action,
-                window.is_init,
-                window.state,
-                reduce,
-                norm,
-                target,
-                chunk,
+            found = saliency(
+                model, w.frames, w.last_action, w.is_init, w.state, reduce=reduce, norm=norm, target=target, chunk=chunk
             )
-            mass = totals.double().cpu().numpy()
-            if mass.sum() > 0:
-                shares.append(mass / mass.sum())
-                ended.append(window.ended)
+            if found.per_frame.sum() > 0:
+                shares.append(found.shares())
+                ended.append(w.ended)
             else:
                 silent += 1
         if progress is not None:
             progress(count)
+    lengths, flat = np.array([share.size for share in shares], dtype=np.int64), np.concatenate([*shares, np.zeros(0)])
     what = resolve(model, target)
-    return RecallDensity(tuple(shares), np.array(ended, dtype=np.bool_), dropped, silent, end, norm, reduce, what)
+    return RecallDensity(flat, lengths, np.array(ended, dtype=np.bool_), dropped, silent, end, norm, reduce, what)
+
+
+def binned(shares: Array, bins: int) -> Array:
+    """Mass in equal parts of a trajectory.
+
+    Step t of N owns the interval [t/N, (t+1)/N) and bin b of B owns [b/B, (b+1)/B); the mass of a step is split by the
+    overlap of the intervals. Every trajectory therefore keeps its whole mass, whatever its length.
+
+    Args:
+        shares: float64 [N], mass of every step, oldest first.
+        bins: B.
+
+    Returns:
+        float64 [B], with the sum of ``shares``.
+
+    Raises:
+        ValueError: there is no step or no bin.
+
+    Example:
+        >>> binned(np.array([1.0, 0.0]), 3).round(3).tolist()
+        [0.667, 0.333, 0.0]
+    """
+    if bins < 1 or shares.size < 1:
+        raise ValueError(f"need at least one bin and one step, got {bins} and {shares.size}")
+    steps = np.arange(shares.size + 1) / shares.size
+    return np.diff(np.interp(np.arange(bins + 1) / bins, steps, np.concatenate([[0.0], np.cumsum(shares)])))
+
+
+def point_sampled(shares: Array, taus: Array) -> Array:
+    """The paper's curve: the share of step floor(tau n), n the index of the last step.
+
+    It does not integrate to one over trajectories of different length; `binned` does.
+    """
+    return shares[np.floor(taus * (shares.size - 1) + 1e-9).astype(np.int64)]
+
+
+def no_memory(lengths: Sequence[int], bins: int) -> Array:
+    """Reference line: only the last frame of each trajectory counts.
+
+    A trajectory with fewer steps than bins spreads its last frame over several of them, as it does its other frames.
+    """
+    return np.asarray(np.mean([binned(np.eye(1, length, length - 1)[0], bins) for length in lengths], axis=0))

@@ -1,12 +1,17 @@
 """Windows of experience to analyse: greedy episodes up to the decision that ended them, or to one before it."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
 from torch import Tensor
+
+from arcade_torch.tools.analysis.policy import policy_of
 
 MAX_STEPS = 512
 """Longest window; what is cut, and where, stands with the functions."""
@@ -14,8 +19,11 @@ MAX_STEPS = 512
 MIN_STEPS = 3
 """A shorter trajectory says nothing about memory: recall density leaves it out and counts it."""
 
+SIDE_BY_SIDE = 16
+"""Episodes played at once where the caller brings no environments: at most 512 of their frames each are in memory."""
+
 End = Literal["last", "random"]
-_COLUMNS = ("pixels", "last_action", "is_init")
+Twin = Literal["full", "partial"]
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,7 @@ class Window:
         return replace(self, **cut, ended=False)
 
 
-def greedy_window(
-    agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_STEPS, keep: int | None = None
-) -> Window:
+def greedy_window(agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_STEPS) -> Window:
     """Play one greedy episode and return what the agent saw.
 
     Args:
@@ -67,34 +73,23 @@ def greedy_window(
         env: ``ArcadeEnv`` with one environment.
         seed: of the episode.
         max_steps: the episode is cut after this many steps.
-        keep: the window holds the last so many steps (its ``state`` is the one before them); all by default.
 
     Returns:
         The window. The frame after the ending action is never part of it.
 
     Raises:
-        ValueError: the env is not a batch of one, or a length is below 1.
+        ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
     if tuple(env.batch_size) != (1,):
         raise ValueError(f"a window is played in a batch of one environment, got batch size {list(env.batch_size)}")
-    if max_steps < 1 or (keep is not None and keep < 1):
-        raise ValueError(f"max_steps and keep must be at least 1, got {max_steps} and {keep}")
-    played = play(agent, env, seed=seed, keep=keep or max_steps, max_steps=max_steps)
-    if played.lengths[0] > played.windows[0].n + 1:
-        first = [int(played.lengths[0]) - (keep or max_steps)]
-        played = play(agent, env, seed=seed, keep=keep or max_steps, max_steps=max_steps, first=first)
-    return played.windows[0]
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    (window,), _ = play(agent, env, seed=seed, keep=max_steps, max_steps=max_steps)
+    return window
 
 
 def greedy_windows(
-    agent: Any,
-    env: Any,
-    *,
-    episodes: int,
-    seed: int = 0,
-    end: End = "last",
-    cap: int = MAX_STEPS,
-    progress: Callable[[int], None] | None = None,
+    agent: Any, env: Any, *, episodes: int, seed: int = 0, end: End = "last", cap: int = MAX_STEPS
 ) -> Iterator[Window]:
     """Play greedy episodes side by side, one window each; a batch of episodes is in memory at a time.
 
@@ -107,7 +102,6 @@ def greedy_windows(
         end: ``last``: the window ends with the frame on which the ending action was chosen; ``random``: with a frame
             drawn uniformly from index 2 on. An episode longer than ``cap`` ends at a random frame in either case.
         cap: longest window: the last so many frames before its end, with the recurrent state before them.
-        progress: called with the number of environment steps of every step of a batch.
 
     Yields:
         Windows.
@@ -122,19 +116,19 @@ def greedy_windows(
     size = int(env.batch_size[0])
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
-        batch_seed = episode_seed(seed, group)
-        played = play(agent, env, seed=batch_seed, keep=cap, progress=progress)
-        ends = np.array([_end(int(length), end, cap, rng) for length in played.lengths])
+        batch_seed = _episode_seed(seed, group)
+        windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
+        ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
         if (late := ends >= cap).any():  # these windows begin later than what was kept: play the very same again
-            del played
+            del windows
             first = np.where(late, ends - cap + 1, 0).tolist()
-            played = play(agent, env, seed=batch_seed, keep=cap, first=first, progress=progress)
+            windows, _ = play(agent, env, seed=batch_seed, keep=cap, first=first)
             ends = np.where(late, cap - 1, ends)
-        for window, n in zip(played.windows[: episodes - group * size], ends, strict=False):
+        for window, n in zip(windows[: episodes - group * size], ends, strict=False):
             yield window.up_to(int(n))
 
 
-def episode_seed(seed: int, group: int) -> int:
+def _episode_seed(seed: int, group: int) -> int:
     """Environment seed of a batch of episodes: held out from training, and different for every (seed, group)."""
     from arcade_torch.agents.config import SEED_LIMIT
     from arcade_torch.agents.evaluation import held_out_seed
@@ -151,14 +145,6 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
     return last if length <= cap else int(rng.integers(cap - 1, length))
 
 
-@dataclass(frozen=True)
-class Played:
-    """One episode of every env of a batch: what was kept of each, and all lengths int64 [N]."""
-
-    windows: list[Window]
-    lengths: np.ndarray[Any, np.dtype[np.int64]]
-
-
 @torch.no_grad()
 def play(
     agent: Any,
@@ -168,8 +154,7 @@ def play(
     keep: int,
     max_steps: int | None = None,
     first: Sequence[int] | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> Played:
+) -> tuple[list[Window], NDArray[np.int64]]:
     """Play the first episode of every env of a batch greedily.
 
     Args:
@@ -179,61 +164,81 @@ def play(
         keep: frames of each episode to keep.
         max_steps: episodes are cut after this many steps; never by default.
         first: index of the first frame to keep, one for every env; 0 by default.
-        progress: called with N at every step.
 
     Returns:
-        Windows and lengths. The frame after an ending action is never part of a window.
+        A window of each episode, and all lengths int64 [N]. The frame after an ending action is never part of a window.
     """
     size = int(env.batch_size[0])
-    starts = torch.zeros(size, dtype=torch.int64) if first is None else torch.as_tensor(first)
+    starts = torch.as_tensor([0] * size if first is None else first)
     lengths, ended = torch.zeros(size, dtype=torch.int64), torch.zeros(size, dtype=torch.bool)
     env.set_seed(seed)
     obs, state = env.reset(), agent.initial_state(size)
-    kept, states = _Kept(size, keep), [None] * size
+    kept: TensorDictBase | None = None
+    states: list[Any] = [None] * size
     playing, t = torch.ones(size, dtype=torch.bool), 0
     while playing.any() and (max_steps is None or t < max_steps):
         for row in (playing & (starts == t)).nonzero().flatten().tolist():
             states[row] = None if state is None else state[row : row + 1].clone()
         action, _, state = agent.act(obs, state)
         rows = (playing & (starts <= t) & (t < starts + keep)).nonzero().flatten()
-        seen = {name: obs.get(name)[rows] for name in _COLUMNS} | {"action": action[rows]}
+        seen = obs.select("pixels", "last_action", "is_init").set("action", action)
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        after = step.get("next")
-        kept.add(rows, t - starts[rows], seen | {"reward": after.get("reward")[rows]})
+        seen.set("reward", step.get(("next", "reward")))
+        if kept is None:  # untouched memory is never really taken
+            kept = seen.apply(lambda x: x.new_empty(size, keep, *x.shape[1:]), batch_size=[size, keep])
+        kept[rows, t - starts[rows]] = seen[rows]
         lengths += playing
-        ended |= playing & after.get("done").reshape(-1).cpu()
+        ended |= playing & step.get(("next", "done")).reshape(-1).cpu()
         playing &= ~ended
         t += 1
-        if progress is not None:
-            progress(size)
-    return Played(kept.windows(starts, lengths, ended, states, seed), lengths.numpy())
+    assert kept is not None
+    windows = []
+    for row, (begin, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
+        steps = max(0, min(keep, length - begin))
+        seen = {name: value if name == "pixels" else value.reshape(-1) for name, value in kept[row, :steps].items()}
+        whole = bool(ended[row]) and begin + steps == length
+        windows.append(Window(seen.pop("pixels"), **seen, state=states[row], ended=whole, seed=seed, row=row))
+    return windows, lengths.numpy()
 
 
-class _Kept:
-    """Preallocated columns [N, keep, ...]; untouched memory is never really taken."""
+def resolve_agent(agent: Any, env: Any = None, observability: Twin | None = None) -> tuple[Any, Any]:
+    """Something that acts, and environments for it.
 
-    def __init__(self, size: int, keep: int) -> None:
-        self.shape = size, keep
-        self.columns: dict[str, Tensor] = {}
+    Args:
+        agent: an agent, the path of its run folder or checkpoint, or with ``env`` given anything `policy_of` takes.
+        env: environments; 16 of the agent's own game by default.
+        observability: another twin than the one trained on (without ``env``).
 
-    def add(self, rows: Tensor, places: Tensor, values: dict[str, Tensor]) -> None:
-        """Keep one step of some rows."""
-        for name, value in values.items():
-            value = value if name == "pixels" else value.reshape(-1)
-            if name not in self.columns:
-                self.columns[name] = torch.empty(*self.shape, *value.shape[1:], dtype=value.dtype, device=value.device)
-            self.columns[name][rows, places] = value
+    Raises:
+        ValueError: there is no environment for it, or more than one.
+    """
+    if isinstance(agent, str | Path):
+        from arcade_torch.agents import load
 
-    def windows(self, starts: Tensor, lengths: Tensor, ended: Tensor, states: Sequence[Any], seed: int) -> list[Window]:
-        """What was kept of every row."""
-        found = []
-        for row, (start, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
-            steps = max(0, min(self.shape[1], length - start))
-            c = {name: column[row, :steps] for name, column in self.columns.items()}
-            whole = bool(ended[row]) and start + steps == length
-            found.append(
-                Window(
-                    c["pixels"], c["last_action"], c["is_init"], c["action"], c["reward"], states[row], whole, seed, row
-                )
-            )
-        return found
+        agent = load(agent)
+    player = agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
+    if env is not None and observability is not None:
+        raise ValueError("observability belongs to the environments: leave it out, or leave env out")
+    if env is None and not hasattr(agent, "config"):
+        raise ValueError(f"{type(agent).__name__} does not say which game it plays: hand over env as well")
+    return player, _own_env(agent, SIDE_BY_SIDE, observability) if env is None else env
+
+
+def _own_env(agent: Any, num_envs: int, observability: Twin | None) -> Any:
+    """Environments of an agent's own game, on the device of its network."""
+    from arcade_torch.agents.evaluation import make_eval_env
+
+    twin = observability or agent.config.observability
+    if twin not in get_args(Twin):
+        raise ValueError(f"this agent was trained on {twin} twins: name one of them, full or partial")
+    device = str(next(agent.network.parameters()).device)
+    return make_eval_env(replace(agent.config, device=device), num_envs, twin)
+
+
+def episode_window(
+    agent: Any, *, seed: int = 0, observability: Twin | None = None, max_steps: int = MAX_STEPS
+) -> Window:
+    """Play one greedy episode in the agent's own game; the seed is one of held-out environments."""
+    from arcade_torch.agents.evaluation import held_out_seed
+
+    return greedy_window(agent, _own_env(agent, 1, observability), seed=held_out_seed(seed), max_steps=max_steps)

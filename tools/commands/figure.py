@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from arcade_torch.tools.figures import registry
-from arcade_torch.tools.figures.registry import FIGURES, Options, module_of
+from arcade_torch.tools.figures.registry import FIGURES, Options
 from arcade_torch.tools.options import parse as parse_options
 
 
@@ -33,13 +33,10 @@ class Figure:
 
         keep_freed_memory()
         need("matplotlib")
-        confidence = getattr(self.options, "confidence", 0.95)
-        if not 0 < confidence < 1:
-            raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
         with Bars() as bars:
-            made = module_of(self.name).make(self.options, bars.update)
+            made = registry.make_figure(self.name, self.options, bars.update)
         if self.options.csv:
-            print_csv(made.rows)
+            print_csv([row for picture in made.pictures for row in picture.rows])
             return 0
         for table in made.tables:
             table.show()
@@ -62,21 +59,14 @@ def parse(words: Sequence[str], prog: str) -> Figure:
         ValueError: an option is unknown or malformed.
     """
     _, group, name = prog.split()
-    entry, module = FIGURES[name], module_of(name)
-    words = [part for word in words for part in _positional(word)]
+    entry = FIGURES[name]
+    words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
     registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
-    module.Options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
-    options: Any = parse_options(module.Options, words, prog)
+    entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
+    options: Any = parse_options(entry.options, words, prog)
     if options.out is None and group == "analyze":
         options = replace(options, out=_analysis_folder(options.runs))
     return Figure(name, options)
-
-
-def _positional(word: str) -> list[str]:
-    """``--runs DIR`` means the same as ``DIR``."""
-    if word == "--runs":
-        return []
-    return [word.removeprefix("--runs=")]
 
 
 def _analysis_folder(runs: Sequence[Path]) -> Path | None:

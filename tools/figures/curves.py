@@ -2,24 +2,20 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from arcade_torch.tools.analysis.curves import Curve, curves_of_runs
-from arcade_torch.tools.figures import registry
-from arcade_torch.tools.figures.registry import Made, Progress
+from arcade_torch.tools.figures.registry import CurveOptions, Made, Picture, Progress
 from arcade_torch.tools.figures.style import (
     DASHES,
     MARKERS,
     NEUTRAL,
     TWIN_NAMES,
     agent_colours,
-    drawing,
-    footnote,
-    inches,
-    save,
+    panels,
+    rows_of,
     seeds_note,
 )
 from arcade_torch.tools.runs import find_runs
@@ -27,45 +23,31 @@ from arcade_torch.tools.runs import find_runs
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
 
 
-@dataclass
-class Options(registry.Options):
-    """Options of the figure."""
-
-    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"
-    """Greedy evaluations, or training returns with exploration in them."""
-    confidence: float = 0.95
-    """Of the bands."""
-
-
-def make(options: Options, progress: Progress | None) -> Made:
+def curves(options: CurveOptions, progress: Progress | None) -> Made:
     """The figure ``curves``."""
     found = find_runs(options.runs)
     kind = "eval" if options.metric == "eval_final" else "train"
     groups = {key: [run.folder for run in runs] for key, runs in found.groups().items()}
-    curves = curves_of_runs(groups, kind, options.confidence)
-    if not curves:
+    every = curves_of_runs(groups, kind, options.confidence)
+    if not every:
         raise ValueError(f"no run below {options.runs[0]} has logged a {AXIS[kind]}: nothing to draw")
-    tasks = list(dict.fromkeys((curve.game, curve.observability) for curve in curves))
-    agents = list(dict.fromkeys(curve.agent for curve in curves))
+    tasks = list(dict.fromkeys((curve.game, curve.observability) for curve in every))
+    agents = list(dict.fromkeys(curve.agent for curve in every))
     columns = min(4, len(tasks))
     lines = math.ceil(len(tasks) / columns)
-    with drawing(options.style) as plt:
-        size = inches(options.style, max(5.5, 3.9 * columns), 0.8 + 3.0 * lines)
-        figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
-        for axis in axes.flat[len(tasks) :]:
-            axis.set_axis_off()
-        of_game: dict[str, Any] = {}
-        for axis, (game, twin) in zip(axes.flat, tasks, strict=False):
-            axis.sharey(of_game.setdefault(game, axis))  # twins are there to be compared
-            plot([curve for curve in curves if (curve.game, curve.observability) == (game, twin)], axis, agents)
-            axis.set_title(f"{game}, {TWIN_NAMES.get(twin, twin)}")
-            axis.set_ylabel(AXIS[kind])
-        handles = {handle.get_label(): handle for axis in axes.flat for handle in axis.get_lines()}
-        shown = [handles[agent] for agent in agents if agent in handles]
-        figure.legend(handles=shown, loc="outside upper center", ncols=min(8, len(shown)))
-        footnote(figure, seeds_note([len(curve.seeds) for curve in curves], options.confidence, "bands"))
-        rows = _rows(curves)
-        return Made(save(options, "curves", figure, rows), found.notes + found.single_seeds(), rows=rows)
+    figure, axes = panels(lines, columns, (max(5.5, 3.9 * columns), 0.8 + 3.0 * lines))
+    for axis in axes.flat[len(tasks) :]:
+        axis.set_axis_off()
+    of_game: dict[str, Any] = {}
+    for axis, (game, twin) in zip(axes.flat, tasks, strict=False):
+        axis.sharey(of_game.setdefault(game, axis))  # twins are there to be compared
+        plot([curve for curve in every if (curve.game, curve.observability) == (game, twin)], axis, agents)
+        axis.set(title=f"{game}, {TWIN_NAMES.get(twin, twin)}", ylabel=AXIS[kind])
+    handles = {handle.get_label(): handle for axis in axes.flat for handle in axis.get_lines()}
+    shown = [handles[agent] for agent in agents if agent in handles]
+    figure.legend(handles=shown, loc="outside upper center", ncols=min(8, len(shown)))
+    note = seeds_note([len(curve.seeds) for curve in every], options.confidence, "bands")
+    return Made([Picture("curves", figure, note, _rows(every))], found.notes + found.single_seeds())
 
 
 def plot(curves: Sequence[Curve], axis: Any, agents: Sequence[str], levels: Mapping[str, float] | None = None) -> None:
@@ -88,17 +70,8 @@ def plot(curves: Sequence[Curve], axis: Any, agents: Sequence[str], levels: Mapp
 
 
 def _rows(curves: Sequence[Curve]) -> list[dict[str, Any]]:
-    return [
-        {
-            "agent": curve.agent,
-            "game": curve.game,
-            "observability": curve.observability,
-            "seeds": len(curve.seeds),
-            "frames": int(curve.frames[i]),
-            "mean": curve.mean[i],
-            "low": curve.low[i],
-            "high": curve.high[i],
-        }
-        for curve in curves
-        for i in range(curve.frames.size)
-    ]
+    found = []
+    for c in curves:
+        what = {"agent": c.agent, "game": c.game, "observability": c.observability, "seeds": len(c.seeds)}
+        found += rows_of(**what, frames=c.frames.astype(np.int64), mean=c.mean, low=c.low, high=c.high)
+    return found

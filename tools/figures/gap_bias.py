@@ -1,52 +1,85 @@
-"""Gap against Bias: one point an agent; right and down is better. Also the table that returns and report draw."""
+"""Gap and Bias: one point an agent, also by size of the memory; and bars of returns, Gap and Bias."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Interval, seed_coverage
+from arcade_torch.tools.analysis.bootstrap import Array, Interval, seed_coverage
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import SEEDS, paper_table
-from arcade_torch.tools.figures.registry import Made, Progress, ScoreOptions
-from arcade_torch.tools.figures.style import (
-    MARKERS,
-    NEUTRAL,
-    agent_colours,
-    drawing,
-    footnote,
-    inches,
-    save,
-    seeds_note,
-    whiskers,
-)
-from arcade_torch.tools.runs import Score, find_runs, read_scores
+from arcade_torch.tools.figures.registry import Made, Picture, Progress, ScoreOptions, SweepOptions
+from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, agent_colours, panels, seeds_note, whiskers
+from arcade_torch.tools.runs import Score, agent_names, find_runs, is_baseline, read_scores
 from arcade_torch.tools.tables import Table
 
-Options = ScoreOptions
+PANELS = {
+    "mdp": ("MDP return", "normalised return"),
+    "pomdp": ("POMDP return", "normalised return"),
+    "gap": ("Observability Gap", "MDP - POMDP"),
+    "bias": ("Memory Bias", "MDP - memory-free MDP"),
+}
+DRAWN = ("pomdp", "gap", "bias")
 
 
-def make(options: ScoreOptions, progress: Progress | None) -> Made:
-    """The figure ``gap-bias``."""
-    made, table, under = table_of(options)
-    with drawing(options.style) as plt:
-        figure, axis = plt.subplots(figsize=inches(options.style, 7.4, 5.4), layout="constrained")
-        plot(table.rows, axis)
-        footnote(figure, under)
-        made.files += save(options, "gap-bias", figure, made.rows)
+def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
+    """The figure ``gap-bias``: right and down is better."""
+    made, table, note = _table(options)
+    figure, axes = panels(1, 1, (7.4, 5.4))
+    plot(table.rows, axes[0, 0])
+    made.pictures = [Picture("gap-bias", figure, note, table.table())]
     return made
+
+
+def returns(options: ScoreOptions, progress: Progress | None) -> Made:
+    """Two figures: ``returns`` and, with several games, ``returns-without`` (one game left out at a time)."""
+    made, table, note = _table(options)
+    figure, axes = panels(1, 3, (12.5, 4.2))
+    for axis, name in zip(axes[0], DRAWN, strict=True):
+        plot_bars(table.rows, axis, name)
+    made.pictures = [Picture("returns", figure, note, table.table())]
+    if table.without:
+        made.pictures.append(Picture("returns-without", _without_each(table), note))
+    return made
+
+
+def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
+    """The figure ``size-sweep``: a panel a game; agents are named LAYERSxWIDTH, the memory-free one without."""
+    found = find_runs(options.runs)
+    sized = agent_names(found.names, sized=True)
+    names = {key: name if is_baseline(name, options.baseline) else sized[key] for key, name in found.names.items()}
+    every = zip(found.runs, found.scores(options.metric), strict=True)
+    scores = [replace(score, agent=names[run.key]) for run, score in every]
+    notes, tables = list(found.notes), dict[str, GapBias]()
+    for game in dict.fromkeys(score.game for score in scores):
+        try:
+            tables[game] = _computed([score for score in scores if score.game == game], options)
+        except ValueError as error:
+            notes.append(f"left out, {game}: {error}")
+    if not tables:
+        raise ValueError(f"no size sweep in these runs: {notes[-1]}")
+    rows = [row | {"game": game} for game, table in tables.items() for row in table.table()]
+    if len({row["agent"] for row in rows}) < 3:
+        notes.append("a single size beside the memory-free agent: vary --network-option layers or hidden_size")
+    figure, axes = panels(1, len(tables), (7.2 * len(tables), 5.4))
+    for axis, (game, table) in zip(axes[0], tables.items(), strict=True):
+        plot(table.rows, axis)
+        axis.set_title(game)
+    seeds = seeds_note([int(row["seeds"]) for row in rows], options.confidence)
+    return Made([Picture("size-sweep", figure, f"labels: layers x width; {options.metric}, {seeds}", rows)], notes)
 
 
 def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     """Draw a point an agent, with both intervals and the name beside it; people have no Bias."""
     colours = agent_colours([row.agent for row in rows])
-    for place, row in enumerate(row for row in rows if not is_person(row.agent)):
-        ends = np.array([[x.low, x.value, x.high] for x in (row.bias, row.gap)])
-        colour = colours[row.agent]
-        xerr, yerr = (whiskers(*line[:, None]) if np.isfinite(line).all() else None for line in ends)
-        mark, point = MARKERS[place % len(MARKERS)], (row.bias.value, row.gap.value)
-        axis.errorbar(*point, yerr=yerr, xerr=xerr, fmt=mark, color=colour, capsize=2, lw=1)
+    for place, row in enumerate(row for row in rows if not _is_person(row.agent)):
+        point, colour = (row.bias.value, row.gap.value), colours[row.agent]
+        xerr, yerr = (
+            whiskers(*line[:, None]) if np.isfinite(line).all() else None for line in _ends(row.bias, row.gap)
+        )
+        axis.errorbar(*point, yerr, xerr, fmt=MARKERS[place % len(MARKERS)], color=colour, capsize=2, lw=1)
         axis.annotate(row.agent, point, (6, 5), textcoords="offset points", color=colour, fontsize="small")
     axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
     axis.axvline(0.0, color=NEUTRAL, lw=1, ls="--")
@@ -56,29 +89,77 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     axis.set_ylabel("Observability Gap\n(MDP - POMDP, normalised return)")
 
 
-def is_person(agent: str) -> bool:
+def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
+    """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
+    chosen = [row for row in rows if not (name == "bias" and _is_person(row.agent))]
+    ends = _ends(*(getattr(row, name) for row in chosen))
+    colours = agent_colours([row.agent for row in rows])
+    places, known = np.arange(len(chosen)), np.isfinite(ends[:, 0])
+    axis.bar(places, ends[:, 1], 0.72, color=[colours[row.agent] for row in chosen])
+    axis.errorbar(places[known], ends[known, 1], whiskers(*ends[known].T), fmt="none", ecolor="black", capsize=3, lw=1)
+    axis.set_xticks(places, [row.agent for row in chosen], rotation=35, ha="right", rotation_mode="anchor")
+    title, unit = PANELS[name]
+    axis.set(title=title, ylabel=unit)
+    if name in ("gap", "bias"):
+        axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
+
+
+def _without_each(table: GapBias) -> Any:
+    """The same three numbers with one game left out at a time; the first column has all games."""
+    columns = {"all games": table.rows} | {f"no {game}": rows for game, rows in table.without.items()}
+    figure, axes = panels(3, 1, (12.5, 10), sharex=True)
+    agents = [row.agent for row in table.rows]
+    offsets, places = np.linspace(-0.34, 0.34, len(agents)), np.arange(len(columns))
+    for axis, name in zip(axes[:, 0], DRAWN, strict=True):
+        for place, agent in enumerate(agents):
+            if name == "bias" and (_is_person(agent) or agent == table.baseline):
+                continue
+            ends = _ends(*(getattr(rows[place], name) for rows in columns.values()))
+            errors = whiskers(*ends.T) if np.isfinite(ends).all() else None
+            style = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
+            axis.errorbar(places + offsets[place], ends[:, 1], errors, label=agent, **style)
+        title, unit = PANELS[name]
+        axis.set_title(title, loc="left")
+        axis.set_ylabel(unit)
+        axis.axvline(0.5, color=NEUTRAL, lw=0.8)
+        if name != "pomdp":
+            axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
+    axes[0, 0].legend(ncols=len(agents), loc="lower center", bbox_to_anchor=(0.5, 1.08))
+    axes[-1, 0].set_xticks(places, list(columns), rotation=25, ha="right")
+    return figure
+
+
+def _ends(*intervals: Interval) -> Array:
+    """Low, value and high of each, float64 [n, 3]."""
+    return np.array([[each.low, each.value, each.high] for each in intervals])
+
+
+def _is_person(agent: str) -> bool:
     """Whether a row is people: they have no Bias, which compares training runs."""
     return agent.lower() == "human"
 
 
-def table_of(options: ScoreOptions) -> tuple[Made, GapBias, str]:
-    """The table of runs, of CSV files, or of the paper."""
+def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
+    """The table of runs, of CSV files, or of the paper; what to say and print; what stands under a figure of it."""
     if options.paper:
         paper = paper_table()
-        under = (
+        note = (
             f"published returns, {len(paper.table.tasks)} tasks, n = {SEEDS} seeds; bars: normal 95 % interval, tasks "
             f"independent (a bootstrap over {SEEDS} seeds would cover {100 * seed_coverage(SEEDS):.0f} %)"
         )
-        return Made([], [paper.text()], rows=paper.table.table()), paper.table, under
+        return Made(notes=[paper.text()]), paper.table, note
     scores, notes = _scores(options)
-    table = gap_and_bias(
-        scores, metric=options.metric, baseline=options.baseline, draws=options.draws, confidence=options.confidence
-    )
+    table = _computed(scores, options)
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
-    under = f"{tasks}, {seeds_note([row.seeds for row in table.rows], options.confidence)}"
-    return Made([], notes, [printed(table, tasks)], table.table()), table, under
+    note = f"{tasks}, {seeds_note([row.seeds for row in table.rows], options.confidence)}"
+    return Made(notes=notes, tables=[_printed(table, tasks)]), table, note
+
+
+def _computed(scores: list[Score], options: SweepOptions) -> GapBias:
+    how: Any = {name: getattr(options, name) for name in ("metric", "baseline", "draws", "confidence")}
+    return gap_and_bias(scores, **how)
 
 
 def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
@@ -100,15 +181,17 @@ def _is_bare(path: Path) -> bool:
     return (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
 
 
-def printed(table: GapBias, what: str) -> Table:
+def _printed(table: GapBias, what: str) -> Table:
     """The table as it is printed; an interval stands under its value."""
 
     def cell(interval: Interval) -> str:
         ends = "" if np.isnan(interval.low) else f"\n{interval.low:+.3f} {interval.high:+.3f}"
         return f"{interval.value:+.3f}{ends}"
 
-    names: Mapping[str, str] = {"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias"}
-    names |= {"mdp_iqm": "MDP IQM", "pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"}  # type: ignore[operator]
+    names: Mapping[str, str] = {
+        **{"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias"},
+        **{"mdp_iqm": "MDP IQM", "pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"},
+    }
     rows = [(row.agent, row.seeds, *(cell(getattr(row, name)) for name in names)) for row in table.rows]
     coverage = {row.seeds: row.coverage for row in table.rows if row.coverage == row.coverage}
     measured = ", ".join(f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in sorted(coverage.items()))

@@ -2,19 +2,18 @@
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options
+import numpy as np
+
+from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_bytes, write_csv, write_npz
 from arcade_torch.tools.optional import need
-
-STYLES = ("light", "print")
-"""``light`` for screens, ``print`` for a page: smaller, serif."""
 
 AGENT_COLOURS = {
     "mlp": "#6b6b6b",
@@ -87,14 +86,15 @@ _SHARED = {
     "figure.facecolor": "white",
     "axes.titlesize": "medium",
 }
-_SCALE = {"light": 1.0, "print": 0.62}
+_PRINT_SCALE = 0.62
+"""Sizes of figures are given for a screen; on a page they are so much smaller."""
 
 
 @contextmanager
 def drawing(style: str) -> Iterator[Any]:
-    """matplotlib.pyplot in one of `STYLES`, without a window."""
-    if style not in STYLES:
-        raise ValueError(f"unknown style {style!r}: allowed are {', '.join(STYLES)}")
+    """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
+    if style not in _RC:
+        raise ValueError(f"unknown style {style!r}: allowed are {', '.join(_RC)}")
     need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
     with plt.rc_context(_SHARED | _RC[style]):
@@ -104,9 +104,12 @@ def drawing(style: str) -> Iterator[Any]:
             plt.close("all")
 
 
-def inches(style: str, width: float, height: float) -> tuple[float, float]:
-    """Size of a figure, given for a screen, in a style."""
-    return width * _SCALE[style], height * _SCALE[style]
+def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
+    """A figure of ``size`` inches and its axes [rows, columns]; options are those of ``matplotlib.pyplot.subplots``."""
+    figure, axes = need("matplotlib.pyplot").subplots(
+        rows, columns, figsize=size, squeeze=False, layout="constrained", **options
+    )
+    return figure, axes
 
 
 def agent_colour(name: str, place: int = 0) -> str:
@@ -127,17 +130,8 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
 
 def whiskers(low: Any, value: Any, high: Any) -> Any:
     """Lengths of error bars [2, n] for matplotlib; 0 where there is no interval."""
-    import numpy as np
-
     ends = np.array([np.asarray(value) - np.asarray(low), np.asarray(high) - np.asarray(value)])
     return np.nan_to_num(np.maximum(ends, 0.0))
-
-
-def footnote(figure: Any, text: str) -> None:
-    """What stands under a figure: how many, and which interval; wrapped to the width of the figure."""
-    label = figure.supxlabel(" ", fontsize="small", color=NEUTRAL)
-    letters = int(figure.get_figwidth() * 72 / (0.56 * label.get_fontsize()))
-    label.set_text("\n".join(line for part in text.split("\n") for line in textwrap.wrap(part, letters)))
 
 
 def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:
@@ -160,25 +154,35 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> s
     )
 
 
-def save(
-    options: Options,
-    name: str,
-    figure: Any = None,
-    rows: Sequence[Mapping[str, Any]] = (),
-    arrays: Mapping[str, Any] | None = None,
-) -> list[Path]:
-    """Write a figure, and its numbers beside it."""
-    base, endings = options.path(name)
-    written = []
-    for ending in [ending for ending in endings if ending in PICTURES] if figure is not None else []:
+def rows_of(**columns: Any) -> list[dict[str, Any]]:
+    """Numbers of a figure: a row a cell of columns that are arrays of one shape, or single values for all rows.
+
+    Example:
+        >>> rows_of(agent="lru", delay=[0, 1])
+        [{'agent': 'lru', 'delay': 0}, {'agent': 'lru', 'delay': 1}]
+    """
+    cells = (column.ravel().tolist() for column in np.broadcast_arrays(*columns.values()))
+    return [dict(zip(columns, row, strict=True)) for row in zip(*cells, strict=True)]
+
+
+def save(options: Options, picture: Picture) -> list[Path]:
+    """Write a figure with its note, and its numbers beside it."""
+    (base, endings), figure, written = options.path(picture.name), picture.figure, []
+    if options.style == "print":
+        figure.set_size_inches(_PRINT_SCALE * figure.get_size_inches())
+    if picture.note:  # wrapped to the width of the figure
+        label = figure.supxlabel(" ", fontsize="small", color=NEUTRAL)
+        letters = int(figure.get_figwidth() * 72 / (0.56 * label.get_fontsize()))
+        label.set_text("\n".join(line for part in picture.note.split("\n") for line in textwrap.wrap(part, letters)))
+    for ending in [ending for ending in endings if ending in PICTURES]:
         buffer = BytesIO()
         figure.savefig(buffer, format=ending[1:])
         written.append(write_bytes(base.with_name(base.name + ending), buffer.getvalue()))
-    if rows:
-        columns = list(dict.fromkeys(name for row in rows for name in row))
-        written.append(write_csv(base.with_name(base.name + ".csv"), rows, columns))
-    if arrays and endings != NUMBERS:
-        written.append(write_npz(base.with_name(base.name + ".npz"), arrays))
+    if picture.rows:
+        columns = list(dict.fromkeys(name for row in picture.rows for name in row))
+        written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows, columns))
+    if picture.arrays and endings != NUMBERS:
+        written.append(write_npz(base.with_name(base.name + ".npz"), picture.arrays))
     return written
 
 

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
-from arcade_torch.tools.analysis.checkpoints import contamination_of_run, density_of_run, saliency_of_run
+from arcade_torch.tools.analysis.bootstrap import Array, Pooled, over_seeds
+from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
 from arcade_torch.tools.analysis.contamination import Contamination
+from arcade_torch.tools.analysis.contamination import contamination as noise
 from arcade_torch.tools.analysis.curves import curves_of_runs
 from arcade_torch.tools.analysis.gap_bias import GapBias
+from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.analysis.recall_density import RecallDensity
-from arcade_torch.tools.figures import contamination, curves, recall_density, returns, saliency
+from arcade_torch.tools.analysis.recall_density import recall_density as density_of
+from arcade_torch.tools.figures import contamination, curves, gap_bias, recall_density, saliency
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, drawing, png, svg
 from arcade_torch.tools.reports.selection import Cell
 from arcade_torch.tools.runs import Runs
@@ -103,7 +106,7 @@ def _joined(levels: Mapping[str, float], apart: float) -> dict[str, float]:
 
 def score_panels(table: GapBias) -> list[Panel]:
     """Normalised returns on both twins, Gap and Bias."""
-    return [Panel(picture(name, FULL, partial(returns.plot, table.rows, name=name))) for name in returns.PANELS]
+    return [Panel(picture(name, FULL, partial(gap_bias.plot_bars, table.rows, name=name))) for name in gap_bias.PANELS]
 
 
 @dataclass(frozen=True)
@@ -121,16 +124,15 @@ def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[St
     """One strip for each cell, from its first finished seed."""
     strips = []
     for done, cell in enumerate(cells, start=1):
-        _, arrays = saliency_of_run(cell.runs[0], SHOW, TRIES)
-        frames, per_frame = arrays["frames"], arrays["per_frame"].astype(np.float64)
-        shares = 100 * per_frame / (per_frame.sum() or 1.0)
+        _, found = measure_run(cell.runs[0], episode_saliency, {"show": SHOW, "tries": TRIES})
+        frames, shares = found.frames, 100 * found.shares()
         count = min(SHOW, len(frames))
         with drawing("light") as plt:
             figure = plt.figure(figsize=(4.8, 1.4 * -(-count // 4)), layout="constrained")
             axes = figure.subplots(-(-count // 4), 4, squeeze=False).flatten()
             for axis in axes[count:]:
                 axis.set_axis_off()
-            peak = saliency.plot(frames, arrays["maps"], axes[:count], below=shares)
+            peak = saliency.plot(frames, found.maps, axes[:count], below=shares)
             source = "data:image/png;base64," + b64encode(png(figure)).decode("ascii")
         strips.append(Strip(cell, source, len(frames), peak, float(shares[-1])))
         if progress is not None:
@@ -143,7 +145,7 @@ def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progr
     made, tasks = Section(), dict[tuple[str, str], dict[str, list[RecallDensity]]]()
     for cell in cells:
         tell = partial(progress, f"recall density, {cell.agent} on {cell.game}") if progress else None
-        every = [density_of_run(path, DENSITY, None, tell)[1] for path in cell.runs]
+        every = [measure_run(path, density_of, DENSITY, None, tell)[1] for path in cell.runs]
         if found := [density for density in every if density.shares]:
             tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = found
             shares = [share for density in found for share in density.shares]
@@ -157,9 +159,7 @@ def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progr
         bins = min(BINS, *(int(density.lengths.min()) for found in here.values() for density in found))
         series = {}
         for agent, found in here.items():
-            masses = np.array([density.mass(bins) for density in found])
-            pooled = recall_density.Pooled(masses, *over_seeds(masses))
-            series[agent] = (pooled, agent_colours(agents)[agent])
+            series[agent] = (Pooled.of([density.mass(bins) for density in found]), agent_colours(agents)[agent])
         title = f"{game}, {TWIN_NAMES[twin]}"
 
         def plot(axis: Any, series: Any = series, bins: int = bins, title: str = title) -> None:
@@ -172,15 +172,15 @@ def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progr
 
 def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progress | None) -> Section:
     """Share of decisions that one noisy frame changes, by delay; a picture a task."""
-    made, tasks = Section(), dict[tuple[str, str], dict[str, contamination.Pooled]]()
+    made, tasks = Section(), dict[tuple[str, str], dict[str, contamination.Measures]]()
     for cell in cells:
         tell = partial(progress, f"contamination, {cell.agent} on {cell.game}") if progress else None
         try:
-            measured = [contamination_of_run(path, NOISE, progress=tell) for path in cell.runs]
+            measured = [measure_run(path, noise, NOISE, None, tell) for path in cell.runs]
         except ValueError as error:  # episodes too short for a start point
             made.notes.append(f"{cell.agent} on {cell.game} {TWIN_NAMES[cell.twin]}: {error}")
             continue
-        (pooled,) = contamination.pool(measured, 0.95).values()
+        (pooled,) = contamination.pool(by_task(measured)).values()
         tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = pooled
         made.rows.append(_row(cell, len(measured)) | _noise_row([found for _, found in measured]))
     for (game, twin), here in tasks.items():

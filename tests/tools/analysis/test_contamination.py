@@ -10,8 +10,7 @@ from torch import Tensor
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination, shuffled_beginning
-from arcade_torch.tools.analysis.contamination_examples import noise_examples, shuffle_example
-from arcade_torch.tools.analysis.perturbation import disturbed_frames, shuffle_order
+from arcade_torch.tools.analysis.contamination import disturbed_frames, examples, replayed, shuffle_order
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
@@ -33,12 +32,10 @@ def test_a_linear_memory_forgets_noise_at_its_own_rate() -> None:
 def test_the_relative_change_is_rho_to_the_delay_over_the_spread_of_values() -> None:
     rho, policy = 0.6, linear_policy(0.6, dtype=torch.float32)
     w = window(8)
-    from arcade_torch.tools.analysis.perturbation import replayed
-
     clean = policy.encode(w.frames)[None]
     noisy = clean.clone()
     noisy[0, 2] += 5.0
-    before, after = (replayed(policy, w, e, np.array([2]), False)[0] for e in (clean, noisy))
+    before, after = (replayed(policy, w, e, 2, False)[0] for e in (clean, noisy))
     at_once, later = after[2] - before[2], after[6] - before[6]
     torch.testing.assert_close(later, rho**4 * at_once, rtol=1e-3, atol=1e-2)
     torch.testing.assert_close(after[:2], before[:2])
@@ -122,15 +119,15 @@ def test_a_policy_has_a_divergence_that_is_zero_where_nothing_changes() -> None:
 
 def test_examples_hold_the_frames_and_the_values_of_every_version() -> None:
     policy, w = linear_policy(0.9, dtype=torch.float32), window(13)
-    found = noise_examples(policy, w, [2, 8])
+    found = examples(policy, w, [2, 8])
     assert found.frames.shape == (3, 3, 4, 4, 3) and found.labels == ("clean", "noise on frame 2", "noise on frame 8")
     np.testing.assert_array_equal(found.frames[0, 2], w.frames[12])
     assert not np.array_equal(found.frames[1, 1], w.frames[2]) and np.array_equal(found.frames[1, 2], w.frames[12])
     np.testing.assert_allclose(found.values.sum(1), 0, atol=1e-2)  # relative values
-    order = shuffle_example(policy, w)
+    order = examples(policy, w)
     assert order.frames.shape == (2, 5, 4, 4, 3) and np.array_equal(order.frames[0, 3:], order.frames[1, 3:])
     with pytest.raises(ValueError, match="indices from 0 to 12"):
-        noise_examples(policy, w, [13])
+        examples(policy, w, [13])
 
 
 @pytest.mark.parametrize(
