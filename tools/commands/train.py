@@ -75,7 +75,7 @@ class Train:
         """What films the agent at every evaluation."""
         if self.videos == "none":
             return None
-        from arcade_torch.tools.record.evaluations import EvaluationVideos
+        from arcade_torch.tools.play.recording import EvaluationVideos
 
         return EvaluationVideos(folder / "videos", f".{self.videos}")
 

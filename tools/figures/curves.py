@@ -41,7 +41,7 @@ def make(options: Options, progress: Progress | None) -> Made:
     """The figure ``curves``."""
     found = find_runs(options.runs)
     kind = "eval" if options.metric == "eval_final" else "train"
-    groups = {key: [run.folder for run in runs] for key, runs in found.groups().items()}
+    groups = found.groups()
     curves = curves_of_runs(groups, kind, options.confidence)
     if not curves:
         raise ValueError(f"no run below {options.runs[0]} has logged a {AXIS[kind]}: nothing to draw")

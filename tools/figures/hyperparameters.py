@@ -9,8 +9,7 @@ from arcade_torch.tools.figures import registry
 from arcade_torch.tools.figures.registry import Made, Progress
 from arcade_torch.tools.figures.style import drawing, inches, save
 from arcade_torch.tools.files import write_text
-from arcade_torch.tools.runs import find_runs
-from arcade_torch.tools.studies.grid import flatten
+from arcade_torch.tools.runs import find_runs, flatten
 
 CELL = ("env", "observability", "memory", "seed")
 """Fields that tell runs apart; all others are settings."""

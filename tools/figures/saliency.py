@@ -51,7 +51,7 @@ def make(options: Options, progress: Progress | None) -> Made:
     if options.show < 1 or options.max_steps < 1:
         raise ValueError(f"--show and --max-steps must be at least 1, got {options.show} and {options.max_steps}")
     paths, notes = checkpoints_of(options.runs)
-    first = [runs[0].folder.path for runs in find_runs(paths).groups().values()] if _are_runs(paths) else paths
+    first = [runs[0].path for runs in find_runs(paths).groups().values()] if _are_runs(paths) else paths
     paths = [path for path in paths if path in first or path in options.runs]
     measured, windows = [], []
     for done, path in enumerate(paths, start=1):

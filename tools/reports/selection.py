@@ -1,17 +1,14 @@
 """Which runs are looked into: all of a small study, a few that stand for the rest of a large one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
+from typing import NamedTuple
 
 from arcade_torch.tools.analysis.normalise import normalise
 from arcade_torch.tools.runs import Runs, is_baseline
 
 MOST_CELLS = 12
 """Up to so many (game, twin, agent) are all looked into."""
-
 MOST_GAMES = 3
 MOST_SEEDS = 3
 
@@ -19,8 +16,7 @@ Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
 """(game, twin) -> agent -> final returns of its finished seeds."""
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """An agent on one twin of a game, and the folders of its finished runs, one a seed."""
 
     agent: str
@@ -30,10 +26,9 @@ class Cell:
 
 
 def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell], str]:
-    """The cells that are looked into."""
+    """The cells that are looked into, and a note on those that are not."""
     paths = {
-        key: [run.folder.path for run in group if (run.folder.path / "checkpoints").is_dir()]
-        for key, group in runs.groups().items()
+        key: [run.path for run in group if (run.path / "checkpoints").is_dir()] for key, group in runs.groups().items()
     }
     bare = len(runs.runs) - sum(map(len, paths.values()))
     notes = [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."] if bare else []
@@ -43,14 +38,13 @@ def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell],
     if len(cells) <= MOST_CELLS:
         return cells, " ".join(notes + ([f"Shown: {seeds} of each agent."] if seeds else []))
     agents, games = representatives(finals, baseline)
-    shown = [cell for cell in cells if cell.agent in agents and cell.game in games]
     out_of = f"{len({cell.agent for cell in cells})} agents and {len({cell.game for cell in cells})} games"
     notes.append(
         f"Shown: {' and '.join(agents)} on {', '.join(games)}{', ' + seeds if seeds else ''}, out of {out_of}: the "
         "memory with the highest mean return where observations are partial, beside the memory-free agent, on the "
         "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
     )
-    return shown, " ".join(notes)
+    return [cell for cell in cells if cell.agent in agents and cell.game in games], " ".join(notes)
 
 
 def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
@@ -60,20 +54,21 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
         >>> representatives({("A", "partial"): {"mlp": [0.1], "lru": [0.9]}, ("B", "partial"): {"mlp": [0.5]}}, "mlp")
         (['mlp', 'lru'], ['A'])
     """
-    twin = "partial" if any(key[1] == "partial" for key in finals) else "full"
+    twin = "partial" if any(seen == "partial" for _, seen in finals) else "full"
     means = {
-        game: {agent: float(np.mean([normalise(game, float(v)) for v in values])) for agent, values in agents.items()}
+        game: {agent: _mean([normalise(game, float(value)) for value in values]) for agent, values in agents.items()}
         for (game, seen), agents in finals.items()
         if seen == twin
     }
-    by_agent: dict[str, list[float]] = {}
-    for agents in means.values():
-        for agent, mean in agents.items():
-            by_agent.setdefault(agent, []).append(mean)
-    free = [agent for agent in by_agent if is_baseline(agent, baseline)]
-    with_memory = [agent for agent in by_agent if agent not in free]
-    best = max(with_memory, key=lambda agent: float(np.mean(by_agent[agent])), default="")
-    pair = [*free[:1], best] if best else free[:1]
+    everybody = dict.fromkeys(agent for found in means.values() for agent in found)
+    free = [agent for agent in everybody if is_baseline(agent, baseline)]
+    strength = {agent: _mean([found[agent] for found in means.values() if agent in found]) for agent in everybody}
+    best = sorted((agent for agent in everybody if agent not in free), key=lambda agent: -strength[agent])
+    pair = [*free[:1], *(best[:1])]
     there = [game for game, found in means.items() if all(agent in found for agent in pair)]
-    there.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]] if len(pair) > 1 else 0.0)
-    return pair, there[:MOST_GAMES]
+    there.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
+    return (pair if best else free[:1]), there[:MOST_GAMES]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
