@@ -16,8 +16,7 @@ from arcade_torch.tools.files import write_csv, write_text
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings, panels
-from arcade_torch.tools.reports.panels import Progress
-from arcade_torch.tools.reports.selection import Finals, select_cells
+from arcade_torch.tools.reports.panels import Finals, Progress, select_cells
 from arcade_torch.tools.runs import METRICS, Runs, flatten, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study

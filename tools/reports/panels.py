@@ -1,8 +1,13 @@
-"""The pictures of the page: every one is a figure of `arcade_torch.tools.figures`, as SVG or PNG."""
+"""The pictures of the page: every one is a figure of `arcade_torch.tools.figures`, as SVG or PNG.
+
+All agents of a small study are looked into, and of a large one a few that stand for the rest.
+"""
 
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +16,10 @@ from arcade_torch.tools.analysis.bootstrap import Array, over_seeds
 from arcade_torch.tools.analysis.checkpoints import contamination_of_run, density_of_run, saliency_of_run
 from arcade_torch.tools.analysis.curves import curves_of_runs
 from arcade_torch.tools.analysis.gap_bias import GapBias
+from arcade_torch.tools.analysis.normalise import normalise
 from arcade_torch.tools.figures import contamination, curves, recall_density, returns, saliency
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, drawing, png, svg
-from arcade_torch.tools.reports.selection import Cell
-from arcade_torch.tools.runs import Runs
+from arcade_torch.tools.runs import Runs, is_baseline
 
 FULL, SMALL = (4.9, 3.0), (3.3, 2.3)
 """Sizes in inches; small ones for many tasks."""
@@ -28,6 +33,13 @@ SHOW, TRIES = 8, 10
 """Frames of a saliency strip; episodes that are tried until one has as many."""
 LEVEL_NAMES = {"random": "random", "state": "oracle", "frames": "frames oracle"}
 
+MOST_CELLS = 12
+"""Up to so many (game, twin, agent) are all looked into."""
+MOST_GAMES = 3
+MOST_SEEDS = 3
+
+Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
+"""(game, twin) -> agent -> final returns of its finished seeds."""
 Levels = Mapping[str, Mapping[str, float]]
 """Game -> player -> mean return."""
 Progress = Callable[[str, int, int], None]
@@ -47,6 +59,60 @@ class Section(NamedTuple):
     panels: list[Panel]
     rows: list[dict[str, Any]]
     notes: list[str]
+
+
+class Cell(NamedTuple):
+    """An agent on one twin of a game, and the folders of its finished runs, one a seed."""
+
+    agent: str
+    game: str
+    twin: str
+    runs: tuple[Path, ...]
+
+
+def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell], str]:
+    """The cells that are looked into, and a note on those that are not."""
+    paths = {
+        key: [run.path for run in group if (run.path / "checkpoints").is_dir()] for key, group in runs.groups().items()
+    }
+    bare = len(runs.runs) - sum(map(len, paths.values()))
+    notes = [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."] if bare else []
+    cells = [Cell(*key, tuple(found[:MOST_SEEDS])) for key, found in paths.items() if found]
+    most = max(map(len, paths.values()), default=0)
+    seeds = f"the first {MOST_SEEDS} of {most} seeds" if most > MOST_SEEDS else ""
+    if len(cells) <= MOST_CELLS:
+        return cells, " ".join(notes + ([f"Shown: {seeds} of each agent."] if seeds else []))
+    agents, games = representatives(finals, baseline)
+    out_of = f"{len({cell.agent for cell in cells})} agents and {len({cell.game for cell in cells})} games"
+    notes.append(
+        f"Shown: {' and '.join(agents)} on {', '.join(games)}{', ' + seeds if seeds else ''}, out of {out_of}: the "
+        "memory with the highest mean return where observations are partial, beside the memory-free agent, on the "
+        "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
+    )
+    return [cell for cell in cells if cell.agent in agents and cell.game in games], " ".join(notes)
+
+
+def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
+    """A memory-free agent (if there is one), the best agent with memory, and the games that tell them apart.
+
+    Example:
+        >>> representatives({("A", "partial"): {"mlp": [0.1], "lru": [0.9]}, ("B", "partial"): {"mlp": [0.5]}}, "mlp")
+        (['mlp', 'lru'], ['A'])
+    """
+    twin = "partial" if any(seen == "partial" for _, seen in finals) else "full"
+    means = {
+        game: {agent: fmean([normalise(game, float(value)) for value in values]) for agent, values in agents.items()}
+        for (game, seen), agents in finals.items()
+        if seen == twin
+    }
+    everybody = dict.fromkeys(agent for found in means.values() for agent in found)
+    free = [agent for agent in everybody if is_baseline(agent, baseline)]
+    strength = {agent: fmean([found[agent] for found in means.values() if agent in found]) for agent in everybody}
+    best = sorted((agent for agent in everybody if agent not in free), key=lambda agent: -strength[agent])
+    pair = [*free[:1], *(best[:1])]
+    there = [game for game, found in means.items() if all(agent in found for agent in pair)]
+    there.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
+    return pair, there[:MOST_GAMES]
 
 
 def picture(name: str, size: tuple[float, float], plot: Callable[[Any], object]) -> str:
