@@ -59,7 +59,8 @@ class Play:
             raise ValueError(f"--scores must end in .csv, got {self.scores}")
         options = dict(map(name_and_value, self.env_option))
         compiled = compiled_game(self.game, self.obs_size, self.rules, options)
-        game, said = compiled.batched.game, list[str]()
+        game: Any = compiled.batched.game
+        said: list[str] = []
         rows = scores.read_scores_file(self.scores) if self.scores is not None else []
         seed = scores.next_seed(rows, game.id, self.player) if self.seed is None else self.seed
 
