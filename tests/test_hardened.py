@@ -19,8 +19,7 @@ from arcade_torch.tools.figures.throughput import read_rows
 from arcade_torch.tools.files import read_csv, read_json, write_between
 from arcade_torch.tools.name_value import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
-from arcade_torch.tools.runs import find_runs, read_scores
-from arcade_torch.tools.studies.folder import RunFolder as StudyRun
+from arcade_torch.tools.runs import Run, find_runs, read_scores
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import small_study, write_study
@@ -242,11 +241,12 @@ def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[st
         small_study(**changes)
 
 
-def test_a_study_that_is_no_table_is_refused() -> None:
+def test_a_study_that_is_no_table_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a study is a table"):
         Study.from_dict([1])  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="it is not TOML"):
-        Study.parse("a = [", "x")
+    (tmp_path / "x.toml").write_text("a = [")
+    with pytest.raises(ValueError, match="is not TOML"):
+        Study.load(tmp_path / "x.toml")
 
 
 def test_records_of_runs_that_hold_no_table_are_damage(tmp_path: Path) -> None:
@@ -284,8 +284,8 @@ def test_a_table_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes, me
 def test_a_published_table_without_names_or_numbers_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "x.csv"
     for text, message in (
-        ("model,mdp_mean,pomdp_mean\nm,1,2\n", "no column for env"),
-        ("model,env,mdp_mean,pomdp_mean\nm,E,x,2\n", "a mean is not a number"),
+        ("model,mdp_mean,pomdp_mean\nm,1,2\n", "no column for game"),
+        ("model,env,mdp_mean,pomdp_mean\nm,E,x,2\n", "score 'x' is not a number"),
     ):
         file.write_text(text)
         with pytest.raises(ValueError, match=message):
@@ -319,7 +319,7 @@ def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, m
 
 def test_seeds_that_never_met_make_no_curve(tmp_path: Path) -> None:
     """Seed 0 was seen at 10 and 20 frames, seed 1 at 14 and 16: between 14 and 16 the longest log has nothing."""
-    runs = [StudyRun(tmp_path / name) for name in ("seed0", "seed1")]
+    runs = [Run(tmp_path / name) for name in ("seed0", "seed1")]
     for run, frames in zip(runs, ((10, 12, 20), (14, 16)), strict=True):
         run.path.mkdir()
         rows = "".join(f"{each},0.5,0,8\n" for each in frames)

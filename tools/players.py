@@ -13,7 +13,6 @@ from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
 
 PLAYERS = ("random", "state", "frames")
 """Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
-
 BEGIN, END = "<!-- baselines -->", "<!-- end of baselines -->"
 EPISODES = 256
 """Of each player, for the reference lines of a report."""
@@ -21,16 +20,8 @@ EPISODES = 256
 
 @dataclass(frozen=True)
 class Baseline:
-    """What one player earned in one game.
-
-    Attributes:
-        id: the game.
-        player: one of `PLAYERS`.
-        episodes: how many were played.
-        mean: mean undiscounted return.
-        half_width: of the 95 % interval around it (normal approximation).
-        steps: mean length of an episode.
-        seconds: what it took, compilation included.
+    """What one player earned in one game: mean undiscounted return, half its 95 % interval (normal approximation), mean
+    length of an episode, and the seconds it took, compilation included.
     """
 
     id: str
@@ -43,27 +34,9 @@ class Baseline:
 
 
 def measure(
-    id: str,
-    player: str,
-    episodes: int = EPISODES,
-    seconds: float = math.inf,
-    *,
-    seed: int = 0,
-    block: int = 250,
-    rules: str = "default",
-    **options: Any,
+    id: str, player: str, episodes: int = EPISODES, seconds: float = math.inf, block: int = 250, **options: Any
 ) -> Baseline:
-    """Let one player play one game.
-
-    Args:
-        id: the game.
-        player: one of `PLAYERS`.
-        episodes: how many at most.
-        seconds: after this time no further block of episodes is begun.
-        seed: of the episodes.
-        block: episodes side by side.
-        rules: of the game.
-        **options: of the game.
+    """Let one of `PLAYERS` play a game, ``block`` episodes side by side, until ``seconds`` are over.
 
     Raises:
         ValueError: unknown game or player, or the game has no such oracle.
@@ -73,20 +46,13 @@ def measure(
 
     if player not in PLAYERS:
         raise ValueError(f"player is {player!r}, allowed: {', '.join(PLAYERS)}")
-    started, game = time.monotonic(), make(id, rules=rules, **options)
-    who = RandomPlayer(seed) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
-    played = play(game, who, episodes, seed, frames=player == "frames", block=min(episodes, block), seconds=seconds)
+    started, game = time.monotonic(), make(id, **options)
+    who = RandomPlayer(0) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
+    played = play(game, who, episodes, 0, frames=player == "frames", block=min(episodes, block), seconds=seconds)
     returns = played.returns.astype(np.float64)
-    spread = float(returns.std(ddof=1)) if returns.size > 1 else math.nan
-    return Baseline(
-        game.id,
-        player,
-        returns.size,
-        round(float(returns.mean()), 5),
-        round(1.96 * spread / math.sqrt(returns.size), 5),
-        round(float(played.lengths.mean()), 5),
-        round(time.monotonic() - started, 1),
-    )
+    half_width = 1.96 * (float(returns.std(ddof=1)) if returns.size > 1 else math.nan) / math.sqrt(returns.size)
+    mean, half_width, steps = (round(float(each), 5) for each in (returns.mean(), half_width, played.lengths.mean()))
+    return Baseline(game.id, player, returns.size, mean, half_width, steps, round(time.monotonic() - started, 1))
 
 
 def references(
@@ -94,17 +60,9 @@ def references(
 ) -> dict[str, Baseline]:
     """What the players earn under the rules and options of a study, kept in ``folder/references-GAME-RULES.json``.
 
-    Args:
-        game: environment id.
-        folder: where the file goes.
-        rules: of the game.
-        options: of the game.
-        episodes: of each player.
-
-    Returns:
-        player -> result; a game without an oracle lacks that player.
+    A game without an oracle lacks that player.
     """
-    file = folder / f"references-{game}-{rules}.json"
+    file, found = folder / f"references-{game}-{rules}.json", {}
     how: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
     try:
         kept = read_json(file)
@@ -112,7 +70,6 @@ def references(
             return {row["player"]: Baseline(**row) for row in kept["players"]}
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass  # there is none, or it is damaged or older: it is made anew
-    found = {}
     for player in PLAYERS:
         try:
             found[player] = measure(game, player, episodes, block=EPISODES, rules=rules, **how["options"])
@@ -125,25 +82,19 @@ def references(
 
 def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
     """Every player in every game, one row after another; rows that ``out`` holds already are not measured again."""
-    known = {(row.id, row.player): row for row in read_baselines(out)} if out.exists() else {}
-    for id in ids:
-        for player in PLAYERS:
-            if (id, player) not in known:
-                known[id, player] = measure(id, player, episodes, seconds)
-                write_csv(out, map(asdict, known.values()), [field.name for field in fields(Baseline)])
-            yield known[id, player]
-
-
-def read_baselines(path: Path) -> list[Baseline]:
-    """The rows of a file that `measure_all` has written."""
-    numbers = ("mean", "half_width", "steps", "seconds")
-    try:
-        return [
-            Baseline(row["id"], row["player"], int(row["episodes"]), *(float(row[name]) for name in numbers))
-            for row in read_csv(path)
-        ]
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} is no table of baselines ({error}); choose another --out") from None
+    columns = [field.name for field in fields(Baseline)]
+    known = dict[tuple[str, str], Baseline]()
+    for row in read_csv(out) if out.exists() else []:
+        try:
+            numbers = map(float, (row[name] for name in columns[3:]))
+            known[row["id"], row["player"]] = Baseline(row["id"], row["player"], int(row["episodes"]), *numbers)
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{out} is no table of baselines ({error}); choose another --out") from None
+    for key in ((id, player) for id in ids for player in PLAYERS):
+        if key not in known:
+            known[key] = measure(*key, episodes, seconds)
+            write_csv(out, map(asdict, known.values()), columns)
+        yield known[key]
 
 
 def markdown(rows: Iterable[Baseline]) -> str:

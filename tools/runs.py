@@ -1,4 +1,4 @@
-"""Finished runs: where they are, which agent each one is, how it scored, and which are seeds of one agent.
+"""What a run is, which agent it is, how it scored, and which runs are seeds of one agent.
 
 Whatever pools seeds (report, figures, gap and bias, curves, measures of checkpoints) asks here.
 """
@@ -7,22 +7,20 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.studies.folder import RunFolder
-from arcade_torch.tools.studies.grid import flatten
+from arcade_torch.agents.runs import files as run_files
+from arcade_torch.tools.files import read_csv, read_json
 
 METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
-
 _SIZE = ("layers", "hidden_size")
-_NOT_SETTINGS = (
-    *("env", "observability", "memory", "seed", "network_options", "env_options", "device", "threads", "obs_size"),
-    *("checkpoint_every", "eval_every", "eval_episodes", "logger", "algorithm", "network", "compile", "cuda_graphs"),
-    "rules",
-)
+_NOT_SETTINGS = {
+    *("env", "observability", "memory", "seed", "algorithm", "network", "network_options", "rules", "obs_size"),
+    *("device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"),
+}
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,7 @@ class AgentKey:
         options = config.get("network_options") or {}
         if not isinstance(options, Mapping) or not isinstance(config.get("memory"), str):
             raise ValueError("its memory or its network_options are of no use")
-        flat = flatten(options)
-        network = str(config.get("network", "paper"))
-        size = ""
+        flat, network, size = flatten(options), str(config.get("network", "paper")), ""
         if any(name in flat for name in _SIZE):
             default = preset_size(network)
             chosen = "x".join(str(flat.get(name, base)) for name, base in zip(_SIZE, default.split("x"), strict=True))
@@ -59,19 +55,13 @@ class AgentKey:
         rest = tuple(sorted((name, str(value)) for name, value in flat.items() if name not in _SIZE))
         return cls(str(config.get("algorithm", "pqn")), config["memory"], network, size, rest)
 
-    @property
-    def full_size(self) -> str:
-        """Layers and width, ``2x512``, those of the preset as well."""
-        return self.size or preset_size(self.network or "paper")
-
 
 def preset_size(network: str) -> str:
     """Layers and width of the memory block of a network preset, ``2x512``."""
-    from arcade_torch.models.presets import PRESETS
+    from arcade_torch.models.presets import preset_of
 
-    if network not in PRESETS:
-        raise ValueError(f"unknown network {network!r}; known are {', '.join(PRESETS)}")
-    return f"{PRESETS[network].layers}x{PRESETS[network].hidden_size}"
+    preset = preset_of(network)
+    return f"{preset.layers}x{preset.hidden_size}"
 
 
 def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey, str]:
@@ -88,7 +78,11 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
     for key in every:
         same = [other for other in every if other.memory == key.memory]
         name = f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
-        parts = [key.full_size] if sized or len({other.size for other in same}) > 1 else []
+        parts = (
+            [key.size or preset_size(key.network or "paper")]
+            if sized or len({other.size for other in same}) > 1
+            else []
+        )
         parts += [key.network] if len(networks) > 1 and key.network else []
         shared = set.intersection(*(set(other.options) for other in same))
         parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
@@ -105,10 +99,9 @@ def is_baseline(agent: str, baseline: str) -> bool:
 
 def find_baseline(agents: Sequence[str], baseline: str) -> str | None:
     """The memory-free agent that others are measured against: the one of that very name, else that of PQN, else any."""
-    exact = [agent for agent in agents if agent.lower() == baseline.lower()]
     free = [agent for agent in agents if is_baseline(agent, baseline)]
-    pqn = [agent for agent in free if agent.lower().startswith("pqn-")]
-    return next(iter([*exact, *pqn, *free]), None)
+    lowered = [(name.lower() != baseline.lower(), not name.lower().startswith("pqn-")) for name in free]
+    return free[lowered.index(min(lowered))] if free else None
 
 
 @dataclass(frozen=True)
@@ -125,11 +118,41 @@ class Score:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its files, its resolved settings, its final evaluation."""
+    """The folder of a run, to read from; a missing file means "not yet"."""
 
-    folder: RunFolder
-    config: dict[str, Any]
-    final: dict[str, Any]
+    path: Path
+
+    @cached_property
+    def record(self) -> dict[str, Any]:
+        """All of ``config.json``: settings, versions, command."""
+        return read_record(self.path / "config.json")
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The resolved settings, flat or nested as the trainer wrote them."""
+        inner = self.record.get("config", self.record)
+        return dict(inner) if isinstance(inner, dict) else {}
+
+    @cached_property
+    def final(self) -> dict[str, Any] | None:
+        """The content of ``eval.json`` if the run has finished, else None; a damaged file counts as none."""
+        try:
+            values = read_json(self.path / "eval.json")
+        except (OSError, ValueError):
+            return None
+        return values if run_files.is_final(values, ("mean", "returns")) else None
+
+    def progress(self) -> tuple[int, int, str]:
+        """Frames done, frames wanted, and status, of ``progress.json``; zeros if there is none to read."""
+        try:
+            values = read_json(self.path / "progress.json")
+            return int(values["frames"]), int(values["total_frames"]), str(values.get("status", "running"))
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):  # it may just be replaced
+            return 0, 0, ""
+
+    def table(self, name: str) -> list[dict[str, str]]:
+        """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
+        return run_files.read_csv(file) if (file := self.path / name).exists() else []
 
     @cached_property
     def key(self) -> AgentKey:
@@ -153,10 +176,45 @@ class Run:
 
     def value(self, metric: str) -> float:
         """The score of the run."""
-        value = self.final.get("mean" if _known(metric) == "eval_final" else "train_max_ewm")
+        value = (self.final or {}).get("mean" if _known(metric) == "eval_final" else "train_max_ewm")
         if value is None:
-            raise ValueError(f"{self.folder.path} has no {metric}: choose another metric")
+            raise ValueError(f"{self.path} has no {metric}: choose another metric")
         return float(value)
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """A JSON file that holds a table of names and values; a damaged one is refused."""
+    values = read_json(file)
+    if not isinstance(values, dict):
+        raise ValueError(f"{file} is damaged: it holds no table of names and values")
+    return values
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys.
+
+    Example:
+        >>> flatten({"device": "cpu", "pqn": {"gamma": 0.9}})
+        {'device': 'cpu', 'pqn.gamma': 0.9}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+def open_run(path: Path) -> Run | None:
+    """A run from its folder, None if it has not finished; refuses damaged settings by the name of the file."""
+    run, file = Run(path), path / "config.json"
+    if not {"env", "memory"} <= set(run.config):
+        raise ValueError(f"{file} does not describe a run: it has no env or no memory")
+    if type(run.config.get("seed", 0)) is not int:
+        raise ValueError(f"{file} is damaged: its seed is {run.config['seed']!r}")
+    try:
+        run.key  # noqa: B018  (refuses damaged options)
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    return run if run.final is not None else None
 
 
 @dataclass(frozen=True)
@@ -190,39 +248,25 @@ class Runs:
 
 def listed(names: Sequence[str], most: int = 3) -> str:
     """Some names, and how many more: ``a, b, c and 2 more``."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
-
-
-def open_run(folder: RunFolder) -> Run | None:
-    """A run from its folder, None if it has not finished."""
-    final, config, file = folder.final(), folder.config(), folder.path / "config.json"
-    if not {"env", "memory"} <= set(config):
-        raise ValueError(f"{file} does not describe a run: it has no env or no memory")
-    if type(config.get("seed", 0)) is not int:
-        raise ValueError(f"{file} is damaged: its seed is {config['seed']!r}")
-    run = Run(folder, config, final or {})
-    try:
-        run.key  # noqa: B018  (refuses damaged options here, with the name of the file)
-    except ValueError as error:
-        raise ValueError(f"{file} is damaged: {error}") from error
-    return run if final is not None else None
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def find_runs(paths: Sequence[Path]) -> Runs:
-    """All finished runs below some folders."""
+    """All finished runs below some folders, which have to be comparable."""
     if not paths:
         raise ValueError("name the folder with the runs: --runs DIR")
-    folders = list(dict.fromkeys(folder for path in paths for folder in _folders(path)))
-    opened = {folder: open_run(RunFolder(folder)) for folder in folders}
+    opened = {folder: open_run(folder) for path in paths for folder in _folders(path)}
     runs = [run for run in opened.values() if run is not None]
     if not runs:
-        raise ValueError(f"none of the {len(folders)} runs below {listed([str(p) for p in paths])} has finished")
+        raise ValueError(f"none of the {len(opened)} runs below {listed([str(p) for p in paths])} has finished")
+    _check_comparable(Runs(tuple(runs)))
     unfinished = [folder.name for folder, run in opened.items() if run is None]
     notes = [f"left out, not finished: {listed(unfinished)}"] if unfinished else []
-    found = Runs(tuple(runs), notes)
-    _check_comparable(found)
-    return replace(found, notes=notes + _versions_note(runs))
+    made = [run.record.get("versions") for run in runs]
+    several = sorted({str(each.get("arcade_torch", "")) for each in made if isinstance(each, dict)} - {""})
+    if len(several) > 1:
+        notes.append(f"the runs were made with several versions of arcade_torch: {', '.join(several)}")
+    return Runs(tuple(runs), notes)
 
 
 def _folders(path: Path) -> list[Path]:
@@ -232,62 +276,44 @@ def _folders(path: Path) -> list[Path]:
         raise ValueError(f"{path} is a file: give a folder with runs")
     if (path / "meta.json").is_file():
         raise ValueError(f"{path} is a single checkpoint: give its run folder, {path.parent.parent}")
-    found = sorted(file.parent for file in path.rglob("config.json") if "checkpoints" not in file.parts)
+    rows = read_csv(table) if (table := path / "results.csv").is_file() else []  # of a study: in the order of its grid
+    order = {row.get("run"): place for place, row in enumerate(rows)}
+    found = [file.parent for file in path.rglob("config.json") if "checkpoints" not in file.parts]
     if not found:
         raise ValueError(f"{path} holds no run: a run folder has a config.json")
-    if (path / "results.csv").is_file():  # a study: in the order of its grid
-        order = {row.get("run"): place for place, row in enumerate(read_csv(path / "results.csv"))}
-        found.sort(key=lambda folder: order.get(folder.name, len(order)))
-    return found
+    return sorted(found, key=lambda folder: (order.get(folder.name, len(order)), folder))
 
 
 def _check_comparable(found: Runs) -> None:
     """Refuse several versions or rules of a game, a run that stands there twice, and seeds that are none."""
-    ids: dict[str, set[str]] = {}
-    for run in found.runs:
-        ids.setdefault(re.sub(r"-v\d+$", "", run.game), set()).add(run.game)
-    for names in ids.values():
-        if len(versioned := sorted(name for name in names if re.search(r"-v\d+$", name))) > 1:
-            raise ValueError(f"runs of {' and '.join(versioned)} cannot be compared: give one version of a game")
+    games = sorted({run.game for run in found.runs if re.search(r"-v\d+$", run.game)})
+    for old, new in pairwise(games):
+        if old.rpartition("-v")[0] == new.rpartition("-v")[0]:
+            raise ValueError(f"runs of {old} and {new} cannot be compared: give one version of a game")
     for key in ("rules", "obs_size"):
         values = sorted({str(run.config[key]) for run in found.runs if key in run.config})
         if len(values) > 1:
             raise ValueError(f"runs with {key} {' and '.join(values)} cannot be compared: give runs with one of them")
     for (agent, game, twin), runs in found.groups().items():
-        _check_seeds(runs, f"{agent} on {game} ({twin})")
-
-
-def _check_seeds(runs: Sequence[Run], what: str) -> None:
-    seen: dict[int, Run] = {}
-    for run in runs:
-        if run.seed in seen:
-            raise ValueError(f"{seen[run.seed].folder.path} and {run.folder.path} are the same cell: give one of them")
-        seen[run.seed] = run
-        first, other = _settings(runs[0]), _settings(run)
-        for name in first.keys() & other.keys():
-            if first[name] != other[name]:
-                raise ValueError(
-                    f"seeds of {what} differ in {name}: {first[name]} and {other[name]}; give runs with one of them"
-                )
+        for one, run in pairwise(runs):  # by seed
+            if one.seed == run.seed:
+                raise ValueError(f"{one.path} and {run.path} are the same cell: give one of them")
+            first, other = _settings(one), _settings(run)
+            if differ := [name for name in first if name in other and first[name] != other[name]]:
+                what = f"{differ[0]}: {first[differ[0]]} and {other[differ[0]]}; give runs with one of them"
+                raise ValueError(f"seeds of {agent} on {game} ({twin}) differ in {what}")
 
 
 def _settings(run: Run) -> dict[str, Any]:
     """What decides a run's result beside its agent, its game and its seed."""
-    others = {"pqn", "ppo", "dqn"} - {run.key.algorithm}
-    own = {name: value for name, value in run.config.items() if name not in (*_NOT_SETTINGS, *others)}
+    others = _NOT_SETTINGS | ({"pqn", "ppo", "dqn"} - {run.key.algorithm})
+    own = {name: value for name, value in run.config.items() if name not in others}
     return flatten(own | {"env_options": run.config.get("env_options") or {}})
 
 
-def _versions_note(runs: Sequence[Run]) -> list[str]:
-    made = [run.folder.record().get("versions") for run in runs]
-    found = sorted({str(each.get("arcade_torch", "")) for each in made if isinstance(each, dict)} - {""})
-    return [f"the runs were made with several versions of arcade_torch: {', '.join(found)}"] * (len(found) > 1)
-
-
-_AGENT, _GAME, _SCORE = ("agent", "memory", "model"), ("game", "env", "task"), ("score", "return", "value")
-
 Source = str | Path | Sequence[str | Path] | Iterable[Score]
-Entry = tuple[AgentKey, Score]  # a score whose agent has no name yet
+_COLUMNS: dict[str, tuple[str, ...]] = {"agent": ("agent", "memory", "model"), "game": ("game", "env", "task")}
+_COLUMNS |= {"observability": ("observability",), "seed": ("seed",), "score": ("score", "return", "value")}
 
 
 def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
@@ -308,12 +334,14 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         ValueError: the metric is unknown, a table lacks a column, or a run appears twice.
     """
     _known(metric)
-    parts: list[Any] = [runs] if isinstance(runs, str | Path) else list(runs)
-    found: list[Entry] = []
-    for part in parts:
+    found: list[tuple[AgentKey, Score]] = []  # whose agents have no names yet
+    for part in [runs] if isinstance(runs, str | Path) else list(runs):
         found += [(AgentKey("", part.agent), part)] if isinstance(part, Score) else _read(Path(part), metric)
-    names = agent_names(key for key, _ in found)
-    scores = _one_name_a_game([replace(score, agent=names[key]) for key, score in found])
+    names, newest = agent_names(key for key, _ in found), dict[str, str]()
+    for game in {score.game for _, score in found if re.search(r"-v\d+$", score.game)}:
+        bare = game.rpartition("-v")[0]  # stands for the newest version that is there
+        newest[bare] = max(newest.get(bare, game), game, key=lambda name: int(name.rpartition("-v")[2]))
+    scores = [replace(score, agent=names[key], game=newest.get(score.game, score.game)) for key, score in found]
     seen: set[tuple[str, str, str, int, str]] = set()
     for score in scores:
         for name in (score.agent, score.game):
@@ -332,68 +360,41 @@ def _known(metric: str) -> str:
     return metric
 
 
-def _one_name_a_game(scores: list[Score]) -> list[Score]:
-    """Where a game stands both bare and with its version, as the newest version that is there."""
-    full: dict[str, str] = {}
-    for name in sorted({score.game for score in scores if re.search(r"-v\d+$", score.game)}, key=len):
-        bare = name.rpartition("-v")[0]
-        full[bare] = max(full.get(bare, name), name, key=lambda item: int(item.rpartition("-v")[2]))
-    return [replace(score, game=full.get(score.game, score.game)) for score in scores]
+def _read(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
+    table = next((file for file in (path, path / "results.csv") if file.is_file()), None)
+    if table is not None:
+        return _read_table(table, metric)
+    if not (path / "config.json").is_file():
+        why = "holds neither a study (results.csv) nor a run (config.json)" if path.exists() else "does not exist"
+        raise FileNotFoundError(f"{path} {why}")
+    run = open_run(path)
+    return [] if run is None else [(run.key, Score("", run.game, run.twin, run.seed, run.value(metric)))]
 
 
-def _read(path: Path, metric: str) -> list[Entry]:
-    if path.is_file():
-        return _read_table(path, metric)
-    if (path / "results.csv").is_file():
-        return _read_table(path / "results.csv", metric)
-    if (path / "config.json").is_file():
-        run = open_run(RunFolder(path))
-        return [] if run is None else [(run.key, Score("", run.game, run.twin, run.seed, run.value(metric)))]
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist")
-    raise FileNotFoundError(f"{path} holds neither a study (results.csv) nor a run (config.json)")
-
-
-def _read_table(path: Path, metric: str) -> list[Entry]:
-    rows = read_csv(path)
-    header = set(rows[0]) if rows else set()
-    if {"mdp_mean", "pomdp_mean"} <= header:
-        if missing := sorted({"env", "model"} - header):
-            raise ValueError(f"{path} has no column for {', '.join(missing)}; it has {', '.join(sorted(header))}")
-        try:
-            return [score for row in rows for score in _wide(row)]
-        except ValueError as error:
-            raise ValueError(f"{path}: a mean is not a number ({error})") from None
-    own = "eval_mean" if metric == "eval_final" else "train_max_ewm"
-    roles: dict[str, tuple[str, ...]] = {"agent": _AGENT, "game": _GAME, "observability": ("observability",)}
-    roles |= {"seed": ("seed",), "score": (own, metric, *_SCORE)}
-    names = {role: next((name for name in choice if name in header), None) for role, choice in roles.items()}
-    missing = [role for role, name in names.items() if name is None]
-    if missing:
-        raise ValueError(f"{path} has no column for {', '.join(missing)}; it has {', '.join(sorted(header)) or 'none'}")
-    found = []
+def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
+    rows, found = read_csv(path), []
+    if rows and {"model", "env", "mdp_mean", "pomdp_mean"} <= set(rows[0]):  # means over seeds count as a single seed
+        rows = [
+            {"model": row["model"], "game": row["env"] + row.get("difficulty", "").capitalize(), "seed": "0"}
+            | {"observability": twin, "score": row[column]}
+            for row in rows
+            for twin, column in (("full", "mdp_mean"), ("partial", "pomdp_mean"))
+        ]
+    header = list(rows[0]) if rows else []
+    roles = _COLUMNS | {"score": ("eval_mean" if metric == "eval_final" else metric, metric, *_COLUMNS["score"])}
+    columns = {role: next((name for name in names if name in header), "") for role, names in roles.items()}
+    if missing := [role for role, name in columns.items() if not name]:
+        raise ValueError(f"{path} has no column for {', '.join(missing)}; it has {', '.join(header) or 'none'}")
     for row in rows:
-        cell = {role: row[str(name)] for role, name in names.items()}
-        if cell["score"] == "":
+        agent, game, twin, seed, score = (row[name] for name in columns.values())
+        if not score:
             continue
         try:
-            score = Score("", cell["game"], cell["observability"], int(cell["seed"]), float(cell["score"]))
+            made = Score("", game, twin, int(seed), float(score), row.get("player") or "")
         except ValueError:
-            raise ValueError(f"{path}: seed {cell['seed']!r} or score {cell['score']!r} is not a number") from None
-        found.append((_key_of_row(path, row, cell["agent"]), replace(score, player=row.get("player") or "")))
+            raise ValueError(f"{path}: seed {seed!r} or score {score!r} is not a number") from None
+        run = path.parent / "runs" / (row.get("run") or "")
+        by_settings = row.get("run") and path.name == "results.csv" and (run / "config.json").is_file()
+        key = AgentKey.of(Run(run).config) if by_settings else AgentKey(row.get("algorithm") or "", agent)
+        found.append((key, made))
     return found
-
-
-def _key_of_row(path: Path, row: Mapping[str, str], agent: str) -> AgentKey:
-    """From the settings of the run a study's row is about; else by the names in the row."""
-    run = RunFolder(path.parent / "runs" / row["run"]) if row.get("run") and path.name == "results.csv" else None
-    if run is not None and (run.path / "config.json").is_file():
-        return AgentKey.of(run.config())
-    return AgentKey(row.get("algorithm") or "", agent)
-
-
-def _wide(row: dict[str, str]) -> list[Entry]:
-    """A line of a published table: means over seeds only, so each counts as a single seed."""
-    game, key = row["env"] + row.get("difficulty", "").capitalize(), AgentKey("", row["model"])
-    pairs = (("full", "mdp_mean"), ("partial", "pomdp_mean"))
-    return [(key, Score("", game, twin, 0, float(row[column]))) for twin, column in pairs]

@@ -247,8 +247,8 @@ def test_a_window_plays_what_is_pressed_and_shows_it(pygame: object, monkeypatch
 
 
 def test_every_key_of_the_window_and_of_the_terminal_is_one_of_the_session(pygame: object) -> None:
-    assert set(window._KEY_OF) == set(KEYS) == set(terminal._SEQUENCES.values())
-    assert all(hasattr(pygame, constant) for constant in window._KEY_OF.values())
+    assert set(window._KEYS.values()) == set(KEYS) == set(terminal._KEYS.values())
+    assert all(hasattr(pygame, constant) for constant in window._KEYS)
 
 
 def test_without_display_or_pygame_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:

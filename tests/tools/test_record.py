@@ -11,18 +11,16 @@ import torch
 from tensordict import TensorDict
 
 import arcade_torch
-from arcade_torch.agents import evaluate, held_out_seed, preset
+from arcade_torch.agents import evaluate, held_out_seed, load, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.agents.runs.checkpoint import save_checkpoint
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.oracles import make_oracle
 from arcade_torch.envs_jax.oracles import play as oracle_play
 from arcade_torch.tools import cli
+from arcade_torch.tools.play import recording
+from arcade_torch.tools.play.recording import SCRIPTED, recorded_frames, scripted, trained, write_gif, write_mp4
 from arcade_torch.tools.play.session import Attempt, Session
-from arcade_torch.tools.record import evaluations
-from arcade_torch.tools.record.episodes import recorded_frames
-from arcade_torch.tools.record.files import write_gif, write_mp4
-from arcade_torch.tools.record.players import SCRIPTED, Trained, load_agent, scripted
 
 GAME = "MineSweeperEasy"
 
@@ -78,7 +76,7 @@ def test_an_agent_is_shown_what_arcade_env_shows(observability: str) -> None:
         if step["next", "done"].item():
             break
     player, found = session(seed=11, both=True)
-    list(recorded_frames(player, Trained(agent, observability == "partial"), max_steps=99, hold=1, scale=1))
+    list(recorded_frames(player, trained(agent, observability == "partial"), max_steps=99, hold=1, scale=1))
     assert found[0].actions == actions and len(set(actions)) > 1
 
 
@@ -97,7 +95,7 @@ def test_a_run_folder_plays_as_it_is_evaluated(
     seed = held_out_seed(0)
     words = ["record", GAME, "--player", str(run_folder), "--seed", str(seed), "--out", str(tmp_path / "a.gif")]
     assert cli.main([*words, "--scale", "1"]) == 0
-    result = evaluate(load_agent(str(run_folder)), episodes=1)
+    result = evaluate(load(run_folder), episodes=1)
     said = f"seed {seed}: return {result.returns[0]:+.3f} in {result.lengths[0]} steps"
     assert said in capsys.readouterr().out
     frames, _ = pictures(tmp_path / "a.gif")
@@ -228,10 +226,10 @@ def test_every_evaluation_of_a_training_is_filmed_and_changes_nothing(tmp_path: 
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
     films = sorted(path.name for path in (tmp_path / "filmed" / "videos").iterdir())
     assert films == ["frames-000000128.gif", "frames-000000256.gif"]
-    agent, found = load_agent(str(tmp_path / "filmed")), []
+    agent, found = load(tmp_path / "filmed"), []
     game = compiled_game(GAME, 128, "default", {})
-    player = Session(game, seed=evaluations.SEED, partial=False, episodes=1, on_attempt=found.append)
-    played = list(recorded_frames(player, Trained(agent, False), max_steps=500, hold=evaluations.FPS, scale=2))
+    player = Session(game, seed=recording.FILM_SEED, partial=False, episodes=1, on_attempt=found.append)
+    played = list(recorded_frames(player, trained(agent, False), max_steps=500, hold=recording.FILM_FPS, scale=2))
     np.testing.assert_array_equal(pictures(tmp_path / "filmed" / "videos" / films[-1])[0], np.stack(played))
     assert (tmp_path / "filmed/eval.csv").read_bytes() == (tmp_path / "plain/eval.csv").read_bytes()
     weights = [sorted((tmp_path / run).rglob("*.safetensors"))[-1].read_bytes() for run in ("filmed", "plain")]
@@ -239,9 +237,9 @@ def test_every_evaluation_of_a_training_is_filmed_and_changes_nothing(tmp_path: 
 
 
 def test_a_film_that_fails_is_the_last_and_stops_nothing(tmp_path: Path) -> None:
-    film = evaluations.EvaluationVideos(tmp_path / "videos")
+    film = recording.EvaluationVideos(tmp_path / "videos")
     with pytest.warns(UserWarning, match="no more films, frames-000000007.gif: AttributeError"):
         film(type("Broken", (), {"frames": 7})())
     film(None)
     with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4"):
-        evaluations.EvaluationVideos(tmp_path, ".avi")
+        recording.EvaluationVideos(tmp_path, ".avi")

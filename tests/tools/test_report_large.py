@@ -8,7 +8,7 @@ from arcade_torch.agents import preset, train
 from arcade_torch.tools import cli, report
 from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.reports import build, panels
-from arcade_torch.tools.reports.selection import representatives, select_cells
+from arcade_torch.tools.reports.panels import representatives, select_cells
 from arcade_torch.tools.runs import Runs, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
@@ -58,8 +58,11 @@ def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: P
     folder, study = large_study(tmp_path / "s", seeds=4)
     for run in study.runs():
         (folder.run(run).path / "checkpoints").mkdir()
-    runs = Runs(tuple(run for spec in study.runs() if (run := open_run(folder.run(spec))) is not None))
-    cells, note = select_cells(runs, build._finals(runs), study.baseline)
+    runs = Runs(tuple(run for spec in study.runs() if (run := open_run(folder.run(spec).path)) is not None))
+    finals: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for (agent, game, twin), group in runs.groups().items():
+        finals.setdefault((game, twin), {})[agent] = [run.value("eval_final") for run in group]
+    cells, note = select_cells(runs, finals, study.baseline)
     assert {cell.agent for cell in cells} == {"mlp", "lru"}
     assert {cell.game for cell in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
     assert all(len(cell.runs) == 3 for cell in cells)

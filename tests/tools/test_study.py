@@ -17,7 +17,7 @@ from arcade_torch.tools.progress import Speed
 from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
-from arcade_torch.tools.studies.runner import DiskFullError, Display, check_names, make_engine, shard_of, study
+from arcade_torch.tools.studies.runner import DiskFullError, Display, make_engine, planned, study
 from tests.tools.fabricated import small_study, write_run, write_study
 
 
@@ -93,7 +93,7 @@ def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(
         ({"seeds": 0}, "1 to 10000"),
         ({"seeds": [1, 1]}, "names something twice"),
         ({"seeds": [-1]}, "0 or more"),
-        ({"observability": ["some"]}, "full, partial"),
+        ({"observability": ["some"]}, "full, partial or both"),
         ({"total_frames": 0}, "total_frames"),
         ({"name": "a/b"}, "letters, digits"),
         ({"colour": 1}, "unknown key 'colour'"),
@@ -107,7 +107,7 @@ def test_bad_studies_are_refused_with_a_reason(changes: dict[str, object], messa
 
 def test_unknown_games_and_memories_are_named_before_anything_runs(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="MineSweeperEasy"):
-        check_names(small_study(games=["MineSweperEasy"]))
+        planned(small_study(games=["MineSweperEasy"]))
     with pytest.raises(ValueError, match="did you mean 'mingru'"):
         study(small_study(memories=["minrgu"]), tmp_path / "s", Fabricator(small_study()))
     assert not (tmp_path / "s").exists()
@@ -349,10 +349,10 @@ def test_engines_are_made_by_name() -> None:
 
 
 def test_speed_is_that_of_the_last_seconds() -> None:
-    speed = Speed(window_s=10)
+    speed = Speed()
     assert speed.update(0, 0) == 0
     assert speed.update(5, 500) == 100
-    assert speed.update(20, 3500) == pytest.approx(200)
+    assert speed.update(50, 9500) == pytest.approx(200)
 
 
 def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
@@ -416,7 +416,7 @@ def test_shards_share_the_runs_out_and_each_knows_the_results_of_all(tmp_path: P
     assert sorted(name for engine in engines for name in engine.done) == sorted(run.name for run in what.runs())
     for wrong in ("0/3", "4/3", "3", "a/b", "1/0"):
         with pytest.raises(ValueError, match="a shard is written 3/10, the third of ten"):
-            shard_of(wrong)
+            planned(what, wrong)
 
 
 def test_a_study_on_a_full_disk_stops_at_the_first_run_that_fails_for_it(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import io
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -141,7 +140,7 @@ def test_where_the_disk_is_shared_the_run_is_written_there(tmp_path: Path) -> No
 @pytest.mark.usefixtures("_small_training")
 def test_where_the_disk_is_not_shared_the_small_files_travel_back(tmp_path: Path) -> None:
     def elsewhere(job: Job, config: bytes) -> Any:
-        return carry_out(replace(job, config=tmp_path / "nowhere" / job.config.name), config)
+        return carry_out(job._replace(config=tmp_path / "nowhere" / job.config.name), config)
 
     assert run_all(FakeRay(elsewhere), some_jobs(tmp_path, 1))["run0"].error == ""
     run = tmp_path / "runs" / "run0"

@@ -41,8 +41,8 @@ def test_rates_are_those_with_every_frame_consumed(tmp_path: Path, capsys: pytes
     rows = figure(tmp_path, capsys)
     assert (tmp_path / "throughput.png").read_bytes().startswith(b"\x89PNG")
     assert rate(rows, "BEasy", "drawing", 16) == 3200 and rate(rows, "BEasy", "no drawing", 16) == 32000
-    assert rate(rows, "compiled step", "mean or other", 1) == 150
-    assert rate(rows, "writing the same bytes", "mean or other", 16) == 120_000
+    assert rate(rows, "compiled step", "mean", 1) == 150
+    assert rate(rows, "writing the same bytes", "mean", 16) == 120_000
 
 
 def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,7 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
             found.append(path)
         else:
             runs = find_runs([path])
-            found += [run.folder.path for run in runs.runs]
+            found += [run.path for run in runs.runs]
             notes += runs.notes
     return found, notes
 

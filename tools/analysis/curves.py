@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, over_seeds
-from arcade_torch.tools.studies.folder import RunFolder
+from arcade_torch.tools.runs import Run
 
 POINTS = 120
 """Points of a training curve."""
@@ -23,7 +23,7 @@ class Curve(Pooled):
 
 
 def curves_of_runs(
-    groups: Mapping[tuple[str, str, str], Sequence[RunFolder]], kind: str = "eval", confidence: float = 0.95
+    groups: Mapping[tuple[str, str, str], Sequence[Run]], kind: str = "eval", confidence: float = 0.95
 ) -> list[Curve]:
     """Curves of groups of run folders.
 
@@ -50,7 +50,7 @@ def curves_of_runs(
     return found
 
 
-def _history(run: RunFolder, kind: str) -> tuple[Array, Array]:
+def _history(run: Run, kind: str) -> tuple[Array, Array]:
     name, column = ("eval.csv", "mean") if kind == "eval" else ("metrics.csv", "train_return_ewm")
     rows = [row for row in run.table(name) if row.get(column)]
     try:

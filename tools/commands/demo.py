@@ -33,9 +33,12 @@ class Demo:
 
     def run(self) -> int:
         """Run the study and write its report."""
-        from arcade_torch.tools.demo import demo, demo_study
+        from arcade_torch.tools.commands.study import carry_out
+        from arcade_torch.tools.studies.grid import demo_study
+        from arcade_torch.tools.studies.runner import make_engine
 
-        return demo(self.out, demo_study(self.frames, self.seeds, self.game), self.workers, self.command())
+        what = demo_study(self.game, self.frames, self.seeds)
+        return carry_out(what, self.out, make_engine("auto", self.workers), self.command(), self.resume_hint())
 
     def command(self) -> str:
         """The line that starts this demo."""

@@ -34,33 +34,15 @@ class Evaluate:
         agent = load(self.run_folder)
         more: dict[str, Any] = {} if self.observability is None else {"observability": self.observability}
         result = evaluate(agent, episodes=self.episodes, **more)
-        returns = [float(value) for value in result.returns]
-        mean, half = mean_and_half_width(returns)
-        twin = self.observability or agent.config.observability
-        config = agent.config
+        twin, config = self.observability or agent.config.observability, agent.config
         print(
             f"{config.env} ({twin}), {config.algorithm} {config.memory}, {agent.frames:,} frames of training: "
-            f"mean return {mean:.3f} +- {half:.3f} (95 %) over {len(returns)} episodes"
+            f"mean return {result.mean:.3f} +- {result.ci:.3f} (95 %) over {len(result.returns)} episodes"
         )
         if self.json is not None:
-            lengths = [int(value) for value in result.lengths]
-            write_json(self.json, {"returns": returns, "lengths": lengths, "mean": mean, "half_width_95": half})
+            found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
+            write_json(self.json, found | {"mean": result.mean, "half_width_95": result.ci})
         return 0
-
-
-def mean_and_half_width(values: list[float]) -> tuple[float, float]:
-    """Mean and half the width of its normal 95 % interval (0 for a single value).
-
-    Example:
-        >>> mean_and_half_width([1.0, 1.0])
-        (1.0, 0.0)
-    """
-    count = len(values)
-    mean = sum(values) / count
-    if count < 2:
-        return mean, 0.0
-    variance = sum((value - mean) ** 2 for value in values) / (count - 1)
-    return mean, float(1.96 * (variance / count) ** 0.5)
 
 
 COMMAND = Evaluate

@@ -48,56 +48,41 @@ class Play:
         """Play."""
         from arcade_torch.compiled import compiled_game
         from arcade_torch.tools.name_value import name_and_value
+        from arcade_torch.tools.play import scores, terminal, window
         from arcade_torch.tools.play.session import LEGEND, Session
-        from arcade_torch.tools.play.terminal import play_in_terminal
-        from arcade_torch.tools.play.window import play_in_window, why_no_window
 
-        self._check()
-        self._said: list[str] = []
-        options = dict(map(name_and_value, self.env_option))
-        game = compiled_game(self.game, self.obs_size, self.rules, options)
-        session = Session(
-            game,
-            seed=self._first_seed(game.batched.game.id),
-            partial=self.partial,
-            both=self.both,
-            episodes=self.episodes,
-            on_attempt=lambda attempt: self._keep(attempt, game.batched.game, options),
-        )
-        reason = None if self.terminal else why_no_window()
-        if self.terminal or reason is not None:
-            if reason is not None:
-                print(f"playing in the terminal: {reason}")
-            play_in_terminal(session)
-        else:
-            print(LEGEND)
-            play_in_window(session, self.scale, self.key_repeat)
-        print("\n".join(self._said) or "no episode was played")
-        return 0
-
-    def _check(self) -> None:
         if self.scale < 1:
             raise ValueError(f"--scale must be at least 1, got {self.scale}")
         if self.key_repeat < 0:
             raise ValueError(f"--key-repeat must be 0 or more milliseconds, got {self.key_repeat}")
         if self.scores is not None and self.scores.suffix != ".csv":
             raise ValueError(f"--scores must end in .csv, got {self.scores}")
+        options = dict(map(name_and_value, self.env_option))
+        compiled = compiled_game(self.game, self.obs_size, self.rules, options)
+        game: Any = compiled.batched.game
+        said: list[str] = []
+        rows = scores.read_scores_file(self.scores) if self.scores is not None else []
+        seed = scores.next_seed(rows, game.id, self.player) if self.seed is None else self.seed
 
-    def _first_seed(self, game_id: str) -> int:
-        """The seed that was asked for, or one that this player has not met in the file."""
-        from arcade_torch.tools.play.scores import next_seed, read_scores_file
+        def keep(attempt: Any) -> None:
+            """Write a score, and remember to say it when the screen is the terminal's again."""
+            how = f"return {attempt.total:+.3f} in {attempt.steps} steps, {attempt.end}"
+            said.append(f"seed {attempt.seed} ({attempt.observability}): {how}")
+            if self.scores is not None:
+                scores.append_score(self.scores, scores.score_row(attempt, game, options, self.player))
 
-        rows = read_scores_file(self.scores) if self.scores is not None else []
-        return next_seed(rows, game_id, self.player) if self.seed is None else self.seed
-
-    def _keep(self, attempt: Any, game: Any, options: dict[str, Any]) -> None:
-        """Write a score, and remember to say it when the screen is the terminal's again."""
-        from arcade_torch.tools.play.scores import append_score, score_row
-
-        words = f"seed {attempt.seed} ({attempt.observability}): return {attempt.total:+.3f} in {attempt.steps} steps"
-        self._said.append(f"{words}, {attempt.end}")
-        if self.scores is not None:
-            append_score(self.scores, score_row(attempt, game, options, self.player))
+        views = {"partial": self.partial, "both": self.both}
+        session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
+        reason = None if self.terminal else window.why_no_window()
+        if reason is not None:
+            print(f"playing in the terminal: {reason}")
+        if self.terminal or reason is not None:
+            terminal.play_in_terminal(session)
+        else:
+            print(LEGEND)
+            window.play_in_window(session, self.scale, self.key_repeat)
+        print("\n".join(said) or "no episode was played")
+        return 0
 
 
 COMMAND = Play

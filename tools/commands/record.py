@@ -1,6 +1,5 @@
 """``arcade-torch record``."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -47,66 +46,57 @@ class Record:
 
     def run(self) -> int:
         """Record."""
-        from arcade_torch.tools.record.episodes import recorded_frames
-        from arcade_torch.tools.record.files import writer_for
-
-        write = writer_for(self.out)
-        self._check()
-        session, chooser = self._players()
-        frames = recorded_frames(
-            session, chooser, max_steps=self.max_steps, hold=max(1, round(self.fps)), scale=self.scale
-        )
-        write(self.out, self._shown(frames), self.fps)
-        print(f"recording: {self.out}")
-        return 0
-
-    def _check(self) -> None:
-        from arcade_torch.tools.record.files import FASTEST_FPS
-
-        for name in ("episodes", "max_steps", "scale"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
-        fastest = FASTEST_FPS[self.out.suffix]
-        if not 0 < self.fps <= fastest:
-            raise ValueError(f"--fps must be above 0 and at most {fastest} for {self.out.suffix}, got {self.fps}")
-
-    def _players(self) -> tuple[Any, Any]:
-        """The session and who plays it."""
         from arcade_torch.compiled import compiled_game
         from arcade_torch.envs_jax import resolve_id
         from arcade_torch.tools.name_value import name_and_value
+        from arcade_torch.tools.optional import need
+        from arcade_torch.tools.play import recording
         from arcade_torch.tools.play.session import Session
-        from arcade_torch.tools.record.players import SCRIPTED, Trained, load_agent, scripted
 
-        game_id = resolve_id(self.game)
-        options = dict(map(name_and_value, self.env_option))
-        obs_size, rules, partial = self.obs_size, self.rules, self.player == "frames-oracle"
-        agent = None if self.player in SCRIPTED else load_agent(self.player)
+        write = recording.writer_for(self.out)
+        for name in ("episodes", "max_steps", "scale"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        fastest = recording.FASTEST_FPS[self.out.suffix]
+        if not 0 < self.fps <= fastest:
+            raise ValueError(f"--fps must be above 0 and at most {fastest} for {self.out.suffix}, got {self.fps}")
+        game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
+        agent = None if self.player in recording.SCRIPTED else self._agent()
+        obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
         if agent is not None:
             config = agent.config
-            if obs_size not in (None, config.obs_size):
-                raise ValueError(f"--obs-size is {obs_size}, but the agent sees frames of {config.obs_size}")
-            obs_size, rules, partial = config.obs_size, rules or config.rules, config.observability != "full"
+            if self.obs_size not in (None, config.obs_size):
+                raise ValueError(f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}")
+            obs_size, rules, partial = config.obs_size, self.rules or config.rules, config.observability != "full"
             if resolve_id(config.env) == game_id:
-                options = {**dict(config.env_options), **options}
+                options = {**config.env_options, **options}
             else:
                 print(f"note: this agent was trained on {config.env}")
         if self.observability is not None:
             partial = self.observability == "partial"
-        game = compiled_game(game_id, obs_size or 128, rules or "default", options)
-        session = Session(
-            game, seed=self.seed, partial=partial, both=self.both, episodes=self.episodes, on_attempt=_say
+        game = compiled_game(game_id, obs_size, rules, options)
+        views = {"partial": partial, "both": self.both}
+        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=_say, **views)
+        player = (
+            recording.scripted(self.player, session.game, self.seed)
+            if agent is None
+            else recording.trained(agent, partial)
         )
-        if agent is not None:
-            return session, Trained(agent, partial)
-        return session, scripted(self.player, game.batched.game, self.seed)
+        how = {"max_steps": self.max_steps, "hold": max(1, round(self.fps)), "scale": self.scale}
+        frames = recording.recorded_frames(session, player, **how)
+        bar = need("tqdm").tqdm(frames, desc=str(self.out), unit=" frames", disable=None, leave=False)
+        write(self.out, bar, self.fps)
+        print(f"recording: {self.out}")
+        return 0
 
-    def _shown(self, frames: Iterable[Any]) -> Iterable[Any]:
-        """The frames, counted on a terminal."""
-        from arcade_torch.tools.optional import need
+    def _agent(self) -> Any:
+        """The agent in a run folder."""
+        from arcade_torch.agents import load
+        from arcade_torch.tools.play.recording import SCRIPTED
 
-        bar: Iterable[Any] = need("tqdm").tqdm(frames, desc=str(self.out), unit=" frames", disable=None, leave=False)
-        return bar
+        if not Path(self.player).is_dir():
+            raise ValueError(f"--player is {self.player!r}, allowed: {', '.join(SCRIPTED)}, or a run folder")
+        return load(self.player)
 
 
 def _say(attempt: Any) -> None:

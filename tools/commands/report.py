@@ -34,17 +34,9 @@ class Report:
         from arcade_torch.tools.progress import Bars
         from arcade_torch.tools.reports.build import report
 
+        sections = {name: getattr(self, name) for name in ("saliency", "recall", "contamination", "references")}
         with Bars() as bars:
-            page = report(
-                self.study,
-                self.out,
-                metric=self.metric,
-                saliency=self.saliency,
-                recall=self.recall,
-                contamination=self.contamination,
-                references=self.references,
-                progress=bars.update,
-            )
+            page = report(self.study, self.out, metric=self.metric, progress=bars.update, **sections)
         print(f"report: {page}")
         return 0
 

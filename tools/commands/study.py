@@ -52,63 +52,24 @@ class StudyCommand:
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""
-        from arcade_torch.tools.studies.runner import DiskFullError, study
-
-        what = self.study()
-        out = self.out or Path("runs") / what.name
-        if self.dry_run:
-            return self._list(what)
-        try:
-            result = study(what, out, self._engine(), command=self.command(), shard=self.shard)
-        except DiskFullError as error:
-            print(f"stopped: {error}; {self.resume_hint()}")
-            return 1
-        print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
-        for name, reason in result.errors.items():
-            print(f"failed: {name}: {reason} (log: {result.root / 'logs' / f'{name}.log'})")
-        if self.report and result.finished and (not self.shard or result.finished == len(result.rows)):
-            from arcade_torch.tools.reports.build import report
-
-            print(f"report: {report(result.root)}")
-        return 1 if result.errors else 0
-
-    def study(self) -> "Study":
-        """What to run.
-
-        Raises:
-            ValueError: neither or both of a file and a preset were given, or the file is no study.
-            FileNotFoundError: there is no such file.
-        """
         from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
+        from arcade_torch.tools.studies.runner import make_engine, planned
 
         if (self.file is None) == (self.preset is None):
             raise ValueError(f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the two")
-        return study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
-
-    def _engine(self) -> "Engine":
-        from arcade_torch.tools.studies.runner import make_engine
-
-        return make_engine(
-            self.engine,
-            self.workers,
-            address=self.address,
-            cpus_per_run=self.cpus_per_run,
-            gpus_per_run=self.gpus_per_run,
-            retries=self.retries,
-        )
-
-    def _list(self, what: "Study") -> int:
-        from arcade_torch.tools.studies.runner import check_names, shard_of
-
-        check_names(what)
-        total, runs = 0, what.runs()[shard_of(self.shard)]
-        for run in runs:
-            config = what.config(run)
-            frames = config.num_updates * config.learner.frames_per_update
-            total += frames
-            print(f"{run.name}  {frames:,} frames")
-        print(f"{len(runs):,} runs, {total:,} frames in all", file=sys.stderr)
-        return 0
+        what = study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
+        if self.dry_run:
+            plan, total = planned(what, self.shard), 0
+            for run, config in plan.items():
+                frames = config.num_updates * config.learner.frames_per_update
+                total += frames
+                print(f"{run.name}  {frames:,} frames")
+            print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
+            return 0
+        of_ray = {name: getattr(self, name) for name in ("address", "cpus_per_run", "gpus_per_run", "retries")}
+        engine = make_engine(self.engine, self.workers, **of_ray)
+        out = self.out or Path("runs") / what.name
+        return carry_out(what, out, engine, self.command(), self.resume_hint(), self.shard, self.report)
 
     def command(self) -> str:
         """The line that started this study; without the shard, which is not the study's."""
@@ -120,6 +81,30 @@ class StudyCommand:
         """What to type after an interruption."""
         line = command_line(["study", *self.argv])
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
+
+
+def carry_out(
+    what: "Study", out: Path, engine: "Engine | str", command: str, hint: str, shard: str = "", report: bool = True
+) -> int:
+    """Run a study, say how each run ended, and write the report; exit code 1 if a run failed."""
+    from arcade_torch.tools.progress import Bars
+    from arcade_torch.tools.studies.runner import DiskFullError, study
+
+    try:
+        result = study(what, out, engine, command=command, shard=shard)
+    except DiskFullError as error:
+        print(f"stopped: {error}; {hint}")
+        return 1
+    print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
+    for name, reason in result.errors.items():
+        print(f"failed: {name}: {reason} (log: {result.root / 'logs' / f'{name}.log'})")
+    if report and result.finished and (not shard or result.finished == len(result.rows)):
+        from arcade_torch.tools.reports.build import report as write_report
+
+        with Bars() as bars:
+            page = write_report(result.root, progress=bars.update)
+        print(f"report: {page.resolve()}")
+    return 1 if result.errors else 0
 
 
 COMMAND = StudyCommand

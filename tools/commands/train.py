@@ -59,7 +59,7 @@ class Train:
         name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
         folder = self.out or Path("runs") / name
         if self.videos != "none":
-            from arcade_torch.tools.record.evaluations import EvaluationVideos
+            from arcade_torch.tools.play.recording import EvaluationVideos
 
             film = EvaluationVideos(folder / "videos", f".{self.videos}")
         wait_until_free(folder, self.wait)

@@ -27,8 +27,7 @@ def curves(options: CurveOptions, progress: Progress | None) -> Made:
     """The figure ``curves``."""
     found = find_runs(options.runs)
     kind = "eval" if options.metric == "eval_final" else "train"
-    groups = {key: [run.folder for run in runs] for key, runs in found.groups().items()}
-    every = curves_of_runs(groups, kind, options.confidence)
+    every = curves_of_runs(found.groups(), kind, options.confidence)
     if not every:
         raise ValueError(f"no run below {options.runs[0]} has logged a {AXIS[kind]}: nothing to draw")
     tasks = list(dict.fromkeys((curve.game, curve.observability) for curve in every))

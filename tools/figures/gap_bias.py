@@ -173,7 +173,7 @@ def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
     notes = found.notes + found.single_seeds()
     if not known:
         return found.scores(options.metric), notes
-    return read_scores([*known, *(run.folder.path for run in found.runs)], options.metric), notes
+    return read_scores([*known, *(run.path for run in found.runs)], options.metric), notes
 
 
 def _is_bare(path: Path) -> bool:

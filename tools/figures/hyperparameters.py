@@ -8,8 +8,7 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress
 from arcade_torch.tools.figures.style import panels
 from arcade_torch.tools.files import write_text
-from arcade_torch.tools.runs import find_runs
-from arcade_torch.tools.studies.grid import flatten
+from arcade_torch.tools.runs import find_runs, flatten
 
 NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
 """Fields that tell runs apart, or decide nothing."""

@@ -27,7 +27,7 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         raise ValueError(f"--show and --max-steps must be at least 1, got {options.show} and {options.max_steps}")
     paths, notes = checkpoints_of(options.runs)
     if len(paths) > 1 and all((path / "eval.json").is_file() for path in paths):
-        first = [runs[0].folder.path for runs in find_runs(paths).groups().values()]
+        first = [runs[0].path for runs in find_runs(paths).groups().values()]
         paths = [path for path in paths if path in first or path in options.runs]
     how = {name: getattr(options, name) for name in ("seed", "max_steps", "reduce", "norm", "target")}
     measured = []

@@ -16,42 +16,24 @@ from arcade_torch.tools.files import read_csv, write_csv
 from arcade_torch.tools.play.session import Attempt, Session
 
 COLUMNS = (
-    "model",
-    "env",
-    "difficulty",
-    "observability",
-    "return",
-    "steps",
-    "end",
-    "attempt",
-    "seed",
-    "actions",
-    "game",
-    "obs_size",
-    "rules",
-    "options",
-    "player",
+    *("model", "env", "difficulty", "observability", "return", "steps", "end", "attempt"),
+    *("seed", "actions", "game", "obs_size", "rules", "options", "player"),
 )
 _ID = re.compile(r"(?P<env>\w+?)(?P<difficulty>Easy|Medium|Hard)?-v\d+")
+_WHOLE = re.compile(r"[0-9]{1,10}")
 
 
 def score_row(attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = "") -> dict[str, Any]:
     """One line of the table."""
     match = _ID.fullmatch(game.id)
     return {
+        **{name: getattr(attempt, name) for name in ("observability", "steps", "end", "attempt", "seed", "actions")},
+        **{name: getattr(game, name) for name in ("obs_size", "rules")},
         "model": "human",
         "env": match["env"] if match else game.id,
         "difficulty": (match["difficulty"] or "").lower() if match else "",
-        "observability": attempt.observability,
         "return": None if attempt.end == "abandoned" else attempt.total,
-        "steps": attempt.steps,
-        "end": attempt.end,
-        "attempt": attempt.attempt,
-        "seed": attempt.seed,
-        "actions": attempt.actions,
         "game": game.id,
-        "obs_size": game.obs_size,
-        "rules": game.rules,
         "options": json.dumps(dict(options), sort_keys=True),
         "player": player,
     }
@@ -67,7 +49,7 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
     if not rows and path.read_text(encoding="utf-8").strip() != ",".join(COLUMNS):
         raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
     for row in rows:
-        if not re.fullmatch(r"[0-9]{1,10}", row["seed"]):
+        if not _WHOLE.fullmatch(row["seed"]):
             raise ValueError(f"{path}: the seed {row['seed']!r} is no whole number")
     return rows
 
@@ -95,24 +77,10 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     Raises:
         ValueError: the actions go on after the end, or the line is damaged.
     """
-    found: list[Attempt] = []
-    seed, obs_size, options = _numbers(row)
-    game = compiled_game(row["game"], obs_size, row["rules"], options)
-    session = Session(game, seed=seed, partial=row["observability"] == "partial", on_attempt=found.append)
-    for number, action in enumerate(row["actions"]):
-        if session.end is not None:
-            raise ValueError(f"{len(row['actions'])} actions, but the episode ends after {number}")
-        session.press(ACTION_NAMES[int(action)])
-    session.press("quit")
-    return found[0]
-
-
-def _numbers(row: Mapping[str, Any]) -> tuple[int, int, dict[str, Any]]:
-    """Seed, size and options of a line; its actions are looked at too."""
     if not re.fullmatch(r"[0-4]+", row["actions"]):
         raise ValueError(f"actions are digits from 0 to 4, one a step, got {row['actions']!r}")
     for name in ("seed", "obs_size"):
-        if not re.fullmatch(r"[0-9]{1,10}", str(row[name])):
+        if not _WHOLE.fullmatch(str(row[name])):
             raise ValueError(f"{name} is {row[name]!r}, expected a whole number")
     try:
         options = json.loads(row["options"])
@@ -120,4 +88,13 @@ def _numbers(row: Mapping[str, Any]) -> tuple[int, int, dict[str, Any]]:
         options = None
     if not isinstance(options, dict):
         raise ValueError(f"options are {row['options']!r}, expected a JSON object")
-    return int(row["seed"]), int(row["obs_size"]), options
+    found: list[Attempt] = []
+    game = compiled_game(row["game"], int(row["obs_size"]), row["rules"], options)
+    partial = row["observability"] == "partial"
+    session = Session(game, seed=int(row["seed"]), partial=partial, on_attempt=found.append)
+    for number, action in enumerate(row["actions"]):
+        if session.end is not None:
+            raise ValueError(f"{len(row['actions'])} actions, but the episode ends after {number}")
+        session.press(ACTION_NAMES[int(action)])
+    session.press("quit")
+    return found[0]

@@ -20,7 +20,6 @@ End = Literal["terminated", "truncated", "abandoned"]
 RESTART, TOGGLE, NEXT, QUIT = "restart", "toggle", "next", "quit"
 KEYS = (*ACTION_NAMES, RESTART, TOGGLE, NEXT, QUIT)
 LEGEND = "arrows and space play, P changes the twin, R restarts, Enter goes on after an end, Esc quits"
-_SEEDS = 2**32
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,8 @@ class Attempt:
 class Session:
     """One player at one game.
 
+    ``seed`` and ``end`` (None while it runs) are those of the running episode; a ``closed`` session hears nothing.
+
     Args:
         game: what is played.
         seed: of the first episode; each further one has the next.
@@ -79,18 +80,13 @@ class Session:
         partial: bool = False,
         both: bool = False,
         episodes: int = 0,
-        on_attempt: Callable[[Attempt], None] | None = None,
+        on_attempt: Callable[[Attempt], None] = lambda attempt: None,
     ) -> None:
         if episodes < 0:
             raise ValueError(f"episodes is {episodes}, expected 0 (no end) or more")
         self._batch = NumpyBatch(game, np.zeros(1, bool))
-        self.partial, self.both = partial, both
-        self.seed = seed
-        self.finished = 0
-        self.closed = False
-        self._episodes = episodes
-        self._on_attempt = on_attempt or (lambda attempt: None)
-        self._attempt = 0
+        self.partial, self.both, self.seed, self.finished, self.closed = partial, both, seed, 0, False
+        self._episodes, self._on_attempt, self._attempt = episodes, on_attempt, 0
         self._begin(seed)
 
     @property
@@ -113,11 +109,6 @@ class Session:
         """Return of the running episode so far."""
         return float(self._batch.info["episode_reward"][0])
 
-    @property
-    def end(self) -> End | None:
-        """How the episode ended; None while it runs."""
-        return self._end
-
     def view(self, partial: bool) -> Frame:
         """What one twin shows now, uint8 [1, S, S, 3]."""
         return self._batch.draw(np.array([partial]))
@@ -125,24 +116,17 @@ class Session:
     @property
     def frame(self) -> Frame:
         """What the player sees: uint8 [S, S, 3], or [S, 2 S, 3] with both twins."""
-        if self.both:
-            both: Frame = np.concatenate([self.view(False)[0], self.view(True)[0]], axis=1)
-            return both
-        one: Frame = self.view(self.partial)[0]
-        return one
+        twins = (False, True) if self.both else (self.partial,)
+        return np.concatenate([self.view(partial)[0] for partial in twins], axis=1)
 
     @property
     def caption(self) -> str:
         """Game, twin, return, steps and last reward in one line."""
         twin = "MDP | POMDP" if self.both else "POMDP" if self.partial else "MDP"
         numbers = f"return {self.total:+.3f}  steps {self.steps}/{self.game.max_steps}  last {self._reward:+.3f}"
-        return f"{self.game.id} {twin}  {numbers}{self._what_now()}"
-
-    def _what_now(self) -> str:
-        if self._end is None:
-            return ""
-        why = "over" if self._end == "terminated" else "time is up"
-        return f"  {why}: Enter {'ends' if self._all_played() else 'for the next'}, Esc quits"
+        why = {None: "", "terminated": "  over", "truncated": "  time is up"}[self.end]
+        what_now = f": Enter {'ends' if self._all_played() else 'for the next'}, Esc quits" if why else ""
+        return f"{self.game.id} {twin}  {numbers}{why}{what_now}"
 
     def press(self, key: str) -> None:
         """React to a key.
@@ -157,18 +141,21 @@ class Session:
             raise ValueError(f"key is {key!r}, allowed: {', '.join(KEYS)}")
         if self.closed:
             return
-        if key == QUIT:
+        if key == TOGGLE:
+            if not self.both:
+                self.partial = not self.partial
+                self._mixed |= self.end is None
+        elif key in ACTION_NAMES:
+            if self.end is None:
+                self._step(ACTION_NAMES.index(key))
+        elif key == QUIT or (self.end is not None and self._all_played()):
             self._abandon()
             self.closed = True
-        elif key == TOGGLE:
-            self._toggle()
-        elif key in (RESTART, NEXT) and self._end is not None:
-            self._go_on()
+        elif self.end is not None:  # leave the last picture
+            self._begin((self.seed + 1) % 2**32)
         elif key == RESTART:
             self._abandon()
             self._begin(self.seed)
-        elif key != NEXT and self._end is None:
-            self._step(ACTION_NAMES.index(key))
 
     def _begin(self, seed: int) -> None:
         """Begin the episode of a seed."""
@@ -176,25 +163,11 @@ class Session:
         self.seed = seed
         self._batch.reset(np.ones(1, bool), seed_keys(seed, 1))
         self._actions: list[int] = []
-        self._reward = 0.0
-        self._end: End | None = None
-        self._mixed = False
-
-    def _toggle(self) -> None:
-        """Show the other twin; side by side there is none."""
-        if not self.both:
-            self.partial = not self.partial
-            self._mixed |= self._end is None
-
-    def _go_on(self) -> None:
-        """Leave the picture of an end."""
-        if self._all_played():
-            self.closed = True
-        else:
-            self._begin((self.seed + 1) % _SEEDS)
+        self._reward, self._mixed = 0.0, False
+        self.end: Literal["terminated", "truncated"] | None = None
 
     def _all_played(self) -> bool:
-        return self._episodes > 0 and self.finished >= self._episodes
+        return 0 < self._episodes <= self.finished
 
     def _step(self, action: int) -> None:
         """Take an action."""
@@ -202,13 +175,13 @@ class Session:
         self._actions.append(action)
         self._reward = float(stepped.reward[0])
         if stepped.terminated[0] or stepped.truncated[0]:
-            self._end = "terminated" if stepped.terminated[0] else "truncated"
+            self.end = "terminated" if stepped.terminated[0] else "truncated"
             self.finished += 1
-            self._report(self._end)
+            self._report(self.end)
 
     def _abandon(self) -> None:
         """Report the running episode, if there is anything to report."""
-        if self._end is None and self._actions:
+        if self.end is None and self._actions:
             self._report("abandoned")
 
     def _report(self, end: End) -> None:

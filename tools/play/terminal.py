@@ -1,6 +1,7 @@
 """A session in a terminal: two pixels a character, by half blocks in 24-bit colours."""
 
 import os
+import re
 import select
 import shutil
 import sys
@@ -8,27 +9,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import numpy.typing as npt
 
+from arcade_torch.tools.optional import need
 from arcade_torch.tools.play.session import LEGEND, NEXT, QUIT, RESTART, TOGGLE, Frame, Session
 
-_SEQUENCES = {
-    **{b"\x1b" + prefix + bytes([letter]): name
-       for prefix in (b"[", b"O")
-       for letter, name in zip(b"ABCD", ("up", "down", "right", "left"), strict=True)},
+_ARROWS = dict(zip("ABCD", ("up", "down", "right", "left"), strict=True))
+_KEYS = {
+    **{f"\x1b{prefix}{letter}".encode(): name for prefix in "[O" for letter, name in _ARROWS.items()},
     b" ": "fire",
-    b"r": RESTART,
-    b"R": RESTART,
-    b"p": TOGGLE,
-    b"P": TOGGLE,
-    b"\r": NEXT,
-    b"\n": NEXT,
-    b"q": QUIT,
-    b"\x03": QUIT,
-    b"\x04": QUIT,
-}  # fmt: skip
-_ESCAPE = b"\x1b"
-_ESCAPE_WAIT_S = 0.05  # the rest of an arrow key's sequence arrives within this
+    **dict.fromkeys((b"r", b"R"), RESTART),
+    **dict.fromkeys((b"p", b"P"), TOGGLE),
+    **dict.fromkeys((b"\r", b"\n"), NEXT),
+    **dict.fromkeys((b"\x1b", b"q", b"\x03", b"\x04"), QUIT),
+}
+_SEQUENCE = re.compile(rb"\x1b[\[O][^@-~]*[@-~]?|.", re.DOTALL)  # up to the final byte of a sequence, or one byte
+_REST_WITHIN_S = 0.05  # the rest of an arrow key's sequence arrives within this
 _ENTER, _LEAVE = "\x1b[?1049h\x1b[?25l\x1b[2J", "\x1b[0m\x1b[?25h\x1b[?1049l"
 _TEXT_ROWS = 2
 
@@ -40,19 +35,7 @@ def decode_keys(data: bytes) -> list[str]:
         >>> decode_keys(b"\\x1b[A p\\x1b")
         ['up', 'fire', 'toggle', 'quit']
     """
-    keys = []
-    while data:
-        if data[:1] == _ESCAPE and data[1:2] in (b"[", b"O"):
-            length = 3
-            while length <= len(data) and not 0x40 <= data[length - 1] <= 0x7E:  # up to the final byte of a sequence
-                length += 1
-        else:
-            length = 1
-        chunk, data = data[:length], data[length:]
-        name = QUIT if chunk == _ESCAPE else _SEQUENCES.get(chunk)
-        if name is not None:
-            keys.append(name)
-    return keys
+    return [_KEYS[found] for found in _SEQUENCE.findall(data) if found in _KEYS]
 
 
 def shrink(frame: Frame, height: int, width: int) -> Frame:
@@ -62,17 +45,10 @@ def shrink(frame: Frame, height: int, width: int) -> Frame:
         >>> shrink(np.zeros((128, 256, 3), np.uint8), 60, 60).shape
         (30, 60, 3)
     """
-    factor = min(height / frame.shape[0], width / frame.shape[1])
-    if factor >= 1:
-        return frame
-    out: npt.NDArray[np.float64] = frame.astype(np.float64)
-    for axis in (0, 1):
-        size = frame.shape[axis]
-        fits = max(1, int(size * factor + 1e-9))
-        edges = np.arange(fits + 1) * size // fits
-        shape = [-1 if i == axis else 1 for i in range(3)]
-        out = np.add.reduceat(out, edges[:-1], axis=axis) / np.diff(edges).reshape(shape)
-    return out.round().astype(np.uint8)
+    image = need("PIL.Image")
+    picture = image.fromarray(frame)
+    picture.thumbnail((width, height), image.Resampling.BOX, reducing_gap=None)
+    return np.asarray(picture)
 
 
 def half_blocks(frame: Frame) -> list[str]:
@@ -105,9 +81,11 @@ def play_in_terminal(session: Session) -> None:
     with _raw_terminal() as source:
         while not session.closed:
             size = shutil.get_terminal_size()
-            sys.stdout.write(screen(session, size.columns, size.lines))
-            sys.stdout.flush()
-            for key in decode_keys(_read(source)):
+            print(screen(session, size.columns, size.lines), end="", flush=True)
+            data = os.read(source, 64)
+            while data.endswith((b"\x1b", b"\x1b[", b"\x1bO")) and select.select([source], [], [], _REST_WITHIN_S)[0]:
+                data += os.read(source, 64)
+            for key in decode_keys(data or b"\x04"):  # a closed terminal quits
                 session.press(key)
 
 
@@ -121,17 +99,8 @@ def _raw_terminal() -> Iterator[int]:
     before = termios.tcgetattr(source)
     try:
         tty.setcbreak(source)
-        sys.stdout.write(_ENTER)
+        print(_ENTER, end="")
         yield source
     finally:
         termios.tcsetattr(source, termios.TCSADRAIN, before)
-        sys.stdout.write(_LEAVE)
-        sys.stdout.flush()
-
-
-def _read(source: int) -> bytes:
-    """Wait for keys; the rest of a sequence that has begun is waited for. A closed terminal quits."""
-    data = os.read(source, 64)
-    while data.endswith((_ESCAPE, b"\x1b[", b"\x1bO")) and select.select([source], [], [], _ESCAPE_WAIT_S)[0]:
-        data += os.read(source, 64)
-    return data or b"\x04"
+        print(_LEAVE, end="", flush=True)

@@ -9,17 +9,8 @@ from arcade_torch.tools.play.session import NEXT, QUIT, RESTART, TOGGLE, Session
 
 FPS = 30
 _DELAY_MS = 300  # how long a key is held before it repeats
-_KEY_OF = {
-    "up": "K_UP",
-    "down": "K_DOWN",
-    "left": "K_LEFT",
-    "right": "K_RIGHT",
-    "fire": "K_SPACE",
-    RESTART: "K_r",
-    TOGGLE: "K_p",
-    NEXT: "K_RETURN",
-    QUIT: "K_ESCAPE",
-}
+_KEYS = {"K_UP": "up", "K_DOWN": "down", "K_LEFT": "left", "K_RIGHT": "right", "K_SPACE": "fire"}
+_KEYS |= {"K_r": RESTART, "K_p": TOGGLE, "K_RETURN": NEXT, "K_ESCAPE": QUIT}
 
 
 def why_no_window() -> str | None:
@@ -43,7 +34,7 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
     """Show a session and hand it the keys, until it is closed."""
     window = Window(scale)
     pygame = window.pygame
-    keys = {getattr(pygame, constant): name for name, constant in _KEY_OF.items()}
+    keys = {getattr(pygame, constant): name for constant, name in _KEYS.items()}
     try:
         window.show(session.frame, session.caption)
         pygame.key.set_repeat(*((_DELAY_MS, key_repeat_ms) if key_repeat_ms else ()))

@@ -9,6 +9,9 @@ TRUSTED_COVERAGE = 0.85
 """Below this measured coverage a difference is reported of the seeds that were run, not of the agent."""
 
 
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
 def number_words(count: int) -> str:
     """Small numbers as words.
 
@@ -16,8 +19,7 @@ def number_words(count: int) -> str:
         >>> number_words(2), number_words(30)
         ('two', '30')
     """
-    names = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-    return names[count] if 0 <= count < len(names) else str(count)
+    return _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
 
 
 def ends(interval: Interval) -> str:
@@ -85,16 +87,19 @@ def coverage_sentence(table: GapBias) -> str:
     )
 
 
+def way(value: float, levels: Mapping[str, float]) -> float | None:
+    """The share of the way from the random policy to the oracle; None where that is not known."""
+    low, high = levels.get("random"), levels.get("state")
+    return None if low is None or high is None or high == low else (value - low) / (high - low)
+
+
 def learning_sentence(game: str, twin: str, finals: Mapping[str, Sequence[float]], levels: Mapping[str, float]) -> str:
     """Where the agents of one task ended between the random policy and the oracle."""
-    if not finals or "random" not in levels or "state" not in levels:
+    ways = {agent: way(sum(values) / len(values), levels) for agent, values in finals.items()}
+    if not ways or None in ways.values():
         return ""
-    low, high = levels["random"], levels["state"]
-    if high == low:
-        return ""
-    ways = {agent: (sum(values) / len(values) - low) / (high - low) for agent, values in finals.items()}
-    said = ", ".join(f"{agent} {100 * way:.0f} %" for agent, way in ways.items())
-    below = [agent for agent, values in finals.items() if min(values) <= low]
+    said = ", ".join(f"{agent} {100 * share:.0f} %" for agent, share in ways.items() if share is not None)
+    below = [agent for agent, values in finals.items() if min(values) <= levels["random"]]
     kind = "MDP" if twin == "full" else "POMDP"
     tail = f"; a seed of {' and of '.join(below)} did not get above random" if below else ", every seed above random"
     return f"{game} {kind}, share of the way from random to oracle: {said}{tail}."

@@ -1,50 +1,54 @@
-"""The pictures of the page: every one is a figure of `arcade_torch.tools.figures`, as SVG or PNG."""
+"""The pictures of the page: every one is a figure of `arcade_torch.tools.figures`, as SVG or PNG.
+
+All agents of a small study are looked into, and of a large one a few that stand for the rest.
+"""
 
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from pathlib import Path
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, over_seeds
 from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
-from arcade_torch.tools.analysis.contamination import Contamination
 from arcade_torch.tools.analysis.contamination import contamination as noise
 from arcade_torch.tools.analysis.curves import curves_of_runs
 from arcade_torch.tools.analysis.gap_bias import GapBias
+from arcade_torch.tools.analysis.normalise import normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
-from arcade_torch.tools.analysis.recall_density import RecallDensity
 from arcade_torch.tools.analysis.recall_density import recall_density as density_of
 from arcade_torch.tools.figures import contamination, curves, gap_bias, recall_density, saliency
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, drawing, png, svg
-from arcade_torch.tools.reports.selection import Cell
-from arcade_torch.tools.runs import Runs
+from arcade_torch.tools.runs import Runs, is_baseline
 
 FULL, SMALL = (4.9, 3.0), (3.3, 2.3)
 """Sizes in inches; small ones for many tasks."""
-
 BINS = 8
 """Parts of an episode, or as many as the shortest episode of a task has frames."""
-
 DENSITY: Mapping[str, Any] = {"episodes": 16, "cap": 96}
 """Options of `recall_density` for the page; a figure for a paper takes 100 whole episodes."""
-
 NOISE: Mapping[str, Any] = {"sigmas": (0.3,), "delays": (0, 1, 2, 5, 10, 20), "starts": 32, "cap": 96}
 """Options of `contamination` for the page."""
-
 SHOW, TRIES = 8, 10
 """Frames of a saliency strip; episodes that are tried until one has as many."""
-
 LEVEL_NAMES = {"random": "random", "state": "oracle", "frames": "frames oracle"}
+
+MOST_CELLS = 12
+"""Up to so many (game, twin, agent) are all looked into."""
+MOST_GAMES = 3
+MOST_SEEDS = 3
+
+Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
+"""(game, twin) -> agent -> final returns of its finished seeds."""
 Levels = Mapping[str, Mapping[str, float]]
 """Game -> player -> mean return."""
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """A picture, what stands below it, and the task it is of, as ``GAME-TWIN`` (empty where there are several)."""
 
     picture: str
@@ -52,13 +56,66 @@ class Panel:
     task: str = ""
 
 
-@dataclass
-class Section:
+class Section(NamedTuple):
     """Pictures, rows of the table, and what could not be shown."""
 
-    panels: list[Panel] = field(default_factory=list)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    panels: list[Panel]
+    rows: list[dict[str, Any]]
+    notes: list[str]
+
+
+class Cell(NamedTuple):
+    """An agent on one twin of a game, and the folders of its finished runs, one a seed."""
+
+    agent: str
+    game: str
+    twin: str
+    runs: tuple[Path, ...]
+
+
+def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell], str]:
+    """The cells that are looked into, and a note on those that are not."""
+    paths = {
+        key: [run.path for run in group if (run.path / "checkpoints").is_dir()] for key, group in runs.groups().items()
+    }
+    bare = len(runs.runs) - sum(map(len, paths.values()))
+    notes = [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."] if bare else []
+    cells = [Cell(*key, tuple(found[:MOST_SEEDS])) for key, found in paths.items() if found]
+    most = max(map(len, paths.values()), default=0)
+    seeds = f"the first {MOST_SEEDS} of {most} seeds" if most > MOST_SEEDS else ""
+    if len(cells) <= MOST_CELLS:
+        return cells, " ".join(notes + ([f"Shown: {seeds} of each agent."] if seeds else []))
+    agents, games = representatives(finals, baseline)
+    out_of = f"{len({cell.agent for cell in cells})} agents and {len({cell.game for cell in cells})} games"
+    notes.append(
+        f"Shown: {' and '.join(agents)} on {', '.join(games)}{', ' + seeds if seeds else ''}, out of {out_of}: the "
+        "memory with the highest mean return where observations are partial, beside the memory-free agent, on the "
+        "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
+    )
+    return [cell for cell in cells if cell.agent in agents and cell.game in games], " ".join(notes)
+
+
+def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
+    """A memory-free agent (if there is one), the best agent with memory, and the games that tell them apart.
+
+    Example:
+        >>> representatives({("A", "partial"): {"mlp": [0.1], "lru": [0.9]}, ("B", "partial"): {"mlp": [0.5]}}, "mlp")
+        (['mlp', 'lru'], ['A'])
+    """
+    twin = "partial" if any(seen == "partial" for _, seen in finals) else "full"
+    means = {
+        game: {agent: fmean([normalise(game, float(value)) for value in values]) for agent, values in agents.items()}
+        for (game, seen), agents in finals.items()
+        if seen == twin
+    }
+    everybody = dict.fromkeys(agent for found in means.values() for agent in found)
+    free = [agent for agent in everybody if is_baseline(agent, baseline)]
+    strength = {agent: fmean([found[agent] for found in means.values() if agent in found]) for agent in everybody}
+    best = sorted((agent for agent in everybody if agent not in free), key=lambda agent: -strength[agent])
+    pair = [*free[:1], *(best[:1])]
+    there = [game for game, found in means.items() if all(agent in found for agent in pair)]
+    there.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
+    return pair, there[:MOST_GAMES]
 
 
 def picture(name: str, size: tuple[float, float], plot: Callable[[Any], object]) -> str:
@@ -71,37 +128,30 @@ def picture(name: str, size: tuple[float, float], plot: Callable[[Any], object])
 
 def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], small: bool) -> list[Panel]:
     """One picture a task; the twins of a game share their y axis."""
-    groups = {key: [run.folder for run in group] for key, group in runs.groups().items()}
-    every, panels = curves_of_runs(groups, kind), []
+    every, panels = curves_of_runs(runs.groups(), kind), []
     for game, twin in dict.fromkeys((curve.game, curve.observability) for curve in every):
         here = [curve for curve in every if (curve.game, curve.observability) == (game, twin)]
         seen = np.concatenate([curve.seeds.ravel() for curve in every if curve.game == game])
         means = levels.get(game, {})
         low, high = min([seen.min(), *means.values()]), max([seen.max(), *means.values()])
         margin = 0.07 * (high - low) or 0.5
-        shown = _joined({LEVEL_NAMES[k]: v for k, v in means.items() if (k, twin) != ("frames", "full")}, 2 * margin)
-        title = f"{game}, {TWIN_NAMES[twin]}"
+        shown: dict[str, float] = {}
+        for player, mean in means.items():
+            if (player, twin) != ("frames", "full"):  # lines that lie on one another share a label
+                near = next((name for name, at in shown.items() if abs(at - mean) < 2 * margin), None)
+                name = LEVEL_NAMES[player]
+                shown |= {name: mean} if near is None else {f"{near}, {name}": shown.pop(near)}
 
-        def plot(axis: Any, here: Any = here, shown: Any = shown, title: str = title, ends: Any = (low, high)) -> None:
-            curves.plot(here, axis, agents, shown)
-            axis.set_ylim(ends[0] - margin, ends[1] + margin)  # noqa: B023  (drawn at once)
-            axis.set_title(title)
+        def plot(axis: Any) -> None:
+            curves.plot(here, axis, agents, shown)  # noqa: B023  (drawn at once)
+            axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")  # noqa: B023
 
         counts = sorted({len(curve.seeds) for curve in here})
         seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
         caption = f"mean of {seeds}" + ("; band: interval over seeds" if counts != [1] else "")
-        drawn = picture(f"{kind} {title}", SMALL if small else FULL, plot)
+        drawn = picture(f"{kind} {game}, {TWIN_NAMES[twin]}", SMALL if small else FULL, plot)
         panels.append(Panel(drawn, "" if small else caption, f"{game}-{twin}"))
     return panels
-
-
-def _joined(levels: Mapping[str, float], apart: float) -> dict[str, float]:
-    """Reference lines that lie on one another share a label."""
-    found: dict[str, float] = {}
-    for name, value in levels.items():
-        near = next((other for other, at in found.items() if abs(at - value) < apart), None)
-        found |= {f"{near}, {name}": found.pop(near)} if near is not None else {name: value}
-    return found
 
 
 def score_panels(table: GapBias) -> list[Panel]:
@@ -109,19 +159,8 @@ def score_panels(table: GapBias) -> list[Panel]:
     return [Panel(picture(name, FULL, partial(gap_bias.plot_bars, table.rows, name=name))) for name in gap_bias.PANELS]
 
 
-@dataclass(frozen=True)
-class Strip:
-    """Frames under heat: whose they are, the picture, length of the episode, value drawn brightest, last share (%)."""
-
-    cell: Cell
-    source: str
-    frames: int
-    peak: float
-    last_share: float
-
-
-def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[Strip]:
-    """One strip for each cell, from its first finished seed."""
+def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[dict[str, Any]]:
+    """Frames under heat of every cell, from its first seed; with the value drawn brightest and the last share (%)."""
     strips = []
     for done, cell in enumerate(cells, start=1):
         _, found = measure_run(cell.runs[0], episode_saliency, {"show": SHOW, "tries": TRIES})
@@ -134,7 +173,8 @@ def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[St
                 axis.set_axis_off()
             peak = saliency.plot(frames, found.maps, axes[:count], below=shares)
             source = "data:image/png;base64," + b64encode(png(figure)).decode("ascii")
-        strips.append(Strip(cell, source, len(frames), peak, float(shares[-1])))
+        last = float(shares[-1])
+        strips.append({"cell": cell, "source": source, "frames": len(frames), "peak": peak, "last_share": last})
         if progress is not None:
             progress("saliency", done, len(cells))
     return strips
@@ -142,70 +182,77 @@ def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[St
 
 def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progress | None) -> Section:
     """Recall density of every cell, a picture a task; numbers are kept in the run folders."""
-    made, tasks = Section(), dict[tuple[str, str], dict[str, list[RecallDensity]]]()
-    for cell in cells:
-        tell = partial(progress, f"recall density, {cell.agent} on {cell.game}") if progress else None
-        every = [measure_run(path, density_of, DENSITY, None, tell)[1] for path in cell.runs]
-        if found := [density for density in every if density.shares]:
-            tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = found
-            shares = [share for density in found for share in density.shares]
-            row = {"episodes": len(shares), "length": float(np.mean([share.size for share in shares]))}
-            row |= {"last": float(np.mean([s[-1] for s in shares])), "first": float(np.mean([s[0] for s in shares]))}
-            row |= {"older": float(np.mean([density.mass(2)[0] for density in found]))}
-            made.rows.append(_row(cell, len(found)) | row)
-        else:
-            made.notes.append(f"{cell.agent} on {cell.game} {TWIN_NAMES[cell.twin]}: no episode of three frames")
-    for (game, twin), here in tasks.items():
+
+    def measure(cell: Cell, tell: Any) -> tuple[Any, dict[str, Any]]:
+        found = [measure_run(path, density_of, DENSITY, None, tell)[1] for path in cell.runs]
+        found = [density for density in found if density.shares]
+        if not found:
+            raise ValueError("no episode of three frames")
+        shares = [share for density in found for share in density.shares]
+        row = {"seeds": len(found), "episodes": len(shares), "length": float(np.mean([s.size for s in shares]))}
+        row |= {"last": float(np.mean([s[-1] for s in shares])), "first": float(np.mean([s[0] for s in shares]))}
+        return found, row | {"older": float(np.mean([density.mass(2)[0] for density in found]))}
+
+    def plot(here: Mapping[str, Any], axis: Any) -> None:
         bins = min(BINS, *(int(density.lengths.min()) for found in here.values() for density in found))
         series = {}
         for agent, found in here.items():
             series[agent] = (Pooled.of([density.mass(bins) for density in found]), agent_colours(agents)[agent])
-        title = f"{game}, {TWIN_NAMES[twin]}"
+        recall_density.plot(series, axis, bins)
+        axis.set_xlabel("time in the episode (1: the decision)")
 
-        def plot(axis: Any, series: Any = series, bins: int = bins, title: str = title) -> None:
-            recall_density.plot(series, axis, bins)
-            axis.set(title=title, xlabel="time in the episode (1: the decision)")
-
-        made.panels.append(Panel(picture(f"recall {title}", SMALL, plot), "", f"{game}-{twin}"))
-    return made
+    return _section(("recall density", "recall"), cells, measure, plot, progress)
 
 
 def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progress | None) -> Section:
     """Share of decisions that one noisy frame changes, by delay; a picture a task."""
-    made, tasks = Section(), dict[tuple[str, str], dict[str, contamination.Measures]]()
-    for cell in cells:
-        tell = partial(progress, f"contamination, {cell.agent} on {cell.game}") if progress else None
-        try:
-            measured = [measure_run(path, noise, NOISE, None, tell) for path in cell.runs]
-        except ValueError as error:  # episodes too short for a start point
-            made.notes.append(f"{cell.agent} on {cell.game} {TWIN_NAMES[cell.twin]}: {error}")
-            continue
+
+    def measure(cell: Cell, tell: Any) -> tuple[Any, dict[str, Any]]:
+        measured = [measure_run(path, noise, NOISE, None, tell) for path in cell.runs]
+        found = [one for _, one in measured]
         (pooled,) = contamination.pool(by_task(measured)).values()
-        tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = pooled
-        made.rows.append(_row(cell, len(measured)) | _noise_row([found for _, found in measured]))
-    for (game, twin), here in tasks.items():
+        flips = np.array([item.mean("flip")[0] for item in found])
+        change = over_seeds(np.array([item.mean("change")[0] for item in found]))[0]
+        later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
+        row = {"seeds": len(found), "points": sum(len(item.points) for item in found), "change": float(change[1])}
+        return pooled, row | {"at_once": _mean(flips[:, 0]), "one": _mean(flips[:, 1]), "later": _mean(later)}
+
+    def plot(here: Mapping[str, Any], axis: Any) -> None:
         delays = NOISE["delays"][: contamination.reached(here.values())]
+        contamination.plot(here, axis, "flip", 0, delays, agent_colours(agents))
+        top = max(axis.get_ylim()[1], contamination.LEAST_SCALE)
+        axis.set(xlabel="steps after the noisy frame", ylim=(-0.05 * top, top))
+
+    return _section(("contamination", "noise"), cells, measure, plot, progress)
+
+
+def _section(
+    names: tuple[str, str],
+    cells: Sequence[Cell],
+    measure: Callable[[Cell, Any], tuple[Any, dict[str, Any]]],
+    plot: Callable[[Mapping[str, Any], Any], None],
+    progress: Progress | None,
+) -> Section:
+    """Measure every cell for a row of the table, and draw the agents of each task in one picture."""
+    made, tasks = Section([], [], []), dict[tuple[str, str], dict[str, Any]]()
+    for cell in cells:
+        who, twin = f"{cell.agent} on {cell.game}", TWIN_NAMES[cell.twin]
+        try:
+            found, row = measure(cell, partial(progress, f"{names[0]}, {who}") if progress else None)
+        except ValueError as error:  # episodes too short
+            made.notes.append(f"{who} {twin}: {error}")
+            continue
+        tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = found
+        made.rows.append({"agent": cell.agent, "game": cell.game, "twin": twin} | row)
+    for (game, twin), here in tasks.items():
         title = f"{game}, {TWIN_NAMES[twin]}"
 
-        def plot(axis: Any, here: Any = here, delays: Any = delays, title: str = title) -> None:
-            contamination.plot(here, axis, "flip", 0, delays, agent_colours(agents))
-            top = max(axis.get_ylim()[1], contamination.LEAST_SCALE)
-            axis.set(title=title, xlabel="steps after the noisy frame", ylim=(-0.05 * top, top))
+        def draw(axis: Any) -> None:
+            plot(here, axis)  # noqa: B023  (drawn at once)
+            axis.set_title(title)  # noqa: B023
 
-        made.panels.append(Panel(picture(f"noise {title}", SMALL, plot), "", f"{game}-{twin}"))
+        made.panels.append(Panel(picture(f"{names[1]} {title}", SMALL, draw), "", f"{game}-{twin}"))
     return made
-
-
-def _noise_row(found: Sequence[Contamination]) -> dict[str, Any]:
-    flips = np.array([item.mean("flip")[0] for item in found])
-    change = over_seeds(np.array([item.mean("change")[0] for item in found]))[0]
-    later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
-    row = {"points": sum(len(item.points) for item in found), "change": float(change[1])}
-    return row | {"at_once": _mean(flips[:, 0]), "one": _mean(flips[:, 1]), "later": _mean(later)}
-
-
-def _row(cell: Cell, seeds: int) -> dict[str, Any]:
-    return {"agent": cell.agent, "game": cell.game, "twin": TWIN_NAMES[cell.twin], "seeds": seeds}
 
 
 def _mean(values: Array) -> float:

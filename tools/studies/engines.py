@@ -6,14 +6,16 @@ needs no channel of its own: every run writes ``progress.json`` into its folder.
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from arcade_torch.tools.errors import reason
 
@@ -24,30 +26,16 @@ PARENT_VARIABLE = "ARCADE_TORCH_PARENT"
 """Process id that a worker watches: when that process is gone the worker stops with a checkpoint."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """One run to do.
-
-    Attributes:
-        name: of the run.
-        config: JSON file with its config.
-        folder: of the run; one that was begun goes on.
-        log: file that takes what the run prints, or why it failed.
-    """
+class Job(NamedTuple):
+    """One run to do: its name, JSON file with its config, its folder, and the log for what it prints."""
 
     name: str
     config: Path
     folder: Path
     log: Path
 
-    @property
-    def argv(self) -> list[str]:
-        """What follows ``arcade-torch`` on the command line."""
-        files = ["--config", str(self.config), "--out", str(self.folder)]
-        return ["train", *files, "--resume", "--wait", f"{GRACE_S:g}"]
-
     def train(self) -> None:
-        """Carry it out in this process.
+        """Carry it out in this process; a run that was begun goes on.
 
         Raises:
             KeyboardInterrupt: it was interrupted, and has saved.
@@ -62,9 +50,14 @@ class Job:
         if train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status == "interrupted":
             raise KeyboardInterrupt
 
+    def add_to_log(self, text: str) -> None:
+        """Add text to the log; its folder is made."""
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a", encoding="utf-8") as stream:
+            stream.write(text)
 
-@dataclass(frozen=True)
-class JobResult:
+
+class JobResult(NamedTuple):
     """How a job ended; ``error`` is one line, empty for success."""
 
     name: str
@@ -88,24 +81,10 @@ class Inline:
             try:
                 job.train()
             except Exception as error:
-                append(job.log, traceback.format_exc())
+                job.add_to_log(traceback.format_exc())
                 yield JobResult(job.name, reason(error))
             else:
                 yield JobResult(job.name)
-
-
-def append(log: Path, text: str) -> None:
-    """Add text to a log; its folder is made."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a", encoding="utf-8") as stream:
-        stream.write(text)
-
-
-@dataclass
-class _Worker:
-    job: Job
-    process: "subprocess.Popen[bytes]"
-    core: int
 
 
 @dataclass
@@ -124,39 +103,40 @@ class Processes:
     poll_s: float = 0.1
     grace_s: float = GRACE_S
 
-    def __post_init__(self) -> None:
-        """Check the number of workers.
-
-        Raises:
-            ValueError: it is negative.
-        """
-        if self.workers < 0:
-            raise ValueError(f"workers must be at least 1 (or 0 for one a core), got {self.workers}")
-
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
         cores = available_cores()
         count = self.workers or len(cores)
         free = [cores[index % len(cores)] for index in range(count)]
-        waiting, active = list(jobs), list[_Worker]()
+        waiting, active = list(jobs), dict[subprocess.Popen[bytes], tuple[Job, int]]()
         try:
             while waiting or active:
                 while waiting and free:
-                    active.append(self._start(waiting.pop(0), free.pop(0), pin=count <= len(cores)))
-                for worker in [item for item in active if item.process.poll() is not None]:
-                    active.remove(worker)
-                    free.append(worker.core)
-                    yield JobResult(worker.job.name, _error(worker))
+                    job, core = waiting.pop(0), free.pop(0)
+                    active[self._start(job, core, pin=count <= len(cores))] = job, core
+                for process in [each for each in active if each.poll() is not None]:
+                    job, core = active.pop(process)
+                    free.append(core)
+                    yield JobResult(job.name, _error(process.returncode, job.log))
                 time.sleep(self.poll_s)
         finally:
-            _stop([worker.process for worker in active], self.grace_s)
+            for process in active:
+                process.terminate()
+            deadline = time.monotonic() + self.grace_s
+            for process in active:
+                try:
+                    process.wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
 
-    def _start(self, job: Job, core: int, pin: bool) -> _Worker:
-        append(job.log, "")
-        threads = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")} if pin else {}
+    def _start(self, job: Job, core: int, pin: bool) -> "subprocess.Popen[bytes]":
+        job.add_to_log("")
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") if pin else {}
+        files = ["--config", str(job.config), "--out", str(job.folder)]
         with job.log.open("ab") as log:
             process = subprocess.Popen(
-                [*self.program, *job.argv],
+                [*self.program, "train", *files, "--resume", "--wait", f"{GRACE_S:g}"],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -166,25 +146,16 @@ class Processes:
         if pin and hasattr(os, "sched_setaffinity"):
             with contextlib.suppress(ProcessLookupError, PermissionError):  # slower without it, not wrong
                 os.sched_setaffinity(process.pid, {core})
-        return _Worker(job, process, core)
+        return process
 
 
 def available_cores() -> list[int]:
     """Numbers of the processor cores this process may use, at least one."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
 
 
 def watch_parent(every_s: float = 2.0) -> None:
-    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing happens.
-
-    Args:
-        every_s: seconds between two looks.
-    """
-    import signal
-    import threading
-
+    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing happens."""
     parent = os.environ.get(PARENT_VARIABLE, "")
     if not parent.isdigit() or int(parent) == os.getpid():
         return
@@ -197,24 +168,11 @@ def watch_parent(every_s: float = 2.0) -> None:
     threading.Thread(target=look, daemon=True, name="watch-parent").start()
 
 
-def _stop(processes: Sequence["subprocess.Popen[bytes]"], grace_s: float) -> None:
-    for process in processes:
-        process.terminate()
-    deadline = time.monotonic() + grace_s
-    for process in processes:
-        try:
-            process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def _error(worker: _Worker) -> str:
+def _error(code: int, log: Path) -> str:
     """Why a worker failed: its last words, and the signal that ended it; empty for success."""
-    code = worker.process.returncode
     if code == 0:
         return ""
-    lines = worker.job.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
     if code < 0:
         return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")

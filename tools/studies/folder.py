@@ -1,4 +1,4 @@
-"""The folder of a study, and what stands in the folders of its runs.
+"""The folder of a study.
 
 ::
 
@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.runs.files import is_final
-from arcade_torch.agents.runs.files import read_csv as read_log
 from arcade_torch.tools.files import read_json, write_csv, write_json
+from arcade_torch.tools.runs import Run, read_record
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.versions import versions
 
@@ -30,69 +29,14 @@ TIMING_COLUMNS = ("run", "frames", "seconds")
 
 
 @dataclass(frozen=True)
-class Progress:
-    """How far a run is: environment steps done and wanted, and its status."""
-
-    frames: int
-    total_frames: int
-    status: str
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """Read access to one run's folder; missing files mean "not yet"."""
-
-    path: Path
-
-    def exists(self) -> bool:
-        """Whether a run was ever started here."""
-        return (self.path / "config.json").exists() or (self.path / "progress.json").exists()
-
-    def final(self) -> dict[str, Any] | None:
-        """The content of ``eval.json`` if the run has finished, else None; a damaged file counts as none."""
-        try:
-            values = read_json(self.path / "eval.json")
-        except (OSError, ValueError):
-            return None
-        return values if is_final(values) else None
-
-    def progress(self) -> Progress | None:
-        """What ``progress.json`` says, or None; a file just being replaced counts as none."""
-        try:
-            values = read_json(self.path / "progress.json")
-            return Progress(int(values["frames"]), int(values["total_frames"]), str(values.get("status", "running")))
-        except (OSError, ValueError, KeyError, TypeError, OverflowError):
-            return None
-
-    def config(self) -> dict[str, Any]:
-        """The resolved settings of the run, flat or nested as the trainer wrote them."""
-        values = self.record()
-        inner = values.get("config", values)
-        return dict(inner) if isinstance(inner, dict) else {}
-
-    def record(self) -> dict[str, Any]:
-        """All of ``config.json``: settings, versions, command.
-
-        Raises:
-            ValueError: it is damaged.
-        """
-        return _table(self.path / "config.json")
-
-    def table(self, name: str) -> list[dict[str, str]]:
-        """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
-        file = self.path / name
-        return read_log(file) if file.exists() else []
-
-
-@dataclass(frozen=True)
 class StudyFolder:
     """A study on disk."""
 
     root: Path
 
-    def run(self, spec: RunSpec) -> RunFolder:
-        """The folder of one run."""
-        return RunFolder(self.root / "runs" / spec.name)
+    def run(self, spec: RunSpec) -> Run:
+        """The folder of one run, as it is now."""
+        return Run(self.root / "runs" / spec.name)
 
     def log(self, spec: RunSpec) -> Path:
         """File with what the run printed."""
@@ -103,13 +47,6 @@ class StudyFolder:
         """Folder for numbers and figures made from the runs."""
         return self.root / "analysis"
 
-    def failure(self, spec: RunSpec) -> str:
-        """Why the last attempt at a run failed; empty if it did not."""
-        try:
-            return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
-        except (OSError, ValueError, KeyError, TypeError):
-            return ""
-
     def note_failure(self, spec: RunSpec, error: str) -> None:
         """Keep why a run failed, or forget it where ``error`` is empty."""
         file = self.root / "failures" / f"{spec.name}.json"
@@ -117,6 +54,10 @@ class StudyFolder:
             write_json(file, {"error": error})
         else:
             file.unlink(missing_ok=True)
+
+    def record(self) -> dict[str, Any]:
+        """All of ``study.json``."""
+        return read_record(self.root / "study.json")
 
     def load(self) -> Study:
         """The study that was run here.
@@ -133,10 +74,6 @@ class StudyFolder:
             return Study.from_dict(values["study"])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{file} does not describe a study: {error}") from error
-
-    def record(self) -> dict[str, Any]:
-        """All of ``study.json``."""
-        return _table(self.root / "study.json")
 
     def claim(self, study: Study, command: str = "") -> None:
         """Write ``study.json``, or go on where the same study stands already.
@@ -167,55 +104,34 @@ class StudyFolder:
             write_json(self.root / "study.json", made)
 
     def _check_same(self, before: Study, study: Study) -> None:
-        for key, old in before.fixed().items():
-            if old != study.fixed()[key]:
-                raise FileExistsError(
-                    f"{self.root} holds study {before.name!r} with {key} = {old!r}, not {study.fixed()[key]!r}: "
-                    "choose another --out"
-                )
-        names = {run.name for run in study.runs()}
-        if gone := [run.name for run in before.runs() if run.name not in names]:
-            raise FileExistsError(f"{self.root} holds run {gone[0]}, which this study lacks: choose another --out")
+        new, names = study.fixed(), {run.name for run in study.runs()}
+        what = [
+            f"study {before.name!r} with {k} = {v!r}, not {new[k]!r}" for k, v in before.fixed().items() if v != new[k]
+        ]
+        what += [f"run {run.name}, which this study lacks" for run in before.runs() if run.name not in names]
+        if what:
+            raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
 
     def write_results(self, study: Study) -> list[dict[str, Any]]:
-        """Write ``results.csv`` and ``timings.csv`` from the run folders.
-
-        Args:
-            study: gives the order of the rows.
-
-        Returns:
-            The rows of both, joined.
-        """
+        """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined."""
         rows = [self._row(run) for run in study.runs()]
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
-        write_csv(self.root / "timings.csv", [row for row in rows if row.get("seconds") is not None], TIMING_COLUMNS)
+        write_csv(self.root / "timings.csv", [row for row in rows if row["seconds"] is not None], TIMING_COLUMNS)
         return rows
 
-    def _row(self, run: RunSpec) -> dict[str, Any]:
-        folder = self.run(run)
-        final, progress = folder.final(), folder.progress()
-        error = "" if final else self.failure(run)
+    def _row(self, spec: RunSpec) -> dict[str, Any]:
+        run, error = self.run(spec), ""
         row: dict[str, Any] = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
-        row |= {"run": run.name, "error": error} | {name: getattr(run, name) for name in _CELL}
-        row["status"] = "finished" if final else "failed" if error else "unfinished" if folder.exists() else "waiting"
-        row["frames"] = progress.frames if progress else 0
-        if final:
-            returns = [float(value) for value in final.get("returns", [])]
-            mean = float(final["mean"]) if "mean" in final else sum(returns) / len(returns)
+        row |= {"run": spec.name, "frames": run.progress()[0]} | {name: getattr(spec, name) for name in _CELL}
+        if final := run.final:
+            mean, returns = float(final["mean"]), [float(value) for value in final["returns"]]
             spread = (sum((value - mean) ** 2 for value in returns) / max(1, len(returns) - 1)) ** 0.5
-            row |= {
-                "frames": final.get("frames", row["frames"]),
-                "seconds": final.get("seconds"),
-                "eval_mean": mean,
-                "eval_std": spread if returns else final.get("std"),
-                "eval_n": len(returns) or final.get("n"),
-                "train_max_ewm": final.get("train_max_ewm"),
-            }
-        return row
-
-
-def _table(file: Path) -> dict[str, Any]:
-    values = read_json(file)
-    if not isinstance(values, dict):
-        raise ValueError(f"{file} is damaged: it holds no table of names and values")
-    return values
+            row |= {name: final[name] for name in ("frames", "seconds", "train_max_ewm") if name in final}
+            row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
+        else:
+            try:
+                error = str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
+            except (OSError, ValueError, KeyError, TypeError):
+                error = ""
+        begun = "unfinished" if run.path.exists() else "waiting"
+        return row | {"error": error, "status": "finished" if final else "failed" if error else begun}

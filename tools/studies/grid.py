@@ -3,13 +3,13 @@
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from importlib.resources import files
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arcade_torch.tools.extensions import command_line
+from arcade_torch.tools.runs import flatten
 
 if TYPE_CHECKING:
     from arcade_torch.agents.config import TrainConfig
@@ -19,22 +19,22 @@ STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
 """``seeds = N`` beyond this is a slip."""
 _NAME = re.compile(r"[\w.\-]{1,80}")
-_AXES = ("games", "observability", "memories", "algorithms", "seeds")
+_FOLDER = (str, _NAME, "names of folders, of letters, digits, dots and dashes")
+_AXES: dict[str, tuple[type, re.Pattern[str], str]] = {
+    "games": _FOLDER,
+    "observability": (str, re.compile("full|partial"), "full, partial or both"),
+    "memories": _FOLDER,
+    "algorithms": _FOLDER,
+    "seeds": (int, re.compile(r"\d{1,10}"), "0 or more and below 2**32"),
+    "sizes": (str, re.compile(r"[1-9]\d{0,8}x[1-9]\d{0,8}"), "layers x width, such as '2x512'"),
+}
+"""Axis -> type, form and description of its values."""
 _GRID = {"name", "env", "observability", "memory", "algorithm", "seed", "total_frames", "out"}
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One cell of the grid.
-
-    Attributes:
-        game: environment id.
-        observability: ``full`` (MDP) or ``partial`` (POMDP).
-        memory: name of the memory model.
-        algorithm: name of the learner.
-        seed: of everything random in the run.
-        size: of the memory block, ``LAYERSxWIDTH``; empty for that of the preset.
-    """
+    """One cell of the grid; an empty ``size`` is that of the preset."""
 
     game: str
     observability: str
@@ -97,26 +97,17 @@ class Study:
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name) or set(self.name) == {"."}:
             raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
         for axis in _AXES:
-            _check_axis(axis, getattr(self, axis), int if axis == "seeds" else str)
+            object.__setattr__(self, axis, _axis(axis, getattr(self, axis)))
         for name in ("preset", "baseline", "question"):
             if not isinstance(getattr(self, name), str):
                 raise TypeError(f"{name} must be text, got {getattr(self, name)!r}")
         _check_settings(self.settings)
-        for size in self.sizes:
-            if not isinstance(size, str) or not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
-                raise ValueError(f"sizes are layers x width, such as '2x512', got {size!r}")
-        if len(set(self.sizes)) != len(self.sizes):
-            raise ValueError(f"sizes names something twice: {', '.join(self.sizes)}")
-        if unknown := [value for value in self.observability if value not in OBSERVABILITIES]:
-            raise ValueError(f"observability must be among {', '.join(OBSERVABILITIES)}, got {unknown[0]!r}")
         if self.total_frames is not None and not (type(self.total_frames) is int and 1 <= self.total_frames <= 10**15):
             raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
         """Build a study from plain values, as they stand in a TOML or JSON file.
-
-        ``seeds = 3`` means ``[0, 1, 2]``; a single string stands for a list of one.
 
         Raises:
             ValueError: a key is unknown or missing, or a value is out of range.
@@ -128,8 +119,7 @@ class Study:
             raise ValueError(f"unknown key {unknown[0]!r} in a study; known are {', '.join(known)}")
         if missing := [key for key in ("name", "games", "memories", "seeds") if key not in values]:
             raise ValueError(f"a study needs {', '.join(missing)}")
-        lists = {axis: _as_tuple(axis, values[axis]) for axis in (*_AXES, "sizes") if axis in values}
-        return cls(**{**values, **lists})
+        return cls(**values)
 
     @classmethod
     def load(cls, path: str | Path) -> "Study":
@@ -141,28 +131,13 @@ class Study:
         """
         path = Path(path)
         try:
-            return cls.parse(path.read_text(encoding="utf-8"), path.stem)
+            return cls.from_dict({"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8")))
         except FileNotFoundError:
             raise FileNotFoundError(f"no study at {path}: give a TOML file with games, memories and seeds") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise ValueError(f"{path} is not TOML: {error}") from error
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from error
-
-    @classmethod
-    def parse(cls, text: str, name: str) -> "Study":
-        """Read a study from TOML text.
-
-        Args:
-            text: the TOML.
-            name: of the study, where the text gives none.
-
-        Raises:
-            ValueError: it is not TOML or not a study.
-        """
-        try:
-            values = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise ValueError(f"it is not TOML: {error}") from error
-        return cls.from_dict({"name": name} | values)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
@@ -187,19 +162,17 @@ class Study:
         """
         from arcade_torch.agents.presets import preset
 
-        changes: dict[str, Any] = {"threads": 1, **self.settings}
-        for other in set(self.algorithms) - {run.algorithm}:
-            changes.pop(other, None)
+        others = set(self.algorithms) - {run.algorithm}
+        changes = {"threads": 1} | {name: value for name, value in self.settings.items() if name not in others}
         if self.total_frames is not None:
             changes["total_frames"] = self.total_frames
-        if run.size:
-            layers, width = map(int, run.size.split("x"))
-            changes["network_options"] = {**changes.get("network_options", {}), "layers": layers, "hidden_size": width}
         base = preset(self.preset, env=run.game, algorithm=run.algorithm)
-        for name in {"env_options", "network_options"} & set(changes):
-            changes[name] = {**getattr(base, name), **changes[name]}
-        cell = {"env": run.game, "observability": run.observability, "memory": run.memory}
-        return preset(self.preset, **cell, algorithm=run.algorithm, seed=run.seed, **changes)
+        for name in ("env_options", "network_options"):
+            changes[name] = {**getattr(base, name), **changes.get(name, {})}
+        if run.size:
+            changes["network_options"] |= zip(("layers", "hidden_size"), map(int, run.size.split("x")), strict=True)
+        cell = {"env": run.game, "observability": run.observability, "memory": run.memory, "seed": run.seed}
+        return preset(self.preset, algorithm=run.algorithm, **cell, **changes)
 
     def command(self, run: RunSpec, out: Path) -> str:
         """The line for a shell that trains one run of this study in its folder ``out``."""
@@ -224,56 +197,46 @@ def study_preset(name: str) -> Study:
     """
     if name not in STUDY_PRESETS:
         raise ValueError(f"unknown study preset {name!r}; presets: {', '.join(STUDY_PRESETS)}")
-    return Study.parse((files("arcade_torch.tools") / "data" / f"study-{name}.toml").read_text("utf-8"), name)
+    return replace(Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name)
 
 
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys.
-
-    Example:
-        >>> flatten({"device": "cpu", "pqn": {"gamma": 0.9}})
-        {'device': 'cpu', 'pqn.gamma': 0.9}
-    """
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
+def demo_study(game: str, frames: int, seeds: int) -> Study:
+    """The study behind ``arcade-torch demo``: one game, both twins, one memory model and the memory-free control."""
+    if seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {seeds}")
+    what = replace(study_preset("demo"), games=(game,), seeds=tuple(range(seeds)), total_frames=frames)
+    if game in study_preset("demo").games:
+        return what
+    question = f"What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
+    return replace(what, question=question)
 
 
-def _as_tuple(axis: str, value: Any) -> tuple[Any, ...]:
+def _axis(axis: str, value: Any) -> tuple[Any, ...]:
+    """The values of an axis, checked."""
     if axis == "seeds" and type(value) is int:
         if not 1 <= value <= MOST_SEEDS:
             raise ValueError(f"seeds = {value}: give the number of seeds (1 to {MOST_SEEDS}) or a list")
-        return tuple(range(value))
-    if isinstance(value, str):
-        return (value,)
-    if isinstance(value, Sequence):
-        return tuple(value)
-    raise ValueError(f"{axis} must be a list, got {value!r}")
-
-
-def _check_axis(axis: str, values: tuple[Any, ...], kind: type) -> None:
-    if not values:
-        raise ValueError(f"{axis} is empty: a study needs at least one")
+        value = range(value)
+    values = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, Sequence) else None
+    if values is None or not (values or axis == "sizes"):
+        raise ValueError(f"{axis} is empty: a study needs at least one" if values == () else f"{axis} must be a list")
+    kind, form, allowed = _AXES[axis]
     for value in values:
         if type(value) is not kind:
             raise TypeError(f"{axis} must hold {'whole numbers' if kind is int else 'names'}, got {value!r}")
+        if not form.fullmatch(str(value)) or (isinstance(value, int) and value >= 2**32):
+            raise ValueError(f"{axis} must be {allowed}, got {value!r}")
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
-    if kind is int and not (min(values) >= 0 and max(values) < 2**32):
-        raise ValueError(f"seeds must be 0 or more and below 2**32, got {min(values)} to {max(values)}")
-    if kind is str and (odd := [value for value in values if not _NAME.fullmatch(value)]):
-        raise ValueError(f"{axis} become names of folders: letters, digits, dots and dashes only, got {odd[0]!r}")
+    return values
 
 
 def _check_settings(settings: Any) -> None:
     """Refuse anything but a table of fields; what they are called and hold is checked by ``TrainConfig``."""
     if not isinstance(settings, Mapping):
         raise TypeError(f"settings must be a table of options, got {settings!r}")
-    for name in ("env_options", "network_options"):
-        if not isinstance(settings.get(name, {}), Mapping):
-            raise TypeError(f"settings: {name} must be a table of options, got {settings[name]!r}")
-    if odd := [name for name in settings if not isinstance(name, str) or not _NAME.fullmatch(name)]:
-        raise ValueError(f"settings: {odd[0]!r} is no name of an option")
-    if clash := sorted(set(settings) & _GRID):
-        raise ValueError(f"settings may not hold {clash[0]!r}: the grid decides it")
+    for name, value in settings.items():
+        if name in ("env_options", "network_options") and not isinstance(value, Mapping):
+            raise TypeError(f"settings: {name} must be a table of options, got {value!r}")
+        if name in _GRID:
+            raise ValueError(f"settings may not hold {name!r}: the grid decides it")

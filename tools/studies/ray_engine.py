@@ -15,7 +15,7 @@ import signal
 import tempfile
 import traceback
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from arcade_torch.tools.errors import one_line, reason
 from arcade_torch.tools.extensions import VARIABLE, load_extensions
 from arcade_torch.tools.files import write_bytes
 from arcade_torch.tools.optional import need
-from arcade_torch.tools.studies.engines import GRACE_S, Job, JobResult, append, available_cores
+from arcade_torch.tools.studies.engines import GRACE_S, Job, JobResult, available_cores
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
@@ -61,8 +61,6 @@ class Ray:
             ValueError: one is out of range.
             MissingPackage: ray is not installed.
         """
-        if self.workers < 0:
-            raise ValueError(f"workers must be at least 1 (or 0 for what the cluster has room for), got {self.workers}")
         if self.cpus_per_run <= 0:
             raise ValueError(f"cpus-per-run must be above 0, got {self.cpus_per_run}")
         if self.gpus_per_run < 0 or self.retries < 0:
@@ -72,41 +70,35 @@ class Ray:
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs as there is room; on Ctrl-C or close each run gets time to save."""
         with self._cluster() as ray:
-            self._check_room(ray)
+            have = ray.cluster_resources()
+            cpus, gpus = have.get("CPU", 0), have.get("GPU", 0)
+            if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
+                wanted = f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this machine has"
+                raise ValueError(f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run")
             options = {"num_cpus": self.cpus_per_run, "num_gpus": self.gpus_per_run, "max_retries": self.retries}
             environment = {"env_vars": {VARIABLE: os.environ.get(VARIABLE, "")}}
             task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
-            waiting, flying = [_absolute(job) for job in jobs], dict[Any, Job]()
+            waiting, flying = list(jobs), dict[Any, Job]()
             try:
                 while waiting or flying:
                     while waiting and len(flying) < (self.workers or len(waiting) + len(flying)):
                         job = waiting.pop(0)
-                        flying[task.remote(job, job.config.read_bytes())] = job
+                        there = job._replace(config=job.config.absolute(), folder=job.folder.absolute())
+                        flying[task.remote(there, job.config.read_bytes())] = job
                     ready, _ = ray.wait(list(flying), num_returns=1, timeout=1.0)
-                    self._check_alive(ray)
+                    if not self.address and not ray.cluster_resources().get("CPU"):  # it began with all cores
+                        raise ClusterLostError(
+                            "Ray's node on this machine is gone (killed, or out of memory); finished runs are kept, "
+                            "the same command goes on with the others"
+                        )
                     for reference in ready:
                         yield _result(ray, reference, flying.pop(reference))
             finally:
                 for reference in flying:
                     with contextlib.suppress(Exception):
                         ray.cancel(reference, force=False)  # an interrupt in the task, which saves
-                if flying:
-                    with contextlib.suppress(Exception):
-                        ray.wait(list(flying), num_returns=len(flying), timeout=GRACE_S)
-
-    def _check_room(self, ray: Any) -> None:
-        have = ray.cluster_resources()
-        cpus, gpus = have.get("CPU", 0), have.get("GPU", 0)
-        if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
-            wanted = f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this machine has"
-            raise ValueError(f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run")
-
-    def _check_alive(self, ray: Any) -> None:
-        if not self.address and not ray.cluster_resources().get("CPU"):  # it began with all cores of this machine
-            raise ClusterLostError(
-                "Ray's node on this machine is gone (killed, or out of memory); finished runs are kept, "
-                "the same command goes on with the others"
-            )
+                with contextlib.suppress(Exception):
+                    ray.wait(list(flying), num_returns=len(flying), timeout=GRACE_S)
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Any]:
@@ -117,12 +109,15 @@ class Ray:
             return
         for key, value in _QUIET.items():
             os.environ.setdefault(key, value)
-        handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "address": self.address or "local"}
         if not self.address:
-            _stay_on_loopback()
+            # Ray replaces 127.0.0.1 by the address that other machines know, and listens there, but for this switch,
+            # made for firewalls that ask; it is read from the environment when ray is imported.
+            with contextlib.suppress(ImportError, AttributeError):
+                importlib.import_module("ray._private.ray_constants").ENABLE_RAY_CLUSTER = False  # type: ignore[attr-defined]
             options |= {"num_cpus": max(len(available_cores()), self.workers), "include_dashboard": False}
             options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": 128 << 20}
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             ray.init(**options)
         except ConnectionError as error:
@@ -136,53 +131,33 @@ class Ray:
             ray.shutdown()
 
 
-def _stay_on_loopback() -> None:
-    """Keep ray from replacing 127.0.0.1 by the address that other machines know, at which it would then listen.
-
-    Ray has one switch for this, made for firewalls that ask; it is read from the environment when ray is imported.
-    """
-    with contextlib.suppress(ImportError, AttributeError):
-        constants: Any = importlib.import_module("ray._private.ray_constants")
-        constants.ENABLE_RAY_CLUSTER = False
-
-
 def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """Carry out a run on a machine of the cluster.
 
-    Args:
-        job: its paths are absolute, and those of the machine that sends it.
-        config: content of its config file.
-
-    Returns:
-        Why it failed, in one line, and the traceback; both empty for success. Path in the run folder -> content of the
-        run's small files, where the disk is not shared.
+    The paths of the job are those of the machine that sends it. Returns why the run failed, in one line, and the
+    traceback (empty for success), and the content of its small files where the disk is not shared.
     """
-    shared = False
+    shared, files = False, dict[str, bytes]()
     with contextlib.suppress(OSError):
         shared = job.config.read_bytes() == config
     if not shared:
         key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]  # another attempt finds it again
         here = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
-        job = replace(job, folder=here / "run", config=write_bytes(here / "config.json", config))
+        job = job._replace(folder=here / "run", config=write_bytes(here / "config.json", config))
     error = trace = ""
     try:
         load_extensions()
         job.train()
     except Exception as caught:
         error, trace = reason(caught), traceback.format_exc()
-    files = {} if shared else _small_files(job.folder)
-    if not shared and not error:
-        shutil.rmtree(job.config.parent)
+    if not shared:
+        for path in (path for path in job.folder.rglob("*") if path.is_file()):
+            name = path.relative_to(job.folder)
+            if not _NOT_SENT & set(name.parts):
+                files[name.as_posix()] = path.read_bytes()
+        if not error:
+            shutil.rmtree(job.config.parent)
     return error, trace, files
-
-
-def _small_files(folder: Path) -> dict[str, bytes]:
-    names = {path: path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()}
-    return {name.as_posix(): path.read_bytes() for path, name in names.items() if not _NOT_SENT & set(name.parts)}
-
-
-def _absolute(job: Job) -> Job:
-    return Job(job.name, job.config.absolute(), job.folder.absolute(), job.log.absolute())
 
 
 def _result(ray: Any, reference: Any, job: Job) -> JobResult:
@@ -191,7 +166,7 @@ def _result(ray: Any, reference: Any, job: Job) -> JobResult:
         error, trace, files = ray.get(reference)
     except ray.exceptions.RayError as lost:
         return JobResult(job.name, f"its worker was lost: {type(lost).__name__}: {one_line(lost)[:200]}")
-    for name, data in sorted(files.items(), key=lambda item: item[0] == "eval.json"):
-        write_bytes(job.folder / name, data)
-    append(job.log, trace)
+    for name in sorted(files, key=lambda name: name == "eval.json"):
+        write_bytes(job.folder / name, files[name])
+    job.add_to_log(trace)
     return JobResult(job.name, error)

@@ -6,19 +6,22 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from arcade_torch.tools.files import write_json
 from arcade_torch.tools.progress import Bars, Speed, clock
+from arcade_torch.tools.runs import Run
 from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, available_cores
-from arcade_torch.tools.studies.folder import RunFolder, StudyFolder
+from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.studies.ray_engine import Ray
 
-ENGINES = ("auto", "inline", "processes", "ray")
+if TYPE_CHECKING:
+    from arcade_torch.agents.config import TrainConfig
+
 LEAST_FREE_BYTES = 1 << 20
 """A run that fails with less space than this on the disk failed for want of space."""
 
@@ -29,17 +32,13 @@ class DiskFullError(RuntimeError):
 
 @dataclass(frozen=True)
 class StudyResult:
-    """Where a study stands after an invocation.
-
-    Attributes:
-        root: its folder.
-        rows: the rows of ``results.csv``.
-        errors: run name -> one line, for runs that failed in this invocation.
-    """
+    """Where a study stands after an invocation."""
 
     root: Path
     rows: list[dict[str, Any]]
+    """of ``results.csv``"""
     errors: dict[str, str]
+    """run name -> one line, for runs that failed in this invocation"""
 
     @property
     def finished(self) -> int:
@@ -81,32 +80,26 @@ def study(
     """
     what = what if isinstance(what, Study) else Study.load(what)
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
-    check_names(what)
-    runs = what.runs()
-    mine = runs[shard_of(shard)]
-    configs = {run.name: what.config(run).to_dict() for run in mine}
-    folder = StudyFolder(Path(out))
-    with _full_disk_told():
+    plan, folder = planned(what, shard), StudyFolder(Path(out))
+    try:
         folder.claim(what, command)
-        left = [run for run in mine if folder.run(run).final() is None]
         folder.write_results(what)
-        jobs = [_job(folder, run, configs[run.name]) for run in left]
-        errors = _carry_out(what, folder, {run.name: run for run in mine}, jobs, engine, stream) if jobs else {}
+        jobs = []
+        for run in (run for run in plan if folder.run(run).final is None):
+            file = write_json(folder.root / "configs" / f"{run.name}.json", plan[run].to_dict())
+            jobs.append(Job(run.name, file, folder.run(run).path, folder.log(run)))
+        errors = _carry_out(what, folder, {run.name: run for run in plan}, jobs, engine, stream) if jobs else {}
         return StudyResult(folder.root, folder.write_results(what), errors)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise DiskFullError(f"{error.strerror}: {error.filename or 'the study'}; make room and start again") from error
 
 
 def make_engine(name: str, workers: int = 0, **of_ray: Any) -> Engine:
-    """An engine by its name.
-
-    Args:
-        name: ``inline``, ``processes``, ``ray``, or ``auto`` (processes where there is more than one core).
-        workers: how many runs at once, 0 for one a core, or what a cluster can take.
-        of_ray: ``address``, ``cpus_per_run``, ``gpus_per_run``, ``retries``; see :class:`Ray`.
-
-    Raises:
-        ValueError: there is no such engine, or it has no such option.
-        MissingPackage: ``ray`` is not installed.
-    """
+    """An engine by its name; ``auto`` takes processes where there is more than one core. For Ray see :class:`Ray`."""
+    if workers < 0:
+        raise ValueError(f"workers must be at least 1 (or 0 for as many as there is room for), got {workers}")
     if name == "ray":
         return Ray(workers, **of_ray)
     if wrong := [key for key, value in of_ray.items() if value != getattr(Ray, key)]:
@@ -115,14 +108,14 @@ def make_engine(name: str, workers: int = 0, **of_ray: Any) -> Engine:
         return Processes(workers)
     if name in ("auto", "inline"):
         return Inline()
-    raise ValueError(f"unknown engine {name!r}: allowed are {', '.join(ENGINES)}")
+    raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes, ray")
 
 
-def check_names(what: Study) -> None:
-    """Check that the games and memory models of a study exist.
+def planned(what: Study, shard: str = "") -> "dict[RunSpec, TrainConfig]":
+    """The runs of a study with their configs; of shard ``3/10`` every tenth run from the third.
 
     Raises:
-        ValueError: one does not; the message names the nearest.
+        ValueError: a game, a memory model or a setting does not exist, or it is no shard.
     """
     from arcade_torch.envs_jax import make
     from arcade_torch.models import make_memory, memory_names
@@ -132,23 +125,10 @@ def check_names(what: Study) -> None:
     for memory in what.memories:
         if memory not in (*memory_names(), "feedforward"):
             make_memory(memory, 1, 1)  # refuses it
-
-
-def shard_of(text: str) -> slice:
-    """The runs of a shard: ``3/10`` takes every tenth from the third; an empty text takes all.
-
-    Raises:
-        ValueError: it is no shard.
-    """
-    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
-    if text and (found is None or not 1 <= int(found[1]) <= int(found[2])):
-        raise ValueError(f"a shard is written 3/10, the third of ten; got {text!r}")
-    return slice(int(found[1]) - 1, None, int(found[2])) if found else slice(None)
-
-
-def _job(folder: StudyFolder, run: RunSpec, config: Mapping[str, Any]) -> Job:
-    file = write_json(folder.root / "configs" / f"{run.name}.json", config)
-    return Job(run.name, file, folder.run(run).path, folder.log(run))
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
+    return {run: what.config(run) for run in what.runs()[int(found[1]) - 1 :: int(found[2])]}
 
 
 def _carry_out(
@@ -162,7 +142,7 @@ def _carry_out(
         for result in results:
             run, error = runs[result.name], ""
             ended.add(result.name)
-            if folder.run(run).final() is None:  # a process killed after its last word has done its work
+            if folder.run(run).final is None:  # a process killed after its last word has done its work
                 error = errors[result.name] = result.error or "ended without a final evaluation"
                 display.note(f"{result.name} failed: {error} (log: {folder.log(run)})")
             folder.note_failure(run, error)
@@ -172,29 +152,15 @@ def _carry_out(
     return errors
 
 
-@contextlib.contextmanager
-def _full_disk_told() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        raise DiskFullError(f"{error.strerror}: {error.filename or 'the study'}; make room and start again") from error
-
-
 class Display:
     """Shows how far a study is, from the ``progress.json`` of its runs: a bar for all and one for each run at work.
 
-    Args:
-        title: of the study.
-        folders: run name -> folder.
-        ended: names of the runs that have ended; the caller adds to it.
-        stream: where to write, stderr by default.
+    ``ended`` holds the names of the runs that have ended; the caller adds to it.
     """
 
-    def __init__(self, title: str, folders: Mapping[str, RunFolder], ended: set[str], stream: Any = None) -> None:
-        self.title, self.folders, self.ended = title, folders, ended
-        self.bars, self.speed, self.shown = Bars(stream, first_line_s=3.0), Speed(), set[str]()
+    def __init__(self, title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None) -> None:
+        self.title, self.runs, self.ended = title, runs, ended
+        self.bars, self.speed = Bars(stream, first_line_s=3.0), Speed()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop, daemon=True, name="study-progress")
 
@@ -219,27 +185,26 @@ class Display:
 
     def show(self) -> str:
         """Read all folders once and draw the bars; returns what a log gets, in one line."""
-        seen = {name: folder.progress() for name, folder in self.folders.items()}
-        guess = next((progress.total_frames for progress in seen.values() if progress), 0)
+        seen = {name: run.progress() for name, run in self.runs.items()}
+        usual = next((wanted for _, wanted, _ in seen.values() if wanted), 0)
         frames, total, terminal = 0, 0, self.bars.stream.isatty()
-        for name, progress in seen.items():
-            wanted = progress.total_frames if progress else guess
-            done = wanted if name in self.ended else min(progress.frames, wanted) if progress else 0
+        for name, (done, wanted, status) in seen.items():
+            wanted = wanted or usual
+            done = wanted if name in self.ended else min(done, wanted)
             frames, total = frames + done, total + wanted
-            if progress and progress.status == "running" and name not in self.ended and terminal:
-                self.bars.update(f"  {name.replace('__', ' ')}", done, wanted)
-                self.shown.add(name)
-            elif name in self.shown:
-                self.shown.remove(name)
-                self.bars.remove(f"  {name.replace('__', ' ')}")
+            bar = f"  {name.replace('__', ' ')}"
+            if terminal and status == "running" and name not in self.ended:
+                self.bars.update(bar, done, wanted)
+            else:
+                self.bars.remove(bar)
         speed = self.speed.update(time.monotonic(), frames)
-        left = f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
         pace = f", {speed:,.0f} frames/s" if speed > 0 else ""
+        pace += f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
         share = 100 * frames / total if total else 0
-        runs = f"{len(self.ended)}/{len(self.folders)} runs"
-        line = f"{runs}, {frames:,} of {total:,} frames ({share:.0f} %){pace}{left}"
+        runs = f"{len(self.ended)}/{len(self.runs)} runs"
+        line = f"{runs}, {frames:,} of {total:,} frames ({share:.0f} %){pace}"
         if terminal or frames < total:
-            self.bars.update(self.title, frames, total or None, f"{runs}{pace}{left}", f"{self.title}: {line}")
+            self.bars.update(self.title, frames, total or None, f"{runs}{pace}", f"{self.title}: {line}")
         return line
 
     def _loop(self) -> None:

@@ -1,0 +1,158 @@
+"""Record episodes of random, scripted and trained players as GIF or MP4."""
+
+import io
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arcade_torch.compiled import compiled_game
+from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
+from arcade_torch.gym.window import enlarge
+from arcade_torch.tools.files import write_bytes
+from arcade_torch.tools.optional import need
+from arcade_torch.tools.play.session import NEXT, QUIT, Frame, Session
+
+SCRIPTED = ("random", "state-oracle", "frames-oracle")
+FASTEST_FPS = {".gif": 50, ".mp4": 240}  # a GIF shows a frame for 2 hundredths of a second or more
+# Quality of x264: 0 is lossless, 23 its default. Most players want this pixel format.
+_ENCODING = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+_PALETTE_SIZE = 256
+FILM_FPS, FILM_SEED = 10, 2**31
+"""Of films of a training. The seed is far from those of training and always the same, so that films compare."""
+
+Chooser = Callable[[Session], int]
+"""Somebody who plays: looks at a session and names an action, 0 to 4."""
+
+
+def scripted(name: str, game: Any, seed: int) -> Chooser:
+    """The random player or an oracle of the games, one of `SCRIPTED`."""
+    player = RandomPlayer(seed) if name == "random" else make_oracle(game, "state" if name[0] == "s" else "frames")
+
+    def choose(session: Session) -> int:
+        seen = session.view(partial=True) if name == "frames-oracle" else session.state
+        return int(player.act(seen, np.array([session.steps == 0]))[0])
+
+    return choose
+
+
+def trained(agent: Any, partial: bool) -> Chooser:
+    """A trained agent, greedy; it sees what it would see in an ``ArcadeEnv`` of one env."""
+    import torch
+    from tensordict import TensorDict
+
+    device = agent.config.device if torch.cuda.is_available() else "cpu"
+    state, last_action = agent.initial_state(1), 0
+
+    def choose(session: Session) -> int:
+        nonlocal state, last_action
+        obs = {
+            "pixels": torch.from_numpy(session.view(partial)),
+            "last_action": torch.tensor([last_action]),
+            "is_init": torch.tensor([[session.steps == 0]]),
+            "step_count": torch.tensor([[session.steps]]),
+            "episode_reward": torch.tensor([[session.total]]),
+        }
+        with torch.no_grad():
+            action, _, state = agent.act(TensorDict(obs, batch_size=[1]).to(device), state)
+        last_action = int(action)
+        return last_action
+
+    return choose
+
+
+def recorded_frames(session: Session, choose: Chooser, *, max_steps: int, hold: int, scale: int) -> Iterator[Frame]:
+    """Play a session to its end and give out its frames, the last of an episode ``hold`` times."""
+    while not session.closed:
+        yield enlarge(session.frame, scale)
+        if session.end is not None:
+            yield from (enlarge(session.frame, scale) for _ in range(hold - 1))
+            session.press(NEXT)
+        elif session.steps >= max_steps:
+            session.press(QUIT)
+        else:
+            session.press(ACTION_NAMES[choose(session)])
+
+
+def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
+    """The writer that a file's name asks for."""
+    if path.suffix not in FASTEST_FPS:
+        raise ValueError(f"the file must end in .gif or .mp4, got {path}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: choose a file")
+    need("PIL" if path.suffix == ".gif" else "imageio_ffmpeg")
+    return write_gif if path.suffix == ".gif" else write_mp4
+
+
+def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
+    """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel."""
+    pictures, buffer = map(_picture, frames), io.BytesIO()
+    duration_ms = 10 * max(1, round(100 / fps))
+    next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0)
+    return write_bytes(path, buffer.getvalue())
+
+
+def _picture(frame: Frame) -> Any:
+    """A frame as a Pillow image, by palette where its colours fit into one."""
+    image = need("PIL.Image")
+    packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    colours, index = np.unique(packed, return_inverse=True)
+    if len(colours) > _PALETTE_SIZE:
+        return image.fromarray(frame).quantize(_PALETTE_SIZE)
+    picture = image.fromarray(index.reshape(packed.shape).astype(np.uint8))
+    picture.putpalette(np.stack([colours >> 16, colours >> 8 & 255, colours & 255], -1).astype(np.uint8).tobytes())
+    return picture
+
+
+def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
+    """Write an H.264 film that browsers show; colours are subsampled, pixels are not exact."""
+    program, rest = need("imageio_ffmpeg").get_ffmpeg_exe(), iter(frames)
+    first = next(rest)
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(fps)]
+    with tempfile.TemporaryDirectory() as folder:
+        film, log = Path(folder) / "film.mp4", Path(folder) / "log"
+        words = [program, "-v", "error", *source, "-i", "-", *_ENCODING, str(film)]
+        process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=log.open("wb"))
+        with suppress(BrokenPipeError), process:  # ffmpeg may give up early; it says why in its log
+            assert process.stdin is not None
+            for frame in chain([first], rest):
+                process.stdin.write(np.ascontiguousarray(frame).data)
+        if process.returncode:
+            complaint = log.read_text(errors="replace").strip()
+            raise ValueError(f"ffmpeg could not write {path}: {complaint or process.returncode}")
+        return write_bytes(path, film.read_bytes())
+
+
+class EvaluationVideos:
+    """Films one greedy episode whenever it is called; give it to ``train`` as ``on_evaluation``.
+
+    Playing draws no random number of the training, so a run is the same to the bit with and without it. A film that
+    fails is reported in a warning, and it was the last.
+    """
+
+    def __init__(self, folder: Path, suffix: str = ".gif", max_steps: int = 500) -> None:
+        self.folder, self.suffix, self.max_steps = folder, suffix, max_steps
+        self._write = writer_for(folder / f"film{suffix}")
+        self._failed = False
+
+    def __call__(self, agent: Any) -> None:
+        """Film an agent."""
+        if self._failed:
+            return
+        path = self.folder / f"frames-{agent.frames:09d}{self.suffix}"
+        try:
+            config, partial = agent.config, agent.config.observability != "full"
+            game = compiled_game(config.env, config.obs_size, config.rules, dict(config.env_options))
+            session = Session(game, seed=FILM_SEED, partial=partial, both=config.observability == "mixed", episodes=1)
+            player, how = trained(agent, partial), {"max_steps": self.max_steps, "hold": FILM_FPS, "scale": 2}
+            self._write(path, recorded_frames(session, player, **how), FILM_FPS)
+        except Exception as error:  # a training is worth more than its film
+            self._failed = True
+            warnings.warn(f"no more films, {path.name}: {type(error).__name__}: {error}", stacklevel=2)

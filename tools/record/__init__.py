@@ -1,1 +1,0 @@
-"""Record episodes of random, scripted and trained players as GIF or MP4."""
