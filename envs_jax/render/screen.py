@@ -1,11 +1,15 @@
-"""From codes to a frame: a fixed background, and pictures gathered from atlases into fixed places.
+"""From codes to a frame: a fixed background, and places that each show one of several pictures.
 
-All of it is built once on the host; what runs at each step is one gather for each place. The host parts (numpy) and the
-running parts (JAX) of a place stand together, so that a game only says which pictures it has and which code it wants
-shown.
+All pictures are built once on the host, as rows of bytes that are as long as a part of a row of the screen. What runs
+at each step is one pass over the frame, in which every part of a row is the exclusive or of a few such rows. Rows are
+long enough to be read as whole vectors, no byte needs an index of its own, and a compiler can give the rows of a batch
+to all cores. A game only says which pictures it has and which code it wants shown.
 """
 
+import functools
+import operator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +20,11 @@ from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render.canvas import Picture, blank, rectangle
 from arcade_torch.envs_jax.render.palette import Colour
 from arcade_torch.envs_jax.render.text import TEXT, centred, draw_name, number_pictures
+
+
+# What drawing costs on one core, by which rows are cut into parts: an index, and a byte of a row (Zen 5, AVX-512).
+_INDEX_NS, _BYTE_NS = 0.8, 0.26 / 32
+_LEAST_BYTES = 96  # shorter rows are copied byte by byte
 
 
 def gather(atlas: Array, index: Array) -> Array:
@@ -35,10 +44,21 @@ class Slot:
     pictures: Picture  # uint8 [codes, h, w, 3]
     x: int  # left edge on the screen
     y: int  # top edge on the screen
+    mixed: bool = False  # the pictures are combined with what lies below, by exclusive or, instead of covering it
 
     def draw(self, frame: Array, code: Array) -> Array:
-        """Show picture ``code`` (int scalar) on ``frame`` (uint8 [S, S, 3])."""
+        """Show picture ``code`` (int scalar) on ``frame`` (uint8 [S, S, 3]). ``Layers`` draws a whole screen faster."""
         return place(frame, gather(jnp.asarray(self.pictures), code), self.x, self.y)
+
+    @property
+    def area(self) -> tuple[slice, slice]:
+        """Rows and bytes of the screen that it takes."""
+        height, width = self.pictures.shape[1:3]
+        return slice(self.y, self.y + height), slice(3 * self.x, 3 * (self.x + width))
+
+    def slots(self, shape: tuple[int, ...]) -> list["Slot"]:
+        """This place, for a code of shape ()."""
+        return [self]
 
     def read(self, frames: Picture) -> npt.NDArray[np.int64]:
         """Which picture each frame (uint8 [N, S, S, 3]) shows: int64 [N], -1 where none; on the host."""
@@ -55,8 +75,13 @@ class TileGrid:
     x: int
     y: int
 
+    def slots(self, shape: tuple[int, ...]) -> list[Slot]:
+        """The places of all cells, row by row, for codes of a shape (rows, columns)."""
+        height, width = self.atlas.shape[1:3]
+        return [Slot(self.atlas, self.x + width * c, self.y + height * r) for r, c in np.ndindex(*shape)]
+
     def draw(self, frame: Array, codes: Array) -> Array:
-        """Show tiles ``codes`` (int [rows, columns]) on ``frame`` (uint8 [S, S, 3])."""
+        """Show tiles ``codes`` (int [rows, columns]) on ``frame`` (uint8 [S, S, 3]). ``Layers`` is faster."""
         rows, columns = codes.shape
         height, width = self.atlas.shape[1:3]
         tiles = gather(jnp.asarray(self.atlas), codes)
@@ -98,6 +123,123 @@ def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np
     found = np.searchsorted(numbers, shown @ weights, sorter=order)
     codes = order[np.minimum(found, len(order) - 1)]
     return np.where((known[codes] == shown).all(-1), codes, -1)
+
+
+class _Plan(NamedTuple):
+    """What a screen is drawn from: layer J, part G of row S shows ``rows[start + stride * codes[slot]]``."""
+
+    rows: npt.NDArray[np.uint8]  # [M, U], U bytes are a part of a row of the screen
+    slot: npt.NDArray[np.uint32]  # [J, S, G]
+    start: npt.NDArray[np.uint32]
+    stride: npt.NDArray[np.uint32]
+
+
+class Layers:
+    """A whole screen: a background and the places on it, of which a later one covers those before it.
+
+    Args:
+        background: uint8 [S, S, 3].
+        *places: Slots and grids.
+
+    Example:
+        >>> from arcade_torch.envs_jax.render import Layers, Slot, blank
+        >>> lamp = Slot(np.stack([blank(2, 2, (0, 0, 0)), blank(2, 2, (255, 0, 0))]), 3, 1)
+        >>> Layers(blank(8, 8, (9, 9, 9)), lamp).draw(1)[1, 2:4].tolist()
+        [[9, 9, 9], [255, 0, 0]]
+    """
+
+    def __init__(self, background: Picture, *places: Slot | TileGrid) -> None:
+        self.background, self.places = background, places
+        self._plan = functools.cache(self._make_plan)
+
+    def draw(self, *codes: Array | int) -> Array:
+        """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S, 3]."""
+        arrays = [jnp.asarray(code) for code in codes]
+        plan = self._plan(tuple(array.shape for array in arrays))
+        flat = apart(jnp.concatenate([array.astype(jnp.int32).reshape(-1) for array in arrays]))
+        index = plan.start + plan.stride * gather(flat, plan.slot).astype(jnp.uint32)
+        layers = [gather(jnp.asarray(plan.rows), layer) for layer in index]
+        return functools.reduce(operator.xor, layers).reshape(self.background.shape)
+
+    def _make_plan(self, shapes: tuple[tuple[int, ...], ...]) -> _Plan:
+        """Cut rows into so many parts that a frame costs least, and fill the tables."""
+        slots = [slot for place, shape in zip(self.places, shapes, strict=True) for slot in place.slots(shape)]
+        below = self.background.reshape(len(self.background), -1)
+        owner = np.full(below.shape, -1)  # which slot is on top
+        for number, slot in enumerate(slots):
+            if not slot.mixed:
+                owner[slot.area] = number
+        width = below.shape[1]
+        plans = []
+        for parts in range(1, max(1, width // _LEAST_BYTES) + 1):
+            if width % parts == 0:
+                plans.append(_plan(slots, owner, below, width // parts))
+        return min(plans, key=lambda plan: plan.slot.size * (_INDEX_NS + plan.rows.shape[1] * _BYTE_NS))
+
+
+def _plan(slots: list[Slot], owner: npt.NDArray[np.int64], below: npt.NDArray[np.uint8], length: int) -> _Plan:
+    """The tables for parts of ``length`` bytes; a part of the background is in the first layer that is over it."""
+    size, parts = len(below), below.shape[1] // length
+    rows: list[npt.NDArray[np.uint8]] = []
+    found: dict[bytes, int] = {}
+    layers = np.zeros((size, parts), int)  # so far
+    entries = []
+
+    def row_number(block: npt.NDArray[np.uint8]) -> int:
+        key = block.tobytes()
+        if key not in found:
+            found[key] = sum(map(len, rows))
+            rows.append(block)
+        return found[key]
+
+    for number, slot in enumerate(slots):
+        shown = np.zeros((len(slot.pictures), *below[slot.area[0]].shape), np.uint8)
+        top, across = slot.area
+        changed = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
+        if not slot.mixed:
+            changed = np.where(owner[slot.area] == number, changed ^ below[slot.area], 0).astype(np.uint8)
+        shown[:, :, across] = changed
+        for part in range(across.start // length, -(-across.stop // length)):
+            inside = slice(part * length, (part + 1) * length)
+            block, seen = shown[:, :, inside].copy(), shown[:, :, inside].any((0, 2))
+            first = seen & (layers[top, part] == 0)
+            block[:, first] ^= below[top, inside][first]
+            start = row_number(block.reshape(-1, length))
+            for line in np.flatnonzero(seen).tolist():
+                y = slot.y + line
+                entries.append((layers[y, part], y, part, number, start + line, block.shape[1]))
+                layers[y, part] += 1
+    for y, part in np.argwhere(layers == 0).tolist():
+        inside = slice(part * length, (part + 1) * length)
+        entries.append((0, y, part, 0, row_number(below[y : y + 1, inside]), 0))
+    nothing = row_number(np.zeros((1, length), np.uint8))
+    tables = np.zeros((3, max(1, layers.max()), size, parts), np.uint32)
+    tables[1] = nothing
+    for layer, y, part, number, start, stride in entries:
+        tables[:, layer, y, part] = number, start, stride
+    return _Plan(np.concatenate(rows), *tables)
+
+
+@jax.custom_batching.custom_vmap
+def apart(codes: Array) -> Array:
+    """The same codes, worked out once, and not anew for every byte that shows them."""
+    return codes
+
+
+@apart.def_vmap
+def _apart_in_a_batch(size: int, batched: list[bool], codes: Array) -> tuple[Array, bool]:
+    """The compiler for the CPU drops optimization barriers, but cannot look through a condition it does not know.
+
+    Other devices honour the barrier, and there a condition would make the host wait.
+    """
+
+    def on_cpu(codes: Array) -> Array:
+        unknown = codes.reshape(-1)[0] >= 0  # always true
+        known: Array = jax.lax.cond(unknown, lambda: codes, lambda: jnp.zeros_like(codes))
+        return known
+
+    out: Array = jax.lax.platform_dependent(codes, cpu=on_cpu, default=jax.lax.optimization_barrier)
+    return out, True
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:
