@@ -133,7 +133,6 @@ class BatchedGame(Steps, Generic[State]):
         self.step_auto = jax.jit(self._step_auto)
         self.step_render = jax.jit(self._step_render)
         self.reset_render = jax.jit(self._reset_render)
-        self.render_rows = jax.jit(self._render_rows)
         self.draw = jax.jit(jax.vmap(game.render))  # states [K, ...], partial bool [K] -> uint8 [K, S, S, 3]
 
     @property
@@ -186,11 +185,6 @@ class BatchedGame(Steps, Generic[State]):
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""
         return jax.vmap(self.game.render)(batch.state, batch.partial)
-
-    def _render_rows(self, batch: Batch, index: Array) -> Array:
-        """Draw the envs in ``index`` (int32 [K]) alone: uint8 [K, S, S, 3]."""
-        rows = jax.tree.map(lambda leaf: leaf[index], (batch.state, batch.partial))
-        return jax.vmap(self.game.render)(*rows)
 
 
 @partial(jax.vmap, out_axes=0)

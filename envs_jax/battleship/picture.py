@@ -9,7 +9,16 @@ from arcade_torch.envs_jax.battleship.numbers import SHIP_CELLS, Level
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
 from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import Layers, arc, blank, grid_layout, lined_board, number_slot, paint, titled_background
+from arcade_torch.envs_jax.render import (
+    Layers,
+    arc,
+    blank,
+    grid_layout,
+    lined_board,
+    number_slot,
+    paint,
+    titled_background,
+)
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import BLACK, BRASS, GREY, NICKEL, ORANGE, RED, SKY, WHITE, Colour
 

@@ -13,6 +13,7 @@ from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,
     Slot,
+    TileGrid,
     arc,
     blank,
     number_slot,
@@ -167,24 +168,23 @@ class Screen:
         ]
         self.layers = Layers(background, self.score, *self.arrows, *self._cart_and_pole())
 
-    def _cart_and_pole(self) -> list[Slot]:
-        """Places for every row of the strip that holds cart and pole: the cart, and both ends of the pole.
+    def _cart_and_pole(self) -> list[TileGrid]:
+        """The cart, and both ends of the pole, above the cart and upon it: a code for every line of the field.
 
-        Codes of the cart are where it begins, after the last one there is no cart. Codes of an end of the pole are the
-        column from which on the colours change, so that the two ends leave the pole between them.
+        Codes of the cart are the column where it begins; the last one is for no cart. Codes of an end are the column
+        from which on colours change, so that two ends leave the pole between them.
         """
-        geo, (top, bottom) = self.geo, self.geo.strip
-        columns = np.arange(geo.field)[None, None, :, None]
-        starts = np.arange(geo.cart_range + 2)[:, None, None, None]
+        geo = self.geo
+        columns, starts = np.arange(geo.field), np.arange(geo.cart_range + 2)[:, None]
         cart = (columns >= starts) & (columns < starts + geo.cart[0]) & (starts <= geo.cart_range)
-        pole = columns >= np.arange(geo.field + 1)[:, None, None, None]
+        end = columns >= np.arange(geo.field + 1)[:, None]
 
-        def row(y: int, mask: npt.NDArray[np.bool_], below: Colour, colour: Colour) -> Slot:
-            return Slot(mask * np.bitwise_xor(below, colour).astype(np.uint8), geo.offset, geo.offset + y, mixed=True)
+        def lines(y: int, mask: npt.NDArray[np.bool_], below: Colour, colour: Colour) -> TileGrid:
+            change = np.bitwise_xor(below, colour).astype(np.uint8)
+            return TileGrid(mask[:, None, :, None] * change, geo.offset, geo.offset + y, mixed=True)
 
-        carts = [row(y, cart, CHARCOAL, PINK) for y in range(geo.cart_top, bottom)]
-        ends = [row(y, pole, CHARCOAL if y < geo.cart_top else PINK, COPPER) for y in range(top, bottom)]
-        return carts + ends + ends
+        above, upon = (lines(y, end, colour, COPPER) for y, colour in ((geo.strip[0], CHARCOAL), (geo.cart_top, PINK)))
+        return [lines(geo.cart_top, cart, CHARCOAL, PINK), above, above, upon, upon]
 
     def draw(self, state: CartPoleState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows arrows and score alone."""
@@ -201,7 +201,8 @@ class Screen:
         left = jnp.trunc((x / X_LIMIT + 1) * (geo.cart_range / 2))
         low, high = pole_span(geo, left + geo.cart[0] // 2, theta, jnp.arange(*geo.strip))
         low = jnp.ceil(jnp.clip(low, 0, geo.field))
-        high = jnp.maximum(low, jnp.floor(jnp.clip(high, -1, geo.field - 1)) + 1)
-        cart = jnp.where(hidden, geo.cart_range + 1, left)
-        carts = [cart] * geo.cart[1]
-        return self.layers.draw(state.score, *arrows, *carts, *low, *jnp.where(hidden, low, high))
+        high = jnp.where(hidden, low, jnp.maximum(low, jnp.floor(jnp.clip(high, -1, geo.field - 1)) + 1))
+        cart = jnp.full((geo.cart[1], 1), jnp.where(hidden, geo.cart_range + 1, left))
+        ends = jnp.stack([low, high])[:, :, None]
+        above = geo.cart_top - geo.strip[0]
+        return self.layers.draw(state.score, *arrows, cart, *ends[:, :above], *ends[:, above:])

@@ -1,17 +1,15 @@
 """From codes to a frame: a fixed background, and places that each show one of several pictures.
 
-All pictures are built once on the host, as rows of bytes that are as long as a part of a row of the screen. What runs
-at each step is one pass over the frame, in which every part of a row is the exclusive or of a few such rows. Rows are
-long enough to be read as whole vectors, no byte needs an index of its own, and a compiler can give the rows of a batch
-to all cores. A game only says which pictures it has and which code it wants shown.
+All pictures are cut into lines on the host, once, each as long as a line of the screen and zero beside the picture.
+What runs at each step is one pass over the frame: a line of it is the exclusive or of the lines that stand there, one a
+picture. So no byte needs an index of its own, lines are read and written as whole vectors, and a compiler can give the
+frames of a batch to all cores. A game only says which pictures it has and which code it wants shown.
 """
 
 import functools
 import operator
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -20,21 +18,6 @@ from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render.canvas import Picture, blank, rectangle
 from arcade_torch.envs_jax.render.palette import Colour
 from arcade_torch.envs_jax.render.text import TEXT, centred, draw_name, number_pictures
-
-
-# What drawing costs on one core, by which rows are cut into parts: an index, and a byte of a row (Zen 5, AVX-512).
-_INDEX_NS, _BYTE_NS = 0.8, 0.26 / 32
-_LEAST_BYTES = 96  # shorter rows are copied byte by byte
-
-
-def gather(atlas: Array, index: Array) -> Array:
-    """Rows of an atlas, without a bounds check: indices must be within it."""
-    return atlas.at[index].get(mode="promise_in_bounds")
-
-
-def place(frame: Array, block: Array, x: int, y: int) -> Array:
-    """Put a block of pixels (uint8 [h, w, 3]) at a fixed place of a frame."""
-    return jax.lax.dynamic_update_slice(frame, block, (y, x, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +29,6 @@ class Slot:
     y: int  # top edge on the screen
     mixed: bool = False  # the pictures are combined with what lies below, by exclusive or, instead of covering it
 
-    def draw(self, frame: Array, code: Array) -> Array:
-        """Show picture ``code`` (int scalar) on ``frame`` (uint8 [S, S, 3]). ``Layers`` draws a whole screen faster."""
-        return place(frame, gather(jnp.asarray(self.pictures), code), self.x, self.y)
-
     @property
     def area(self) -> tuple[slice, slice]:
         """Rows and bytes of the screen that it takes."""
@@ -57,7 +36,7 @@ class Slot:
         return slice(self.y, self.y + height), slice(3 * self.x, 3 * (self.x + width))
 
     def slots(self, shape: tuple[int, ...]) -> list["Slot"]:
-        """This place, for a code of shape ()."""
+        """The places for codes of a shape: this one, for a shape ()."""
         return [self]
 
     def read(self, frames: Picture) -> npt.NDArray[np.int64]:
@@ -74,19 +53,13 @@ class TileGrid:
     atlas: Picture  # uint8 [codes, h, w, 3]
     x: int
     y: int
+    mixed: bool = False  # as in a slot
 
     def slots(self, shape: tuple[int, ...]) -> list[Slot]:
-        """The places of all cells, row by row, for codes of a shape (rows, columns)."""
+        """The places for codes of a shape (rows, columns): of all cells, row by row."""
         height, width = self.atlas.shape[1:3]
-        return [Slot(self.atlas, self.x + width * c, self.y + height * r) for r, c in np.ndindex(*shape)]
-
-    def draw(self, frame: Array, codes: Array) -> Array:
-        """Show tiles ``codes`` (int [rows, columns]) on ``frame`` (uint8 [S, S, 3]). ``Layers`` is faster."""
-        rows, columns = codes.shape
-        height, width = self.atlas.shape[1:3]
-        tiles = gather(jnp.asarray(self.atlas), codes)
-        block = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
-        return place(frame, block, self.x, self.y)
+        cells = np.ndindex(*shape)
+        return [Slot(self.atlas, self.x + width * c, self.y + height * r, self.mixed) for r, c in cells]
 
     def read(self, frames: Picture, rows: int, columns: int) -> npt.NDArray[np.int64]:
         """Which tiles frames show, by comparing them with the atlas; on the host.
@@ -125,15 +98,6 @@ def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np
     return np.where((known[codes] == shown).all(-1), codes, -1)
 
 
-class _Plan(NamedTuple):
-    """What a screen is drawn from: layer J, part G of row S shows ``rows[start + stride * codes[slot]]``."""
-
-    rows: npt.NDArray[np.uint8]  # [M, U], U bytes are a part of a row of the screen
-    slot: npt.NDArray[np.uint32]  # [J, S, G]
-    start: npt.NDArray[np.uint32]
-    stride: npt.NDArray[np.uint32]
-
-
 class Layers:
     """A whole screen: a background and the places on it, of which a later one covers those before it.
 
@@ -150,96 +114,56 @@ class Layers:
 
     def __init__(self, background: Picture, *places: Slot | TileGrid) -> None:
         self.background, self.places = background, places
-        self._plan = functools.cache(self._make_plan)
+        self._tables = functools.cache(self._make_tables)
 
     def draw(self, *codes: Array | int) -> Array:
         """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S, 3]."""
         arrays = [jnp.asarray(code) for code in codes]
-        plan = self._plan(tuple(array.shape for array in arrays))
-        flat = apart(jnp.concatenate([array.astype(jnp.int32).reshape(-1) for array in arrays]))
-        index = plan.start + plan.stride * gather(flat, plan.slot).astype(jnp.uint32)
-        layers = [gather(jnp.asarray(plan.rows), layer) for layer in index]
-        return functools.reduce(operator.xor, layers).reshape(self.background.shape)
+        lines, (slot, start, stride) = self._tables(tuple(array.shape for array in arrays))
+        known = jnp.concatenate([*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)])
+        index = start + stride * known.at[slot].get(mode="promise_in_bounds")
+        pictures = [jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index]
+        return functools.reduce(operator.xor, pictures).reshape(self.background.shape)
 
-    def _make_plan(self, shapes: tuple[tuple[int, ...], ...]) -> _Plan:
-        """Cut rows into so many parts that a frame costs least, and fill the tables."""
+    def _make_tables(self, shapes: tuple[tuple[int, ...], ...]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint32]]:
+        """Cut the pictures into lines; the background is part of the first picture of each line.
+
+        Returns:
+            Lines, uint8 [M, 3 S], and uint32 [3, J, S], of J pictures in each line of the screen: the slot, and the
+            numbers of the line for its code 0 and from there to the next code.
+        """
         slots = [slot for place, shape in zip(self.places, shapes, strict=True) for slot in place.slots(shape)]
         below = self.background.reshape(len(self.background), -1)
-        owner = np.full(below.shape, -1)  # which slot is on top
+        on_top = np.full(below.shape, -1)
         for number, slot in enumerate(slots):
             if not slot.mixed:
-                owner[slot.area] = number
-        width = below.shape[1]
-        plans = []
-        for parts in range(1, max(1, width // _LEAST_BYTES) + 1):
-            if width % parts == 0:
-                plans.append(_plan(slots, owner, below, width // parts))
-        return min(plans, key=lambda plan: plan.slot.size * (_INDEX_NS + plan.rows.shape[1] * _BYTE_NS))
+                on_top[slot.area] = number
+        known: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
+        shown: list[list[tuple[int, int, int]]] = [[] for _ in below]
 
+        def add(block: npt.NDArray[np.uint8]) -> int:
+            return known.setdefault(block.tobytes(), sum(map(len, known)) // below.shape[1])
 
-def _plan(slots: list[Slot], owner: npt.NDArray[np.int64], below: npt.NDArray[np.uint8], length: int) -> _Plan:
-    """The tables for parts of ``length`` bytes; a part of the background is in the first layer that is over it."""
-    size, parts = len(below), below.shape[1] // length
-    rows: list[npt.NDArray[np.uint8]] = []
-    found: dict[bytes, int] = {}
-    layers = np.zeros((size, parts), int)  # so far
-    entries = []
-
-    def row_number(block: npt.NDArray[np.uint8]) -> int:
-        key = block.tobytes()
-        if key not in found:
-            found[key] = sum(map(len, rows))
-            rows.append(block)
-        return found[key]
-
-    for number, slot in enumerate(slots):
-        shown = np.zeros((len(slot.pictures), *below[slot.area[0]].shape), np.uint8)
-        top, across = slot.area
-        changed = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
-        if not slot.mixed:
-            changed = np.where(owner[slot.area] == number, changed ^ below[slot.area], 0).astype(np.uint8)
-        shown[:, :, across] = changed
-        for part in range(across.start // length, -(-across.stop // length)):
-            inside = slice(part * length, (part + 1) * length)
-            block, seen = shown[:, :, inside].copy(), shown[:, :, inside].any((0, 2))
-            first = seen & (layers[top, part] == 0)
-            block[:, first] ^= below[top, inside][first]
-            start = row_number(block.reshape(-1, length))
+        for number, slot in enumerate(slots):
+            rows, across = slot.area
+            changes = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
+            if not slot.mixed:
+                changes = np.where(on_top[slot.area] == number, changes ^ below[slot.area], 0).astype(np.uint8)
+            seen = changes.any((0, 2))
+            block = np.zeros((len(changes), *below[rows].shape), np.uint8)
+            block[:, :, across] = changes
+            first = seen & [not entries for entries in shown[rows]]
+            block[:, first] ^= below[rows][first]
+            start = add(block)
             for line in np.flatnonzero(seen).tolist():
-                y = slot.y + line
-                entries.append((layers[y, part], y, part, number, start + line, block.shape[1]))
-                layers[y, part] += 1
-    for y, part in np.argwhere(layers == 0).tolist():
-        inside = slice(part * length, (part + 1) * length)
-        entries.append((0, y, part, 0, row_number(below[y : y + 1, inside]), 0))
-    nothing = row_number(np.zeros((1, length), np.uint8))
-    tables = np.zeros((3, max(1, layers.max()), size, parts), np.uint32)
-    tables[1] = nothing
-    for layer, y, part, number, start, stride in entries:
-        tables[:, layer, y, part] = number, start, stride
-    return _Plan(np.concatenate(rows), *tables)
-
-
-@jax.custom_batching.custom_vmap
-def apart(codes: Array) -> Array:
-    """The same codes, worked out once, and not anew for every byte that shows them."""
-    return codes
-
-
-@apart.def_vmap
-def _apart_in_a_batch(size: int, batched: list[bool], codes: Array) -> tuple[Array, bool]:
-    """The compiler for the CPU drops optimization barriers, but cannot look through a condition it does not know.
-
-    Other devices honour the barrier, and there a condition would make the host wait.
-    """
-
-    def on_cpu(codes: Array) -> Array:
-        unknown = codes.reshape(-1)[0] >= 0  # always true
-        known: Array = jax.lax.cond(unknown, lambda: codes, lambda: jnp.zeros_like(codes))
-        return known
-
-    out: Array = jax.lax.platform_dependent(codes, cpu=on_cpu, default=jax.lax.optimization_barrier)
-    return out, True
+                shown[slot.y + line].append((number, start + line, len(seen)))
+        for line, entries in zip(below, shown, strict=True):
+            if not entries:
+                entries.append((0, add(line), 0))
+        nothing = (0, add(np.zeros_like(below[0])), 0)
+        most = max(map(len, shown))
+        table = np.array([entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32)
+        return np.frombuffer(b"".join(known), np.uint8).reshape(-1, below.shape[1]), table.transpose(2, 1, 0)
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:
