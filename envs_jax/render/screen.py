@@ -149,14 +149,14 @@ class Layers:
             changes = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
             if not slot.mixed:
                 changes = np.where(on_top[slot.area] == number, changes ^ below[slot.area], 0).astype(np.uint8)
-            seen = changes.any((0, 2))
+            seen = np.asarray(changes.any((0, 2)))
             block = np.zeros((len(changes), *below[rows].shape), np.uint8)
             block[:, :, across] = changes
             first = seen & [not entries for entries in shown[rows]]
             block[:, first] ^= below[rows][first]
             start = add(block)
-            for line in np.flatnonzero(seen).tolist():
-                shown[slot.y + line].append((number, start + line, len(seen)))
+            for row in np.flatnonzero(seen).tolist():
+                shown[slot.y + row].append((number, start + row, len(seen)))
         for line, entries in zip(below, shown, strict=True):
             if not entries:
                 entries.append((0, add(line), 0))
