@@ -133,7 +133,6 @@ class BatchedGame(Steps, Generic[State]):
         self.step_auto = jax.jit(self._step_auto)
         self.step_render = jax.jit(self._step_render)
         self.reset_render = jax.jit(self._reset_render)
-        self.draw = jax.jit(jax.vmap(game.render))  # states [K, ...], partial bool [K] -> uint8 [K, S, S, 3]
 
     @property
     def groups(self) -> tuple["BatchedGame[State]", ...]:

@@ -57,8 +57,9 @@ class Pairs(Game[PairsState]):
         self.id, self.obs_size, self.rules = id, obs_size, rules
         layout, background = draw.grid_layout(obs_size, SIDE), draw.titled_background(obs_size, "PAIRS", MIST, NAVY)
         tiles = [card(layout.tile, colour, face, cursor) for cursor in (False, True) for colour, face in LOOKS]
-        self.background, self.board = draw.lined_board(background, layout, tiles, GREY)
+        background, self.board = draw.lined_board(background, layout, tiles, GREY)
         self.score = draw.number_slot(obs_size, FACES, MIST, NAVY)
+        self.layers = draw.Layers(background, self.score, self.board)
 
     def reset(self, key: Array) -> PairsState:
         """Shuffle the cards; the cursor begins in the upper left corner."""
@@ -84,8 +85,8 @@ class Pairs(Game[PairsState]):
         up = state.found | jnp.isin(jnp.arange(SIDE * SIDE), state.turned)
         codes = jnp.where(up, UP + state.cards, jnp.where(partial, DOWN, KNOWN + state.cards))
         cursor = cell_mask(state.x, state.y, SIDE).T  # boards are [x, y], pictures [row, column]
-        frame = self.score.draw(jnp.asarray(self.background), state.found.sum() // 2)
-        return self.board.draw(frame, codes.reshape(SIDE, SIDE) + len(LOOKS) * cursor)
+        codes = codes.reshape(SIDE, SIDE) + len(LOOKS) * cursor
+        return self.layers.draw(state.found.sum() // 2, codes)
 
 
 register("PairsEasy-v0", Pairs)

@@ -82,7 +82,7 @@ def test_it_trains_and_is_evaluated_with_the_stock_tools(tmp_path: Path, capsys:
 
 
 def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    right = "return self.board.draw(frame, codes.reshape(SIDE, SIDE) + len(LOOKS) * cursor)"
+    right = "return self.layers.draw(state.found.sum() // 2, codes)"
     source = FILE.read_text().replace('register("PairsEasy-v0"', 'register("PairsWrong-v0"')
     assert right in source
     (tmp_path / "wrong.py").write_text(source.replace(right, f"{right}[:, :64]"))

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from arcade_torch.envs_jax.autoencode.params import Params
 from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import number_slot, titled_background
+from arcade_torch.envs_jax.render import Layers, number_slot, titled_background
 from arcade_torch.envs_jax.render.palette import HOT_PINK, PALE_BLUE, SCARLET
-from arcade_torch.envs_jax.render.suits import NO_CARD, corner_slot, draw_history, history_grid
+from arcade_torch.envs_jax.render.suits import NO_CARD, corner_slot, history_codes, history_grid
 
 
 class Screen:
@@ -21,12 +21,13 @@ class Screen:
 
     def __init__(self, size: int, level: Params, mdp_marker: bool) -> None:
         self.level, self.mdp_marker = level, mdp_marker
-        self.background = titled_background(size, "AUTOENCODE", PALE_BLUE, HOT_PINK)
+        background = titled_background(size, "AUTOENCODE", PALE_BLUE, HOT_PINK)
         self.score = number_slot(size, level.cards + 1, PALE_BLUE, SCARLET)  # the reference can pay one card twice
         shorter = 3 * (size // 128)
         self.card = corner_slot(size, False, PALE_BLUE, shorter)
         self.selector = corner_slot(size, True, PALE_BLUE, shorter)
         self.history = history_grid(size, PALE_BLUE)
+        self.layers = Layers(background, self.score, self.card, self.selector, self.history)
 
     def draw(self, state: AutoEncodeState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no stack."""
@@ -35,8 +36,5 @@ class Screen:
         if self.mdp_marker:
             height -= state.given
         current = jnp.where(index == state.timestep, 1 + state.cards, NO_CARD).sum()
-
-        frame = self.score.draw(jnp.asarray(self.background), state.score)
-        frame = self.card.draw(frame, current)
-        frame = self.selector.draw(frame, 1 + state.selected)
-        return draw_history(self.history, frame, state.cards, (index < height) & ~jnp.asarray(partial))
+        history = history_codes(state.cards, (index < height) & ~jnp.asarray(partial))
+        return self.layers.draw(state.score, current, 1 + state.selected, history)

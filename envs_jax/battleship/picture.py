@@ -9,7 +9,16 @@ from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, Params
 from arcade_torch.envs_jax.battleship.rules import BattleShipState
 from arcade_torch.envs_jax.cursor import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import arc, blank, grid_layout, lined_board, number_slot, paint, titled_background
+from arcade_torch.envs_jax.render import (
+    Layers,
+    arc,
+    blank,
+    grid_layout,
+    lined_board,
+    number_slot,
+    paint,
+    titled_background,
+)
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import BLACK, BRASS, GREY, NICKEL, ORANGE, RED, SKY, WHITE, Colour
 
@@ -49,8 +58,9 @@ class Screen:
                 ring_tile(side, thickness, colour),
             ]
         background = titled_background(size, "BATTLESHIP", WHITE, SKY)
-        self.background, self.board = lined_board(background, self.layout, tiles, GREY)
+        background, self.board = lined_board(background, self.layout, tiles, GREY)
         self.score = number_slot(size, SHIP_CELLS, WHITE, ORANGE)
+        self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: BattleShipState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the mark under the cursor alone."""
@@ -58,5 +68,4 @@ class Screen:
         shown = (state.guesses == 1) & (cursor | ~jnp.asarray(partial))
         mark = jnp.where(state.board == 1, HIT, MISS)
         codes = jnp.where(shown, mark, COVERED) + jnp.where(cursor, KINDS, 0)
-        frame = self.score.draw(jnp.asarray(self.background), state.hits)
-        return self.board.draw(frame, codes.T)  # boards are [x, y], pictures [row, column]
+        return self.layers.draw(state.hits, codes.T)  # boards are [x, y], pictures [row, column]

@@ -8,7 +8,16 @@ import numpy as np
 from arcade_torch.envs_jax.breakout.params import BRICKS, COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
 from arcade_torch.envs_jax.breakout.rules import DOWN_RIGHT, BreakoutState, velocity
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import TileGrid, blank, centred, disc, number_slot, rectangle, titled_background
+from arcade_torch.envs_jax.render import (
+    Layers,
+    TileGrid,
+    blank,
+    centred,
+    disc,
+    number_slot,
+    rectangle,
+    titled_background,
+)
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import (
     BLACK,
@@ -84,9 +93,10 @@ class Screen:
         field = atlas.shape[2] * COLUMNS
         low = centred(size, field)
         background = titled_background(size, "BREAKOUT", SLATE, YELLOW)
-        self.background = rectangle(background, low, low, low + field, low + field, BLACK)
+        rectangle(background, low, low, low + field, low + field, BLACK)
         self.board = TileGrid(atlas, low, low)
         self.score = number_slot(size, BRICKS, SLATE, SCARLET)
+        self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: BreakoutState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no tail, and the ball only on its way up."""
@@ -102,8 +112,7 @@ class Screen:
         tail = _cell(tail_x, tail_y) & ~hidden
         both = jnp.where(mark == TAIL_TOP, jnp.where(state.ball_x == 0, BALL_TOP_LEFT, BALL_TOP_RIGHT), BALL_TAIL)
         marks = jnp.where(ball & tail, both, jnp.where(ball, BALL, jnp.where(tail, mark, NO_MARK)))
-        frame = self.score.draw(jnp.asarray(self.background), state.score)
-        return self.board.draw(frame, kinds + KINDS * marks)
+        return self.layers.draw(state.score, kinds + KINDS * marks)
 
     def _tail(self, state: BreakoutState) -> tuple[tuple[Array, Array], Array]:
         """Cell (x, y) of the tail, and how it is marked when it is alone there."""

@@ -5,13 +5,24 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT, X_LIMIT
 from arcade_torch.envs_jax.cartpole.rules import CartPoleState
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import Slot, arc, blank, number_slot, place, polygon, rectangle, titled_background
+from arcade_torch.envs_jax.render import (
+    Layers,
+    Slot,
+    TileGrid,
+    arc,
+    blank,
+    number_slot,
+    polygon,
+    rectangle,
+    titled_background,
+)
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK, SILVER, SKY, SPRING_GREEN
+from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK, SILVER, SKY, SPRING_GREEN, Colour
 
 Arrow = Literal["log", "linear"]
 ARROWS: tuple[Arrow, ...] = ("log", "linear")
@@ -149,40 +160,49 @@ class Screen:
     def __init__(self, size: int, max_score: int, arrow: Arrow) -> None:
         self.geo = geo = Geometry(size)
         self.arrow: Arrow = arrow
-        self.background = titled_background(size, "CARTPOLE", CHARCOAL, SKY)
+        background = titled_background(size, "CARTPOLE", CHARCOAL, SKY)
         self.score = number_slot(size, max_score, CHARCOAL, SPRING_GREEN)
         self.arrows = [
             Slot(pictures, geo.offset + x, geo.offset + y)
             for pictures, (x, y) in zip(arrow_pictures(geo, arrow), geo.boxes, strict=True)
         ]
+        self.layers = Layers(background, self.score, *self.arrows, *self._cart_and_pole())
+
+    def _cart_and_pole(self) -> list[TileGrid]:
+        """The cart, and both ends of the pole, above the cart and upon it: a code for every line of the field.
+
+        Codes of the cart are the column where it begins; the last one is for no cart. Codes of an end are the column
+        from which on colours change, so that two ends leave the pole between them.
+        """
+        geo = self.geo
+        columns, starts = np.arange(geo.field), np.arange(geo.cart_range + 2)[:, None]
+        cart = (columns >= starts) & (columns < starts + geo.cart[0]) & (starts <= geo.cart_range)
+        end = columns >= np.arange(geo.field + 1)[:, None]
+
+        def lines(y: int, mask: npt.NDArray[np.bool_], below: Colour, colour: Colour) -> TileGrid:
+            change = np.bitwise_xor(below, colour).astype(np.uint8)
+            return TileGrid(mask[:, None, :, None] * change, geo.offset, geo.offset + y, mixed=True)
+
+        above, upon = (lines(y, end, colour, COPPER) for y, colour in ((geo.strip[0], CHARCOAL), (geo.cart_top, PINK)))
+        return [lines(geo.cart_top, cart, CHARCOAL, PINK), above, above, upon, upon]
 
     def draw(self, state: CartPoleState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows arrows and score alone."""
+        geo = self.geo
         seen = jnp.stack([state.x, state.x_dot, state.theta, state.theta_dot]) + state.noise
-        frame = jnp.asarray(self.background)
-        frame = self.score.draw(frame, state.score)
         hidden = jnp.asarray(partial) & (state.time > 0)
-        frame = place(
-            frame, self._cart_and_pole(seen[0], seen[2], hidden), self.geo.offset, self.geo.offset + self.geo.strip[0]
-        )
+        arrows = []
         for slot, velocity in zip(self.arrows, (seen[1], seen[3]), strict=True):
             levels = len(slot.pictures) // 2
-            code = arrow_level(jnp.abs(velocity), self.arrow, self.geo.box) + jnp.where(velocity > 0, levels, 0)
-            frame = slot.draw(frame, code)
-        return frame
+            arrows.append(arrow_level(jnp.abs(velocity), self.arrow, geo.box) + jnp.where(velocity > 0, levels, 0))
 
-    def _cart_and_pole(self, x: Array, theta: Array, hidden: Array) -> Array:
-        """The strip of the field that holds cart and pole: uint8 [rows, field, 3]."""
-        geo = self.geo
-        x = jnp.clip(x, -X_LIMIT, X_LIMIT)
-        theta = jnp.clip(theta, -THETA_LIMIT, THETA_LIMIT)
+        x = jnp.clip(seen[0], -X_LIMIT, X_LIMIT)
+        theta = jnp.clip(seen[2], -THETA_LIMIT, THETA_LIMIT)
         left = jnp.trunc((x / X_LIMIT + 1) * (geo.cart_range / 2))
-        rows, columns = jnp.arange(*geo.strip), jnp.arange(geo.field, dtype=jnp.float32)
-        low, high = pole_span(geo, left + geo.cart[0] // 2, theta, rows)
-        low = jnp.where(hidden, jnp.inf, low)
-        left = jnp.where(hidden, jnp.inf, left)
-        on_pole = (columns >= low[:, None]) & (columns <= high[:, None])
-        on_cart = (rows >= geo.cart_top)[:, None] & (columns >= left) & (columns < left + geo.cart[0])
-        code = jnp.where(on_pole, 2, jnp.where(on_cart, 1, 0)).astype(jnp.uint8)[:, :, None]
-        colours = jnp.array([CHARCOAL, PINK, COPPER], jnp.uint8)
-        return jnp.where(code == 2, colours[2], jnp.where(code == 1, colours[1], colours[0]))
+        low, high = pole_span(geo, left + geo.cart[0] // 2, theta, jnp.arange(*geo.strip))
+        low = jnp.ceil(jnp.clip(low, 0, geo.field))
+        high = jnp.where(hidden, low, jnp.maximum(low, jnp.floor(jnp.clip(high, -1, geo.field - 1)) + 1))
+        cart = jnp.full((geo.cart[1], 1), jnp.where(hidden, geo.cart_range + 1, left))
+        ends = jnp.stack([low, high])[:, :, None]
+        above = geo.cart_top - geo.strip[0]
+        return self.layers.draw(state.score, *arrows, cart, *ends[:, :above], *ends[:, above:])

@@ -10,6 +10,7 @@ from arcade_torch.envs_jax.render import (
     DIGITS,
     PATTERN,
     TEXT,
+    Layers,
     Slot,
     bitmap,
     blank,
@@ -19,7 +20,7 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.palette import AZURE, CRIMSON, PALE_GREEN, SLATE_BLUE, SMOKE
-from arcade_torch.envs_jax.render.suits import FIELD, NO_CARD, corner_slot, draw_history, history_grid
+from arcade_torch.envs_jax.render.suits import FIELD, NO_CARD, corner_slot, history_codes, history_grid
 
 MINUS = ("00000", "00000", "11111", "00000", "00000")
 COUNTER_X = {128: (68, 123), 256: (136, 246)}  # columns in which the counter is centred
@@ -62,21 +63,20 @@ class Screen:
         self.level, self.counter_range = level, counter
         offset, side = (length * (size // 128) for length in FIELD)
         background = titled_background(size, "COUNTRECALL", SMOKE, AZURE)
-        self.background = rectangle(background, offset, offset, offset + side, offset + side, SLATE_BLUE)
+        rectangle(background, offset, offset, offset + side, offset + side, SLATE_BLUE)
         self.score = number_slot(size, level.cards, SMOKE, CRIMSON)
         self.counter = counter_slot(size, *counter)
         self.card = corner_slot(size, False, SMOKE, SHORTER)
         self.query = corner_slot(size, True, SMOKE, SHORTER)
         self.history = history_grid(size, SLATE_BLUE)
+        self.layers = Layers(background, self.score, self.counter, self.card, self.query, self.history)
 
     def draw(self, state: CountRecallState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no cards dealt before."""
         index = jnp.arange(self.level.cards)
         now = index == state.timestep
         lowest, highest = self.counter_range
-
-        frame = self.score.draw(jnp.asarray(self.background), state.score)
-        frame = self.counter.draw(frame, jnp.clip(state.answer, lowest, highest) - lowest)
-        for slot, pack in ((self.card, state.cards), (self.query, state.queries)):
-            frame = slot.draw(frame, jnp.where(now, 1 + pack, NO_CARD).sum())
-        return draw_history(self.history, frame, state.cards, (index < state.timestep) & ~jnp.asarray(partial))
+        answer = jnp.clip(state.answer, lowest, highest) - lowest
+        card, query = (jnp.where(now, 1 + pack, NO_CARD).sum() for pack in (state.cards, state.queries))
+        history = history_codes(state.cards, (index < state.timestep) & ~jnp.asarray(partial))
+        return self.layers.draw(state.score, answer, card, query, history)

@@ -9,6 +9,7 @@ from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState
 from arcade_torch.envs_jax.render import (
     DIGITS,
     PATTERN,
+    Layers,
     bitmap,
     blank,
     centred,
@@ -46,13 +47,13 @@ class Screen:
         for colour in (BLACK, ORANGE):
             tiles += [blank(side, side, colour)] + [number_tile(side, number, colour) for number in range(NUMBERS)]
         background = titled_background(size, "MINESWEEPER", MIST, NAVY)
-        self.background, self.board = lined_board(background, self.layout, tiles, GREY)
+        background, self.board = lined_board(background, self.layout, tiles, GREY)
         self.score = number_slot(size, level.safe, MIST, PURPLE)
+        self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: MineSweeperState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the number under the cursor alone."""
         cursor = cell_mask(state.x, state.y, self.layout.cells)
         shown = (state.grid == SWEPT) & (cursor | ~jnp.asarray(partial))
         codes = jnp.where(shown, 1 + state.neighbours, 0) + jnp.where(cursor, KINDS, 0)
-        frame = self.score.draw(jnp.asarray(self.background), state.score)
-        return self.board.draw(frame, codes.T)  # boards are [x, y], pictures [row, column]
+        return self.layers.draw(state.score, codes.T)  # boards are [x, y], pictures [row, column]

@@ -9,6 +9,7 @@ from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.navigator.params import Params
 from arcade_torch.envs_jax.navigator.rules import FREE, NavigatorState
 from arcade_torch.envs_jax.render import (
+    Layers,
     bitmap,
     blank,
     centred,
@@ -83,11 +84,12 @@ class Screen:
         zero = number_slot(size, 0, SLATE, MIDNIGHT)  # the published score, which never changes
         height, width = zero.pictures.shape[1:3]
         background[zero.y : zero.y + height, zero.x : zero.x + width] = zero.pictures[0]
-        self.background, self.board = lined_board(background, self.layout, tiles, WHITE)
+        background, self.board = lined_board(background, self.layout, tiles, WHITE)
+        self.layers = Layers(background, self.board)
 
     def draw(self, state: NavigatorState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows the agent on an empty map."""
         agent = cell_mask(state.x, state.y, self.layout.cells)
         hidden = jnp.asarray(partial) & (state.timestep > 0)
         codes = jnp.where(hidden, FREE, state.board) + jnp.where(agent, KINDS, 0)
-        return self.board.draw(jnp.asarray(self.background), codes.T)  # boards are [x, y], pictures [row, column]
+        return self.layers.draw(codes.T)  # boards are [x, y], pictures [row, column]

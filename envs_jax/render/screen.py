@@ -1,13 +1,15 @@
-"""From codes to a frame: a fixed background, and pictures gathered from atlases into fixed places.
+"""From codes to a frame: a fixed background, and places that each show one of several pictures.
 
-All of it is built once on the host; what runs at each step is one gather for each place. The host parts (numpy) and the
-running parts (JAX) of a place stand together, so that a game only says which pictures it has and which code it wants
-shown.
+All pictures are cut into lines on the host, once, each as long as a line of the screen and zero beside the picture.
+What runs at each step is one pass over the frame: a line of it is the exclusive or of the lines that stand there, one a
+picture. So no byte needs an index of its own, lines are read and written as whole vectors, and a compiler can give the
+frames of a batch to all cores. A game only says which pictures it has and which code it wants shown.
 """
 
+import functools
+import operator
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +20,6 @@ from arcade_torch.envs_jax.render.palette import Colour
 from arcade_torch.envs_jax.render.text import TEXT, centred, draw_name, number_pictures
 
 
-def gather(atlas: Array, index: Array) -> Array:
-    """Rows of an atlas, without a bounds check: indices must be within it."""
-    return atlas.at[index].get(mode="promise_in_bounds")
-
-
-def place(frame: Array, block: Array, x: int, y: int) -> Array:
-    """Put a block of pixels (uint8 [h, w, 3]) at a fixed place of a frame."""
-    return jax.lax.dynamic_update_slice(frame, block, (y, x, 0))
-
-
 @dataclass(frozen=True, eq=False)
 class Slot:
     """A place on the screen that shows one of several pictures of one size."""
@@ -35,10 +27,17 @@ class Slot:
     pictures: Picture  # uint8 [codes, h, w, 3]
     x: int  # left edge on the screen
     y: int  # top edge on the screen
+    mixed: bool = False  # the pictures are combined with what lies below, by exclusive or, instead of covering it
 
-    def draw(self, frame: Array, code: Array) -> Array:
-        """Show picture ``code`` (int scalar) on ``frame`` (uint8 [S, S, 3])."""
-        return place(frame, gather(jnp.asarray(self.pictures), code), self.x, self.y)
+    @property
+    def area(self) -> tuple[slice, slice]:
+        """Rows and bytes of the screen that it takes."""
+        height, width = self.pictures.shape[1:3]
+        return slice(self.y, self.y + height), slice(3 * self.x, 3 * (self.x + width))
+
+    def slots(self, shape: tuple[int, ...]) -> list["Slot"]:
+        """The places for codes of a shape: this one, for a shape ()."""
+        return [self]
 
     def read(self, frames: Picture) -> npt.NDArray[np.int64]:
         """Which picture each frame (uint8 [N, S, S, 3]) shows: int64 [N], -1 where none; on the host."""
@@ -54,14 +53,13 @@ class TileGrid:
     atlas: Picture  # uint8 [codes, h, w, 3]
     x: int
     y: int
+    mixed: bool = False  # as in a slot
 
-    def draw(self, frame: Array, codes: Array) -> Array:
-        """Show tiles ``codes`` (int [rows, columns]) on ``frame`` (uint8 [S, S, 3])."""
-        rows, columns = codes.shape
+    def slots(self, shape: tuple[int, ...]) -> list[Slot]:
+        """The places for codes of a shape (rows, columns): of all cells, row by row."""
         height, width = self.atlas.shape[1:3]
-        tiles = gather(jnp.asarray(self.atlas), codes)
-        block = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
-        return place(frame, block, self.x, self.y)
+        cells = np.ndindex(*shape)
+        return [Slot(self.atlas, self.x + width * c, self.y + height * r, self.mixed) for r, c in cells]
 
     def read(self, frames: Picture, rows: int, columns: int) -> npt.NDArray[np.int64]:
         """Which tiles frames show, by comparing them with the atlas; on the host.
@@ -98,6 +96,74 @@ def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np
     found = np.searchsorted(numbers, shown @ weights, sorter=order)
     codes = order[np.minimum(found, len(order) - 1)]
     return np.where((known[codes] == shown).all(-1), codes, -1)
+
+
+class Layers:
+    """A whole screen: a background and the places on it, of which a later one covers those before it.
+
+    Args:
+        background: uint8 [S, S, 3].
+        *places: Slots and grids.
+
+    Example:
+        >>> from arcade_torch.envs_jax.render import Layers, Slot, blank
+        >>> lamp = Slot(np.stack([blank(2, 2, (0, 0, 0)), blank(2, 2, (255, 0, 0))]), 3, 1)
+        >>> Layers(blank(8, 8, (9, 9, 9)), lamp).draw(1)[1, 2:4].tolist()
+        [[9, 9, 9], [255, 0, 0]]
+    """
+
+    def __init__(self, background: Picture, *places: Slot | TileGrid) -> None:
+        self.background, self.places = background, places
+        self._tables = functools.cache(self._make_tables)
+
+    def draw(self, *codes: Array | int) -> Array:
+        """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S, 3]."""
+        arrays = [jnp.asarray(code) for code in codes]
+        lines, (slot, start, stride) = self._tables(tuple(array.shape for array in arrays))
+        known = jnp.concatenate([*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)])
+        index = start + stride * known.at[slot].get(mode="promise_in_bounds")
+        pictures = [jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index]
+        return functools.reduce(operator.xor, pictures).reshape(self.background.shape)
+
+    def _make_tables(self, shapes: tuple[tuple[int, ...], ...]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint32]]:
+        """Cut the pictures into lines; the background is part of the first picture of each line.
+
+        Returns:
+            Lines, uint8 [M, 3 S], and uint32 [3, J, S], of J pictures in each line of the screen: the slot, and the
+            numbers of the line for its code 0 and from there to the next code.
+        """
+        slots = [slot for place, shape in zip(self.places, shapes, strict=True) for slot in place.slots(shape)]
+        below = self.background.reshape(len(self.background), -1)
+        on_top = np.full(below.shape, -1)
+        for number, slot in enumerate(slots):
+            if not slot.mixed:
+                on_top[slot.area] = number
+        known: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
+        shown: list[list[tuple[int, int, int]]] = [[] for _ in below]
+
+        def add(block: npt.NDArray[np.uint8]) -> int:
+            return known.setdefault(block.tobytes(), sum(map(len, known)) // below.shape[1])
+
+        for number, slot in enumerate(slots):
+            rows, across = slot.area
+            changes = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
+            if not slot.mixed:
+                changes = np.where(on_top[slot.area] == number, changes ^ below[slot.area], 0).astype(np.uint8)
+            seen = np.asarray(changes.any((0, 2)))
+            block = np.zeros((len(changes), *below[rows].shape), np.uint8)
+            block[:, :, across] = changes
+            first = seen & [not entries for entries in shown[rows]]
+            block[:, first] ^= below[rows][first]
+            start = add(block)
+            for row in np.flatnonzero(seen).tolist():
+                shown[slot.y + row].append((number, start + row, len(seen)))
+        for line, entries in zip(below, shown, strict=True):
+            if not entries:
+                entries.append((0, add(line), 0))
+        nothing = (0, add(np.zeros_like(below[0])), 0)
+        most = max(map(len, shown))
+        table = np.array([entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32)
+        return np.frombuffer(b"".join(known), np.uint8).reshape(-1, below.shape[1]), table.transpose(2, 1, 0)
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:

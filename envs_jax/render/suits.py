@@ -117,18 +117,16 @@ def history_grid(size: int, background: Colour) -> TileGrid:
     return TileGrid(suit_pictures((side, side), _SYMBOL[size], background), start, start)
 
 
-def draw_history(grid: TileGrid, frame: Array, cards: Array, shown: Array) -> Array:
+def history_codes(cards: Array, shown: Array) -> Array:
     """Lay cards out in rows, left to right and downwards.
 
     Args:
-        grid: From :func:`history_grid`.
-        frame: uint8 [S, S, 3].
         cards: int8 [N], suits.
         shown: bool [N], false where the place stays empty.
 
     Returns:
-        The frame with the cards, uint8 [S, S, 3].
+        Codes for :func:`history_grid`, int8 [rows, 9].
     """
     rows = -(-len(cards) // ROW)
     codes = jnp.where(shown, 1 + cards, NO_CARD)
-    return grid.draw(frame, jnp.pad(codes, (0, rows * ROW - len(cards))).reshape(rows, ROW))
+    return jnp.pad(codes, (0, rows * ROW - len(cards))).reshape(rows, ROW)

@@ -5,6 +5,7 @@ import numpy as np
 
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
+    Layers,
     Slot,
     TileGrid,
     blank,
@@ -52,16 +53,15 @@ class Screen:
     def __init__(self, size: int, level: Params) -> None:
         self.cells = level.cells
         tile = size * 3 // 4 // level.cells
-        self.background = titled_background(size, "SIGNPOST", BLACK, WHITE)
+        background = titled_background(size, "SIGNPOST", BLACK, WHITE)
         self.sign = Slot(sign_pictures(size // 4), centred(size, size // 4), size // 4)
         self.corridor = TileGrid(tiles(tile), centred(size, tile * level.cells), size * 5 // 8)
         self.score = number_slot(size, 1, BLACK, SPRING_GREEN)
+        self.layers = Layers(background, self.score, self.sign, self.corridor)
 
     def draw(self, state: SignpostState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows an empty sign."""
         hidden = jnp.asarray(partial) & (state.timestep > 0)
         cell = jnp.arange(self.cells)
         codes = jnp.where(cell == self.cells - 1, GATE + state.score, FLOOR) + KINDS * (cell == state.x)
-        frame = self.score.draw(jnp.asarray(self.background), state.score)
-        frame = self.sign.draw(frame, jnp.where(hidden, BLANK, state.sign))
-        return self.corridor.draw(frame, codes[None])
+        return self.layers.draw(state.score, jnp.where(hidden, BLANK, state.sign), codes[None])

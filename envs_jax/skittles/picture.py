@@ -5,6 +5,7 @@ import numpy as np
 
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
+    Layers,
     TileGrid,
     blank,
     grid_layout,
@@ -45,8 +46,9 @@ class Screen:
         layout = grid_layout(size, CELLS)
         tiles = [blank(layout.tile, layout.tile, colour) for colour in (BLACK, *BLOCKS, WHITE)]
         background = titled_background(size, "SKITTLES", BLACK, CANARY)
-        self.background, self.board = lined_board(background, layout, tiles, BLACK)
+        background, self.board = lined_board(background, layout, tiles, BLACK)
         self.score = number_slot(size, MAX_STEPS, BLACK, SPRING_GREEN)
+        self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: SkittlesState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows each block in about half of the frames."""
@@ -55,5 +57,4 @@ class Screen:
         here = (columns == state.column[:, None]) & visible[:, None]
         codes = jnp.where(here, 1 + state.colour[:, None], 0)
         agent = (columns[:, None] == CELLS - 1) & (columns == state.x)
-        frame = self.score.draw(jnp.asarray(self.background), state.time)
-        return self.board.draw(frame, jnp.where(agent, AGENT, codes))
+        return self.layers.draw(state.time, jnp.where(agent, AGENT, codes))

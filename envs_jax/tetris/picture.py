@@ -4,7 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.render import Slot, TileGrid, blank, centred, number_slot, rectangle, titled_background
+from arcade_torch.envs_jax.render import (
+    Layers,
+    Slot,
+    TileGrid,
+    blank,
+    centred,
+    number_slot,
+    rectangle,
+    titled_background,
+)
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import (
     AMBER,
@@ -62,7 +71,6 @@ class Screen:
         rectangle(background, corner, corner, corner + field, corner + field, BLACK)
         rectangle(background, left - 1, corner, left, corner + field, WHITE)
         rectangle(background, right, corner, right + 1, corner + field, WHITE)
-        self.background = background
 
         tiles = [blank(cell, cell, BLACK), *(framed_cell(cell, c) for c in PIECE_COLOURS), blank(cell, cell, WHITE)]
         self.board = TileGrid(np.stack(tiles), left, corner)
@@ -78,6 +86,8 @@ class Screen:
             Slot(pictures, corner + 16 * cell, corner + 3 * cell + 2 + 3 * cell * k) for k in range(level.previews)
         ]
         self.score = number_slot(size, MOST_LINES, ASH, SCARLET)
+        # The number field reaches one or two rows into the well: the board is drawn over it.
+        self.layers = Layers(background, self.score, self.board, *self.band_ends, *self.previews)
 
     def codes(self, state: TetrisState, partial: Array | bool) -> Array:
         """What each cell shows, int8 [20, 10]. The POMDP twin shows the piece and complete rows alone."""
@@ -87,12 +97,6 @@ class Screen:
 
     def draw(self, state: TetrisState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]."""
-        # The number field reaches one or two rows into the well: the board is drawn over it.
-        frame = self.score.draw(jnp.asarray(self.background), state.lines)
-        frame = self.board.draw(frame, self.codes(state, partial))
-        full = complete_rows(state.board).astype(jnp.int32)[:, None]
-        for ends in self.band_ends:
-            frame = ends.draw(frame, full)
-        for slot, piece in zip(self.previews, state.next, strict=True):
-            frame = slot.draw(frame, piece)
-        return frame
+        full = complete_rows(state.board)[:, None]
+        previews = [state.next[k] for k in range(len(self.previews))]
+        return self.layers.draw(state.lines, self.codes(state, partial), full, full, *previews)

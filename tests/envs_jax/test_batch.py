@@ -51,7 +51,7 @@ def test_the_fused_step_equals_step_then_reset(id):
         fused, stepped, outcome, frames = game.step_auto(fused, action)
         before, outcome_apart, final_frames = game.step_render(apart, action)
         apart, root_frames = game.reset_render(before, outcome_apart.done)
-        ends += outcome.done.sum()
+        ends += int(outcome.done.sum())
         assert same(fused, apart) and same(stepped, before) and same(outcome, outcome_apart)
         assert np.array_equal(frames, root_frames)
         assert np.array_equal(game.render(stepped), final_frames)

@@ -58,7 +58,7 @@ def test_the_fused_step_equals_step_then_reset_and_the_frame_follows_from_the_st
         apart, root_frames = mixed.reset_render(before, outcome_apart.done)
         assert same(fused, apart) and same(stepped, before) and same(outcome, outcome_apart)
         assert np.array_equal(frames, root_frames) and np.array_equal(frames, mixed.render(fused))
-        assert np.array_equal(mixed.render(before), final_frames)
+        assert np.array_equal(final_frames, mixed.render(before))
 
 
 def test_widening_makes_every_leaf_as_long_as_the_batch_and_narrowing_undoes_it():

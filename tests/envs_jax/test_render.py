@@ -1,12 +1,19 @@
 """Drawing primitives and text."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from arcade_torch.envs_jax.render import (
     DIGITS,
     LETTERS,
     TEXT,
+    Layers,
+    Slot,
+    TileGrid,
     arc,
     bitmap,
     blank,
@@ -95,3 +102,47 @@ def test_numbers_are_centred_distinct_and_inside_their_field(size):
 def test_boards_stand_where_the_published_ones_do(size, cells, side, tile, offset):
     layout = grid_layout(size, cells)
     assert (layout.side, layout.tile, layout.offset) == (side, tile, offset)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), places=st.integers(0, 5))
+def test_layers_draw_what_one_place_after_the_other_draws(seed, places):
+    """Places may overlap, and reach over the same lines; a grid and a slot may have the same pictures."""
+    rng, size = np.random.default_rng(seed), 24
+    background = rng.integers(0, 256, (size, size, 3), np.uint8)
+    made, codes = [], []
+    for number in range(places):
+        kinds, height, width = rng.integers(1, 5, 3)
+        pictures = rng.integers(0, 256, (kinds, height, width, 3), np.uint8)
+        shape = tuple(rng.integers(1, 4, 2)) if number % 2 else ()
+        x, y = rng.integers(0, size - 12, 2)
+        made.append((TileGrid if shape else Slot)(pictures, int(x), int(y)))
+        codes.append(rng.integers(0, kinds, (3, *shape)).astype(np.int8))
+    layers = Layers(background, *made)
+    frames = jax.jit(jax.vmap(layers.draw, axis_size=3))(*codes)
+    for env, frame in enumerate(frames):
+        expected = background.copy()
+        for place, code in zip(made, codes, strict=True):
+            pictures = place.atlas if isinstance(place, TileGrid) else place.pictures
+            height, width = pictures.shape[1:3]
+            for row, column in np.ndindex(*np.atleast_2d(code[env]).shape):
+                y, x = place.y + height * row, place.x + width * column
+                expected[y : y + height, x : x + width] = pictures[np.atleast_2d(code[env])[row, column]]
+        assert np.array_equal(frame, expected)
+
+
+def test_mixed_places_change_what_lies_below_them():
+    below = Slot(np.stack([blank(2, 4, BLACK), blank(2, 4, WHITE)]), 1, 1)
+    mixed = TileGrid(np.array([0, 255, 15], np.uint8).reshape(3, 1, 1, 1).repeat(3, -1), 2, 1, mixed=True)
+    layers = Layers(blank(8, 8, BLACK), below, mixed)
+    assert layers.draw(1, jnp.array([[0, 1, 2]]))[1, :, 0].tolist() == [0, 255, 255, 0, 240, 0, 0, 0]
+    assert layers.draw(0, jnp.array([[1, 2, 0]]))[1, :, 0].tolist() == [0, 0, 255, 15, 0, 0, 0, 0]
+
+
+def test_a_drawing_writes_each_frame_once():
+    """No scatter, no update in place, no loop, however many places there are."""
+    tiles = TileGrid(np.zeros((3, 4, 4, 3), np.uint8), 0, 0)
+    layers = Layers(blank(64, 64, WHITE), tiles)
+    board = jnp.zeros((128, 12, 12), jnp.int32)
+    text = jax.jit(jax.vmap(layers.draw)).lower(board).as_text()
+    assert "scatter" not in text and "dynamic_update_slice" not in text and "while" not in text

@@ -386,7 +386,7 @@ def test_the_well_and_the_previews_stand_where_the_geometry_says(id, size):
     screen, cell = make(id, obs_size=size).screen, 5 * size // 128
     corner = {128: 14, 256: 28}[size]
     assert (screen.board.x, screen.board.y) == (corner + 5 * cell, corner)
-    row = screen.background[corner + 3 * cell]
+    row = screen.layers.background[corner + 3 * cell]
     assert list(np.flatnonzero((row == 255).all(-1))) == [corner + 5 * cell - 1, corner + 15 * cell]
     assert len(screen.previews) == LEVELS[id].previews
     for k, slot in enumerate(screen.previews):
