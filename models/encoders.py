@@ -152,44 +152,46 @@ class PaperEncoder(Encoder):
 
 
 class SmallEncoder(Encoder):
-    """A CNN for one CPU core: frames pooled to 32x32, two convolutions, one layer over all places, 128 features.
+    """A CNN for one CPU core: frames pooled, 8 x 8 patches, one convolution, one layer over all places, 128 features.
 
-    Pooled frames are uint8 (floor of the block's mean), 3 KiB each, so they are pooled once and stored pooled. Input
-    scaling: minus a per-pixel mean, divided by one number, the RMS of the centred pixels; :meth:`calibrate` sets both
-    (before that: division by 255). Float frames are pooled without the floor.
+    Pooled frames are uint8 (floor of the block's mean; 3 KiB at 32 pixels), so they are pooled once and stored pooled.
+    Input scaling: minus a per-pixel mean, divided by one number, the RMS of the centred pixels; :meth:`calibrate` sets
+    both (before that: division by 255). Float frames are pooled without the floor.
 
     Args:
         obs_size: S, 32 times a power of two up to 256.
+        side: of the pooled frame in pixels, 32 or 64, at most S.
+        channels: of a patch.
 
     Raises:
         ValueError: another size.
     """
 
-    SIDE = 32
-
-    def __init__(self, obs_size: int = 128) -> None:
-        if obs_size not in (32, 64, 128, 256):
-            raise ValueError(f"obs_size must be 32, 64, 128 or 256, got {obs_size}")
-        super().__init__(obs_size, self.SIDE, 128)
-        self.conv1 = nn.Conv2d(3, 32, 4, 4)
-        self.conv2 = nn.Conv2d(32, 32, 3)
+    def __init__(self, obs_size: int = 128, side: int = 32, channels: int = 32) -> None:
+        if side not in (32, 64) or obs_size not in (32, 64, 128, 256) or side > obs_size:
+            raise ValueError(
+                f"obs_size must be 32, 64, 128 or 256, and side 32 or 64 and no larger; got {obs_size} and {side}"
+            )
+        super().__init__(obs_size, side, 128)
+        self.conv1 = nn.Conv2d(3, channels, side // 8, side // 8)
+        self.conv2 = nn.Conv2d(channels, 32, 3)
         self.linear = nn.Conv2d(32, 128, 6)
         self.linear.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.register_buffer("mean", torch.zeros(self.SIDE, self.SIDE, 3).permute(2, 0, 1))
+        self.register_buffer("mean", torch.zeros(side, side, 3).permute(2, 0, 1))
         self.register_buffer("inverse_rms", torch.tensor(1 / 255))
         self.mean: Tensor
         self.inverse_rms: Tensor
 
     def compress(self, pixels: Tensor) -> Tensor:
-        """Average pooling to 32x32.
+        """Average pooling.
 
         Args:
             pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3].
 
         Returns:
-            same dtype, [..., 32, 32, 3].
+            same dtype, [..., s, s, 3].
         """
-        lead, side, block = pixels.shape[:-3], self.SIDE, self.obs_size // self.SIDE
+        lead, side, block = pixels.shape[:-3], self.stored_size, self.obs_size // self.stored_size
         if pixels.is_floating_point():
             return pixels.reshape(*lead, side, block, side, block, 3).mean(dim=(-4, -2))
         if pixels.device.type == "cpu" and lead.numel() > 64:  # beyond that the sums leave the cache: half as fast
@@ -198,8 +200,8 @@ class SmallEncoder(Encoder):
         return self._pool(pixels).reshape(*lead, side, side, 3)
 
     def _pool(self, pixels: Tensor) -> Tensor:
-        """uint8 [..., S, S, 3] -> uint8 [N * 32, 32, 3], floor of the block mean."""
-        block = self.obs_size // self.SIDE
+        """uint8 [..., S, S, 3] -> uint8 [N * s, s, 3], floor of the block mean."""
+        block = self.obs_size // self.stored_size
         # Sums fit int16 (8 * 8 * 255). Whole lines are added, never pixels of three values: rows first, then each line
         # to itself, moved by 1, 2 and 4 pixels; what every block-th pixel then holds is the sum of its block.
         lines = pixels.reshape(-1, block, self.obs_size * 3).unbind(1)
@@ -216,7 +218,7 @@ class SmallEncoder(Encoder):
         """Set mean and RMS from frames of random play (3,200 frames are plenty).
 
         Args:
-            pixels: uint8, full [..., S, S, 3] or compressed [..., 32, 32, 3].
+            pixels: uint8, full [..., S, S, 3] or compressed [..., s, s, 3].
 
         Raises:
             ValueError: no frames, or of another size.
@@ -232,9 +234,9 @@ class SmallEncoder(Encoder):
         self.inverse_rms.copy_(1 / rms)
 
     def features(self, frames: Tensor) -> Tensor:
-        """[N, 32, 32, 3] -> [N, 128]."""
+        """[N, s, s, 3] -> [N, 128]."""
         x = torch.sub(frames, self.mean.permute(1, 2, 0)).permute(0, 3, 1, 2)  # colours stay last, as they arrive
         weight = self.conv1.weight * self.inverse_rms  # rather the weights than every pixel
-        x = F.leaky_relu_(F.conv2d(x, weight, self.conv1.bias, stride=4))
+        x = F.leaky_relu_(F.conv2d(x, weight, self.conv1.bias, self.conv1.stride))
         x = F.leaky_relu_(self.conv2(x))
         return F.leaky_relu_(F.layer_norm(self.linear(x).flatten(1), (self.feature_size,)))

@@ -46,19 +46,21 @@ def test_the_gradient_of_the_papers_encoder_with_respect_to_frames_is_that_of_it
 
 
 @given(
-    block=st.sampled_from([1, 2, 4, 8]),
+    side=st.sampled_from([32, 64]),
+    block=st.sampled_from([1, 2, 4]),
     lead=st.lists(st.integers(0, 3), max_size=2),
     high=st.sampled_from([1, 2, 256]),
     seed=st.integers(0, 99),
 )
 @settings(max_examples=25, deadline=None)
-def test_small_pooling_is_the_floor_of_the_block_mean(block, lead, high, seed):
-    size = 32 * block
+def test_small_pooling_is_the_floor_of_the_block_mean(side, block, lead, high, seed):
+    block *= 64 // side  # up to 256 pixels
+    size = side * block
     generator = torch.Generator().manual_seed(seed)
     pixels = torch.randint(256 - high, 256, (*lead, size, size, 3), dtype=torch.uint8, generator=generator)
-    pooled = SmallEncoder(size).compress(pixels)
-    sums = pixels.long().reshape(*lead, 32, block, 32, block, 3).sum((-4, -2))
-    assert pooled.dtype == torch.uint8 and pooled.shape == (*lead, 32, 32, 3) and pooled.is_contiguous()
+    pooled = SmallEncoder(size, side).compress(pixels)
+    sums = pixels.long().reshape(*lead, side, block, side, block, 3).sum((-4, -2))
+    assert pooled.dtype == torch.uint8 and pooled.shape == (*lead, side, side, 3) and pooled.is_contiguous()
     assert torch.equal(pooled, (sums // block**2).to(torch.uint8))
 
 
@@ -162,18 +164,21 @@ def test_wrong_sizes_get_one_clear_line():
         PaperEncoder(64)
     with pytest.raises(ValueError, match="got 100"):
         SmallEncoder(100)
+    with pytest.raises(ValueError, match="side 32 or 64 and no larger; got 32 and 64"):
+        SmallEncoder(32, 64)
     with pytest.raises(ValueError, match="at least one"):
         SmallEncoder().calibrate(frames(0))
 
 
+@pytest.mark.parametrize("side", [32, 64])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
-def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_on_scaled_frames(dtype, tolerance):
-    encoder, pixels = SmallEncoder(), frames(40) // 2
+def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_on_scaled_frames(dtype, tolerance, side):
+    encoder, pixels = SmallEncoder(128, side, side), frames(40) // 2
     encoder.calibrate(pixels)
     encoder.to(dtype)
     weights = [encoder.conv1, encoder.conv2, encoder.linear]
     x = (encoder.compress(pixels).permute(0, 3, 1, 2).to(dtype) - encoder.mean) * encoder.inverse_rms
-    x = F.leaky_relu(F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=4))
+    x = F.leaky_relu(F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=side // 8))
     x = F.leaky_relu(F.conv2d(x, encoder.conv2.weight, encoder.conv2.bias))
     x = F.linear(x.flatten(1), encoder.linear.weight.flatten(1), encoder.linear.bias)
     plain, found = F.leaky_relu(F.layer_norm(x, (128,))), encoder(pixels)
