@@ -262,12 +262,11 @@ class MemoryNetwork(TensorDictModuleBase):
         Returns:
             float [B, T, A].
         """
-        recurrent = self._recurrent[0]
+        features, recurrent, rows = self.encode(sequences["pixels"]), self._recurrent[0], sequences.shape[:1]
         is_init = recurrent.start_flags(sequences)
         last_action = sequences["last_action"] if self.num_actions else is_init
-        rows = sequences.shape[:1]
         first = recurrent.stored_state(TensorDict({}, rows) if state is None else state, rows)
-        return self.remember(self.encode(sequences["pixels"]), last_action, is_init, first)[0]
+        return self.remember(features, last_action, is_init, first)[0]
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""
