@@ -3,13 +3,14 @@
 import functools
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from typing import Any, get_args
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
@@ -179,7 +180,8 @@ class ArcadeCollector(BaseCollector):
         began_with = {key: value for key, value in obs.items() if key != "pixels"}
         self._obs, self._seen = {}, (-1, -1)  # nothing holds the first frames, and a window that fails is noticed
         random = random or self.policy is None or self._frames < self.init_random_frames
-        with set_exploration_type(self.exploration_type):
+        as_wanted = exploration_type() is self.exploration_type  # of the whole process: threads must not take turns
+        with nullcontext() if as_wanted else set_exploration_type(self.exploration_type):
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
         self._obs, self._seen = obs, self.env.generation

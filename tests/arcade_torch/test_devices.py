@@ -17,6 +17,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import arcade_torch
 from arcade_torch import collector as collector_module
@@ -322,6 +323,15 @@ def test_each_thread_may_have_envs_and_collectors_of_its_own() -> None:
 
     alone = [path(seed) for seed in range(4)]
     compiled._cached.cache_clear()  # so that threads also compile at the same time
-    with ThreadPoolExecutor(4) as pool:
+    with set_exploration_type(ExplorationType.RANDOM), ThreadPoolExecutor(4) as pool:
         for one, two in zip(alone, pool.map(path, range(4)), strict=True):
             assert_same(one, two)
+
+
+def test_a_collector_leaves_the_exploration_type_alone_where_it_is_as_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It belongs to the process: threads that set it and put it back in turns leave the wrong one behind."""
+    env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=0)
+    collector = ArcadeCollector(env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8)
+    with set_exploration_type(ExplorationType.RANDOM):
+        monkeypatch.setattr("arcade_torch.collector.set_exploration_type", None)
+        assert collector.collect()["action"].shape == (2, 8)
