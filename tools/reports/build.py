@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import percentile_interval, resampled_means
-from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias
-from arcade_torch.tools.analysis.normalise import normalise
+from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.files import write_csv, write_text
