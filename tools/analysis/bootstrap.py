@@ -19,11 +19,6 @@ class Interval:
     low: float
     high: float
 
-    def __str__(self) -> str:
-        """Three decimals, with the interval if there is one."""
-        ends = "" if np.isnan(self.low) else f" [{self.low:+.3f}, {self.high:+.3f}]"
-        return f"{self.value:+.3f}{ends}"
-
     @property
     def excludes_zero(self) -> bool:
         """Whether there is an interval and zero lies outside it."""

@@ -129,8 +129,6 @@ def shuffled_beginning(
     agent: Any,
     env: Any = None,
     *,
-    first: int = FIRST,
-    last: int = LAST,
     delays: Sequence[int] = DELAYS,
     starts: int = 200,
     feedback: bool = False,
@@ -141,16 +139,14 @@ def shuffled_beginning(
     target: Target = "auto",
     progress: Progress | None = None,
 ) -> Contamination:
-    """Permute the frames first + 1 ... last of a trajectory and keep all others.
+    """Permute frames 2 to 10 of a trajectory and keep all others.
 
     Actions and start flags stay in their order. On a POMDP another order may rightly change what the agent believes:
     draw conclusions on MDPs only.
 
     Args:
         agent: as for `contamination`, and so are ``env`` and all options that do not stand here.
-        first: index of the last frame of the beginning that stays.
-        last: index of the last permuted frame.
-        delays: steps from frame ``last`` to the decision.
+        delays: steps from frame 10 to the decision.
         starts: permutations P, one a trajectory.
         identity: use the identity in place of random permutations, which must change nothing.
 
@@ -158,18 +154,16 @@ def shuffled_beginning(
         Arrays; ``sigmas`` is one NaN.
 
     Raises:
-        ValueError: fewer than two frames are permuted, an option is out of range, or no episode was long enough.
+        ValueError: an option is out of range, or no episode was long enough.
     """
-    if first < 0 or last < first + 2:
-        raise ValueError(f"frames first + 1 to last must be at least two, got first = {first} and last = {last}")
 
     def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> Versions:
-        order = np.arange(window.n + 1) if identity else shuffle_order(window.n + 1, first, last, rng)
-        return _shuffled_versions(policy, window, order, first, last)
+        order = np.arange(window.n + 1) if identity else shuffle_order(window.n + 1, FIRST, LAST, rng)
+        return _shuffled_versions(policy, window, order)
 
     common: Any = {"delays": delays, "starts": starts, "feedback": feedback, "seed": seed, "cap": cap, "target": target}
     player, env = resolve_agent(agent, env, observability)
-    return _measure(player, env, disturb, np.array([np.nan]), 1, last + 1, progress, **common)
+    return _measure(player, env, disturb, np.array([np.nan]), 1, LAST + 1, progress, **common)
 
 
 class Versions(NamedTuple):
@@ -286,9 +280,9 @@ def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -
     return order
 
 
-def _shuffled_versions(policy: Policy, window: Window, order: Ints, first: int, last: int) -> Versions:
+def _shuffled_versions(policy: Policy, window: Window, order: Ints) -> Versions:
     features = policy.features(window.frames)
-    return Versions(torch.stack([features, features[torch.as_tensor(order)]]), np.array([last]), first)
+    return Versions(torch.stack([features, features[torch.as_tensor(order)]]), np.array([LAST]), FIRST)
 
 
 @torch.no_grad()
@@ -347,7 +341,7 @@ def examples(model: Any, window: Window, hits: Sequence[int] = (), seed: int = 0
             labels = ("clean", *(f"noise on frame {hit}" for hit in hits))
         else:
             order = shuffle_order(window.n + 1, FIRST, LAST, np.random.default_rng(seed))
-            versions = _shuffled_versions(policy, window, order, FIRST, LAST)
+            versions = _shuffled_versions(policy, window, order)
             late = list(range(max(LAST + 1, window.n - 2), window.n + 1))
             names = [[*early, *late] for early in (range(FIRST + 1, FIRST + 4), order[FIRST + 1 : FIRST + 4].tolist())]
             pictures, labels = window.frames[torch.tensor(names)], ("clean", "shuffled beginning")

@@ -23,8 +23,7 @@ MEASURES = {
 LEAST_SCALE = 0.1  # axes reach at least so far, so that small effects look small
 ACTIONS = ("up", "down", "left", "right", "fire")
 
-Measures = Mapping[str, Pooled]
-"""Of one agent on one task: for each of `MEASURES` values [S, K], pooled over its seeds."""
+Measures = Mapping[str, Pooled]  # of one agent on one task: for each of `MEASURES` values [S, K] over its seeds
 
 
 def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
@@ -142,8 +141,9 @@ def plot(
     for place, (agent, value) in enumerate(agents.items()):
         mean, low, high = (getattr(value[name], part)[column, : len(delays)] for part in ENDS.values())
         x = places + 0.1 * (place - (len(agents) - 1) / 2)
-        line = {"color": colours[agent], "marker": style.MARKERS[place % len(style.MARKERS)], "label": agent}
-        axis.errorbar(x, mean, style.whiskers(low, mean, high), capsize=2, elinewidth=1, **line)
+        bars = {"fmt": "none", "ecolor": colours[agent], "capsize": 2, "lw": 1}
+        axis.plot(x, mean, color=colours[agent], marker=style.MARKERS[place % len(style.MARKERS)], label=agent)
+        axis.errorbar(x, mean, style.whiskers(low, mean, high), **bars)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(places, [str(delay) for delay in delays])
 

@@ -1,6 +1,6 @@
 """Recall density: bars of few bins with all memory models pooled, curves of many bins for each model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,7 @@ THIRDS = ("oldest third", "middle third", "most recent third")
 POINTS = 101
 
 Densities = Sequence[tuple[Label, measure.RecallDensity]]
-Masses = Mapping[tuple[str, str, str], Pooled]
-"""(agent, game, twin) -> mass in bins: mean over trajectories of a checkpoint, then over seeds."""
+Masses = Mapping[tuple[str, str, str], Pooled]  # (agent, game, twin) -> mass in bins, over trajectories, then seeds
 
 
 def densities(options: DensityOptions, progress: Progress | None) -> Made:
@@ -35,16 +34,17 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
     for bins in options.bins:
         tasks = by_task([(label, density.mass(bins)) for label, density in measured])
         masses = {task: pooled(rows, options.confidence) for task, rows in tasks.items()}
-        if bins <= BARS_UP_TO:
-            figure, seeds = _stacked_bars(masses, bins)
-        else:
-            figure, seeds = _curves(measured, masses, bins, options.confidence)
+        few = bins <= BARS_UP_TO
+        figure, seeds = _stacked_bars(masses, bins) if few else _curves(measured, masses, bins, options.confidence)
         frames = np.concatenate([density.lengths for _, density in measured])
         counts = _range([len(density.lengths) for _, density in measured])
         end = "the one that ended the episode" if options.end == "last" else "at a random step"
         note = f"{seeds} x {counts} greedy trajectories (mean length {frames.mean():.0f} frames); decision: {end}"
-        note += "; dotted: uniform memory; without memory: all in the most recent part" * (bins <= BARS_UP_TO)
-        numbers = [row for task, value in masses.items() for row in _rows(task, value, bins)]
+        note += "; dotted: uniform memory; without memory: all in the most recent part" * few
+        numbers = []
+        for (agent, game, twin), value in masses.items():
+            what = {"agent": agent, "game": game, "observability": twin, "bins": bins, "bin": np.arange(bins)}
+            numbers += style.rows_of(**what, seeds=len(value.seeds), mass=value.mean, low=value.low, high=value.high)
         arrays = _arrays(measured) if bins == options.bins[0] else {}
         made.pictures.append(Picture(f"recall-density-{bins}", figure, note, numbers, arrays))
     cells = [
@@ -140,17 +140,12 @@ def plot(series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths
     axis.set(xlim=(0, 1), ylim=(0, 1.05))
 
 
-def _percent(shares: Sequence[float]) -> str:
+def _percent(shares: Iterable[float]) -> str:
     return " / ".join(f"{100 * share:.1f}" for share in shares)
 
 
 def _range(counts: Sequence[int]) -> str:
     return str(min(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-
-
-def _rows(task: tuple[str, str, str], value: Pooled, bins: int) -> list[dict[str, Any]]:
-    what = {**dict(zip(("agent", "game", "observability"), task, strict=True)), "bins": bins, "bin": np.arange(bins)}
-    return style.rows_of(**what, seeds=len(value.seeds), mass=value.mean, low=value.low, high=value.high)
 
 
 def _arrays(measured: Densities) -> dict[str, Any]:

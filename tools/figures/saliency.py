@@ -16,8 +16,7 @@ from arcade_torch.tools.tables import Table
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
 
-Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]
-"""Title, frames uint8 [T, H, W, 3], maps float [T, H, W]; ends at the explained step."""
+Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]  # title, frames [T, H, W, 3], maps [T, H, W] up to step n
 
 
 def rows(options: SaliencyOptions, progress: Progress | None) -> Made:

@@ -85,8 +85,6 @@ _PRINT_SCALE = 0.62  # sizes of figures are given for a screen; on a page they a
 @contextmanager
 def drawing(style: str) -> Iterator[Any]:
     """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
-    if style not in _RC:
-        raise ValueError(f"unknown style {style!r}: allowed are {', '.join(_RC)}")
     need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
     with plt.rc_context(_SHARED | _RC[style]):

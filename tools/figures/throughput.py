@@ -14,8 +14,7 @@ NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "
 OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
 LIMIT = "writing the same bytes"
 
-Series = Mapping[int, float]
-"""One line: number of envs -> frames consumed per second."""
+Series = Mapping[int, float]  # one line: number of envs -> frames consumed per second
 
 
 def rates(options: Options, progress: Progress | None) -> Made:

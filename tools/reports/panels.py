@@ -32,10 +32,8 @@ LEVEL_NAMES = {"random": "random", "state": "oracle", "frames": "frames oracle"}
 MOST_CELLS = 12  # up to so many (game, twin, agent) are all looked into
 MOST_GAMES = MOST_SEEDS = 3
 
-Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
-"""(game, twin) -> agent -> final returns of its finished seeds."""
-Levels = Mapping[str, Mapping[str, float]]
-"""Game -> player -> mean return."""
+Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]  # (game, twin) -> agent -> final returns of its seeds
+Levels = Mapping[str, Mapping[str, float]]  # game -> player -> mean return
 Progress = Callable[[str, int, int], None]
 
 
@@ -199,7 +197,7 @@ def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress
         (every,) = contamination.pool(by_task(measured)).values()
         flips = np.array([item.mean("flip")[0] for item in found])
         later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
-        row = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
+        row: dict[str, Any] = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
         row |= {"change": every["change"].mean[0, 1], "at_once": _mean(flips[:, 0])}
         return every, row | {"one": _mean(flips[:, 1]), "later": _mean(later)}
 
