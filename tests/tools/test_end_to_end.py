@@ -110,7 +110,7 @@ def test_the_report_holds_a_strip_of_every_agent(
     assert text.count("data:image/png;base64,") >= 2
     assert "100.0 % of the gradient on the last one" in text
     folder = StudyFolder(finished)
-    assert all(list((folder.run(run).path / "analysis").glob("saliency-*.npz")) for run in folder.load().runs())
+    assert all(list((folder.run(run).path / "analysis").glob("episode_saliency-*.npz")) for run in folder.load().runs())
 
 
 def test_reference_returns_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,10 +96,9 @@ def drawing(style: str) -> Iterator[Any]:
 
 def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
     """A figure of ``size`` inches and its axes [rows, columns]; options are those of ``matplotlib.pyplot.subplots``."""
-    figure, axes = need("matplotlib.pyplot").subplots(
-        rows, columns, figsize=size, squeeze=False, layout="constrained", **options
-    )
-    return figure, axes
+    how = {"figsize": size, "squeeze": False, "layout": "constrained"} | options
+    found: tuple[Any, Any] = need("matplotlib.pyplot").subplots(rows, columns, **how)
+    return found
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
