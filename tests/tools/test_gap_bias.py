@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from arcade_torch.tools import gap_and_bias
 from arcade_torch.tools.analysis.bootstrap import measured_coverage, percentile_interval, resampled_means
-from arcade_torch.tools.analysis.gap_bias import GapBias
-from arcade_torch.tools.analysis.normalise import game_of, normalise
+from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
 from arcade_torch.tools.runs import Score, read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"

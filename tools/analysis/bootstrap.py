@@ -19,11 +19,6 @@ class Interval:
     low: float
     high: float
 
-    def __str__(self) -> str:
-        """Three decimals, with the interval if there is one."""
-        ends = "" if np.isnan(self.low) else f" [{self.low:+.3f}, {self.high:+.3f}]"
-        return f"{self.value:+.3f}{ends}"
-
     @property
     def excludes_zero(self) -> bool:
         """Whether there is an interval and zero lies outside it."""
@@ -56,23 +51,15 @@ def iqm(cells: Sequence[Array]) -> Array:
 
 
 def percentile_interval(value: float, draws: Array, confidence: float, known: bool = True) -> Interval:
-    """Percentile interval of an estimate from its bootstrap draws; its ends are NaN where ``known`` is false."""
-    if not known:
-        return Interval(value, float("nan"), float("nan"))
+    """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, or if not ``known``."""
+    if not known or not len(draws):
+        return Interval(float(value), float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(value, float(low), float(high))
+    return Interval(float(value), float(low), float(high))
 
 
-class Estimate(NamedTuple):
-    """Means over seeds and both ends of their intervals, arrays of one shape."""
-
-    mean: Array
-    low: Array
-    high: Array
-
-
-def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> Estimate:
-    """Mean over seeds and its percentile interval, cell by cell.
+def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> tuple[Array, Array, Array]:
+    """Mean over seeds, and both ends of its percentile interval, cell by cell.
 
     Args:
         values: float64 [n_seeds, ...]; NaN where a seed has no value.
@@ -83,19 +70,20 @@ def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed:
     Returns:
         Arrays [...]; the ends are NaN where fewer than two seeds have a value, the mean is NaN where none has.
     """
-    flat = values.reshape(values.shape[0], -1)
-    found = np.full((3, flat.shape[1]), np.nan)
-    for cell in range(flat.shape[1]):
-        known = flat[np.isfinite(flat[:, cell]), cell]
-        if known.size:
-            drawn = resampled_means([known], draws, np.random.default_rng(seed)) if known.size > 1 else known
-            interval = percentile_interval(float(known.mean()), drawn, confidence, known.size > 1)
-            found[:, cell] = interval.value, interval.low, interval.high
-    return Estimate(*found.reshape(3, *values.shape[1:]))
+
+    def cell(seeds: Array) -> Array:
+        known = seeds[np.isfinite(seeds)]
+        if known.size < 2:
+            return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
+        drawn = resampled_means([known], draws, np.random.default_rng(seed))
+        found = percentile_interval(float(known.mean()), drawn, confidence)
+        return np.array([found.value, found.low, found.high])
+
+    mean, low, high = np.apply_along_axis(cell, 0, values)
+    return mean, low, high
 
 
-@dataclass(frozen=True)
-class Pooled:
+class Pooled(NamedTuple):
     """Values of every seed [n_seeds, ...], their mean and its interval, each [...]."""
 
     seeds: Array
@@ -103,11 +91,11 @@ class Pooled:
     low: Array
     high: Array
 
-    @classmethod
-    def of(cls, values: Sequence[Array], confidence: float = 0.95) -> "Pooled":
-        """Pool the arrays of some seeds; see `over_seeds`."""
-        seeds = np.array(values)
-        return cls(seeds, *over_seeds(seeds, confidence))
+
+def pooled(values: Sequence[Array], confidence: float = 0.95) -> Pooled:
+    """Pool the arrays of some seeds; see `over_seeds`."""
+    seeds = np.array(values)
+    return Pooled(seeds, *over_seeds(seeds, confidence))
 
 
 def seed_coverage(seeds: int, confidence: float = 0.95) -> float:
@@ -124,9 +112,9 @@ def measured_coverage(
     draws: int = 500,
     seed: int = 0,
 ) -> float:
-    """Share of simulated studies whose interval for Gap holds the true Gap.
+    """Share of simulated studies whose interval for Gap holds the true Gap, with a standard error of about 0.01.
 
-    Seeds are standard Gaussian in the simulation, the same spread in every task. With few seeds the share is well
+    Scores are standard Gaussian in the simulation, the same spread in every task. With few seeds the share is well
     below the nominal confidence; a report says so beside its intervals.
 
     Args:
@@ -136,9 +124,6 @@ def measured_coverage(
         simulations: simulated studies (fewer for large ones, so that this takes about a second).
         draws: resamples of each.
         seed: of the simulation.
-
-    Returns:
-        A share in [0, 1], with a standard error of about 0.01.
     """
     rng = np.random.default_rng(seed)
     cost = draws * sum(mdp_seeds + pomdp_seeds)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,25 +20,15 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Label:
-    """Which checkpoint this is: one seed of an agent on one twin of a game.
-
-    Attributes:
-        key: which agent.
-        game: environment id.
-        observability: the twin that is looked at.
-        seed: of the training.
-        frames: of training behind it.
-        path: run folder or checkpoint.
-        agent: name of the agent among those it is compared with, see `with_names`.
-    """
+    """Which checkpoint this is: one seed of an agent on one twin of a game."""
 
     key: AgentKey
     game: str
-    observability: str
-    seed: int
-    frames: int
-    path: Path
-    agent: str = ""
+    observability: str  # the twin that is looked at
+    seed: int  # of the training
+    frames: int  # of training behind it
+    path: Path  # run folder or checkpoint
+    agent: str = ""  # its name among those it is compared with, see `with_names`
 
     @property
     def task(self) -> tuple[str, str, str]:
@@ -95,7 +86,7 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     return found, notes
 
 
-NO_OPTIONS = ("agent", "env", "observability", "progress", "chunk")
+NO_OPTIONS = ("agent", "env", "observability", "progress")
 """Arguments of a measure that do not decide its numbers, or stand in the label."""
 
 
@@ -108,13 +99,8 @@ def measure_run(
 ) -> tuple[Label, Found]:
     """A measure of a checkpoint, kept under everything that it depends on: the very weights, the game, all options.
 
-    Args:
-        path: run folder or checkpoint.
-        measure: ``recall_density``, ``contamination``, ``shuffled_beginning`` or ``episode_saliency``: takes an agent
-            and returns a dataclass of arrays, numbers and words.
-        options: of the measure, beside its defaults.
-        observability: another twin than the one trained on.
-        progress: called with (done, of how many).
+    ``measure`` takes an agent and returns a dataclass of arrays, numbers and words; ``observability`` is another twin
+    than the one trained on, ``progress`` is called with (done, of how many).
     """
     agent, label = load_labelled(path, observability)
     how: Any = signature(measure)
@@ -133,3 +119,16 @@ def measure_run(
     arrays = cached_arrays(path, measure.__name__, own | chosen, compute)
     kind, names = how.return_annotation, (field.name for field in fields(how.return_annotation))
     return label, kind(**{name: arrays[name].item() if arrays[name].ndim == 0 else arrays[name] for name in names})
+
+
+def measure_runs(
+    paths: Sequence[Path],
+    measure: Callable[..., Found],
+    options: Mapping[str, Any],
+    observability: Twin | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[tuple[Label, Found]]:
+    """`measure_run` of every path, with names that tell the agents apart."""
+    told = [partial(progress, path.name) if progress else None for path in paths]
+    each = zip(paths, told, strict=True)
+    return with_names([measure_run(path, measure, options, observability, tell) for path, tell in each])

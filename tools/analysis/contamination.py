@@ -14,7 +14,7 @@ in 0..255, which is sigma = 1/255 here.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -28,20 +28,12 @@ Progress = Callable[[int, int], None]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SIGMAS = (0.1, 0.3, 1.0)
-"""Standard deviations of the noise, on the [0, 1] scale."""
-
-DELAYS = (0, 1, 2, 5, 10, 20, 50, 100)
-"""Steps between the disturbed frame and the decision; 0 is the ceiling."""
-
+SIGMAS = (0.1, 0.3, 1.0)  # on the [0, 1] scale of pixels
+DELAYS = (0, 1, 2, 5, 10, 20, 50, 100)  # steps
 POINTS_AN_EPISODE = 4
-"""Start points drawn from one trajectory."""
-
 FIRST, LAST = 1, 10
 """A shuffle permutes the frames behind the first of these, up to the last."""
-
-WHITE = 255.0
-"""Pixel value that stands for 1."""
+WHITE = 255.0  # pixel value that stands for 1
 
 
 @dataclass(frozen=True)
@@ -51,8 +43,7 @@ class Contamination:
     Entries are NaN where the episode ended before the decision.
 
     Attributes:
-        kind: ``noise`` or ``shuffle``.
-        sigmas: float64 [S]; one NaN for ``shuffle``.
+        sigmas: float64 [S]; one NaN for shuffled frames.
         delays: int64 [K], steps from the disturbance (its last frame) to the decision.
         flip: float64 [P, S, K], 1 where the best action changed.
         change: float64 [P, S, K], ``||A' - A||_inf / (max A - min A)`` with A the outputs minus their mean.
@@ -61,22 +52,17 @@ class Contamination:
         clean_error: largest difference that replacing a frame by itself made to any output.
         skipped: trajectories too short for a start point.
         target: which outputs.
-        feedback: whether actions of the replay were fed back.
-        clip: whether noisy pixels were clipped to their range.
     """
 
-    kind: str
     sigmas: Floats
-    delays: NDArray[np.int64]
+    delays: Ints
     flip: Floats
     change: Floats
     kl: Floats
-    points: NDArray[np.int64]
+    points: Ints
     clean_error: float
     skipped: int
     target: str
-    feedback: bool
-    clip: bool
 
     def mean(self, measure: Literal["flip", "change", "kl"]) -> Floats:
         """Mean over start points, float64 [S, K]; NaN where there is none."""
@@ -129,21 +115,20 @@ def contamination(
         raise ValueError(f"sigmas must be numbers of at least 0, got {list(sigmas)}")
     strengths = np.array(sigmas, dtype=np.float64)
 
-    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> _Versions:
+    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> Versions:
         places = np.sort(rng.choice(window.n, min(wanted, window.n), replace=False))
         noisy = disturbed_frames(window.frames, places, strengths, clip, int(rng.integers(2**62)))
         return _noisy_versions(policy, window, places, noisy)
 
-    how = _How("noise", strengths, delays, starts, POINTS_AN_EPISODE, 2, feedback, clip, seed, cap, target)
-    return _measure(agent, env, observability, how, disturb, progress)
+    common: Any = {"delays": delays, "starts": starts, "feedback": feedback, "seed": seed, "cap": cap, "target": target}
+    player, env = resolve_agent(agent, env, observability)
+    return _measure(player, env, disturb, strengths, POINTS_AN_EPISODE, 2, progress, **common)
 
 
 def shuffled_beginning(
     agent: Any,
     env: Any = None,
     *,
-    first: int = FIRST,
-    last: int = LAST,
     delays: Sequence[int] = DELAYS,
     starts: int = 200,
     feedback: bool = False,
@@ -154,16 +139,14 @@ def shuffled_beginning(
     target: Target = "auto",
     progress: Progress | None = None,
 ) -> Contamination:
-    """Permute the frames first + 1 ... last of a trajectory and keep all others.
+    """Permute frames 2 to 10 of a trajectory and keep all others.
 
     Actions and start flags stay in their order. On a POMDP another order may rightly change what the agent believes:
     draw conclusions on MDPs only.
 
     Args:
         agent: as for `contamination`, and so are ``env`` and all options that do not stand here.
-        first: index of the last frame of the beginning that stays.
-        last: index of the last permuted frame.
-        delays: steps from frame ``last`` to the decision.
+        delays: steps from frame 10 to the decision.
         starts: permutations P, one a trajectory.
         identity: use the identity in place of random permutations, which must change nothing.
 
@@ -171,91 +154,77 @@ def shuffled_beginning(
         Arrays; ``sigmas`` is one NaN.
 
     Raises:
-        ValueError: fewer than two frames are permuted, an option is out of range, or no episode was long enough.
+        ValueError: an option is out of range, or no episode was long enough.
     """
-    if first < 0 or last < first + 2:
-        raise ValueError(f"frames first + 1 to last must be at least two, got first = {first} and last = {last}")
 
-    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> _Versions:
-        order = np.arange(window.n + 1) if identity else shuffle_order(window.n + 1, first, last, rng)
-        return _shuffled_versions(policy, window, order, first, last)
+    def disturb(policy: Policy, window: Window, rng: np.random.Generator, wanted: int) -> Versions:
+        order = np.arange(window.n + 1) if identity else shuffle_order(window.n + 1, FIRST, LAST, rng)
+        return _shuffled_versions(policy, window, order)
 
-    how = _How("shuffle", np.array([np.nan]), delays, starts, 1, last + 1, feedback, False, seed, cap, target)
-    return _measure(agent, env, observability, how, disturb, progress)
-
-
-@dataclass(frozen=True)
-class _How:
-    """Options of both measures, and how many points an episode gives and how many frames it needs."""
-
-    kind: str
-    sigmas: Floats
-    delays: Sequence[int]
-    starts: int
-    per_window: int
-    shortest: int
-    feedback: bool
-    clip: bool
-    seed: int
-    cap: int
-    target: Target
+    common: Any = {"delays": delays, "starts": starts, "feedback": feedback, "seed": seed, "cap": cap, "target": target}
+    player, env = resolve_agent(agent, env, observability)
+    return _measure(player, env, disturb, np.array([np.nan]), 1, LAST + 1, progress, **common)
 
 
-@dataclass(frozen=True)
-class _Versions:
-    """Features [1 + points * S, T, E], the undisturbed row first; where delays count from; the first changed frame."""
+class Versions(NamedTuple):
+    """A trajectory and its disturbed versions."""
 
-    features: Tensor
-    places: Ints
-    changed: int
+    features: Tensor  # [1 + points * S, T, E], the undisturbed row first
+    places: Ints  # where delays count from
+    changed: int  # first frame that differs
 
 
 @torch.no_grad()
 def _measure(
-    agent: Any,
+    player: Any,
     env: Any,
-    observability: Twin | None,
-    how: _How,
-    disturb: Callable[[Policy, Window, np.random.Generator, int], _Versions],
+    disturb: Callable[[Policy, Window, np.random.Generator, int], Versions],
+    sigmas: Floats,
+    per_window: int,
+    shortest: int,
     progress: Progress | None,
+    *,
+    delays: Sequence[int],
+    starts: int,
+    feedback: bool,
+    seed: int,
+    cap: int,
+    target: Target,
 ) -> Contamination:
-    if not how.delays or min(how.delays) < 0:
-        raise ValueError(f"delays must be whole numbers of at least 0, got {list(how.delays)}")
-    if how.starts < 1:
-        raise ValueError(f"starts must be at least 1, got {how.starts}")
-    player, env = resolve_agent(agent, env, observability)
-    what = resolve(player, how.target)
+    """Both measures: ``per_window`` start points from every trajectory of at least ``shortest`` frames."""
+    if not delays or min(delays) < 0:
+        raise ValueError(f"delays must be whole numbers of at least 0, got {list(delays)}")
+    if starts < 1:
+        raise ValueError(f"starts must be at least 1, got {starts}")
+    what = resolve(player, target)
     if what == "value":
         raise ValueError("contamination compares actions: target must be q, logits or probs, not value")
-    delays = np.unique(np.array(how.delays, dtype=np.int64))
+    steps = np.unique(np.array(delays, dtype=np.int64))
     policy, parts, points = policy_of(player), list[tuple[Floats, ...]](), list[tuple[int, int]]()
-    skipped, error, rng = 0, 0.0, np.random.default_rng([how.seed, 1])
-    episodes = 4 * -(-how.starts // how.per_window) + 16
+    skipped, error, rng = 0, 0.0, np.random.default_rng([seed, 1])
+    episodes = 4 * -(-starts // per_window) + 16
     with policy.evaluating():
-        for number, w in enumerate(greedy_windows(player, env, episodes=episodes, seed=how.seed, cap=how.cap)):
-            if w.n + 1 < max(2, how.shortest):
+        for number, w in enumerate(greedy_windows(player, env, episodes=episodes, seed=seed, cap=cap)):
+            if w.n + 1 < shortest:
                 skipped += 1
                 continue
-            versions = disturb(policy, w, rng, min(how.per_window, how.starts - len(points)))
-            raw = replayed(policy, w, versions.features, versions.changed, how.feedback)
-            parts.append(_compare(player, what, raw, versions.places[:, None, None] + delays, len(how.sigmas)))
+            features, places, changed = disturb(policy, w, rng, min(per_window, starts - len(points)))
+            raw = replayed(policy, w, features, changed, feedback)
+            parts.append(_compare(player, what, raw, places[:, None, None] + steps, len(sigmas)))
             # What the machinery itself does: a frame in the middle is replaced by itself, encoded alone.
-            again, middle = versions.features[:1].clone(), w.n // 2
+            again, middle = features[:1].clone(), w.n // 2
             again[0, middle] = policy.features(w.frames[middle : middle + 1])[0]
-            same = replayed(policy, w, again, versions.changed, how.feedback)[0]
+            same = replayed(policy, w, again, changed, feedback)[0]
             error = max(error, float((same - raw[0]).abs().max()))
-            points += [(number, int(place)) for place in versions.places]
+            points += [(number, int(place)) for place in places]
             if progress is not None:
-                progress(len(points), how.starts)
-            if len(points) >= how.starts:
+                progress(len(points), starts)
+            if len(points) >= starts:
                 break
     if not parts:
-        raise ValueError(f"none of {skipped} episodes was long enough: {how.shortest} frames are needed")
+        raise ValueError(f"none of {skipped} episodes was long enough: {shortest} frames are needed")
     flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
-    found = np.array(points, dtype=np.int64)
-    return Contamination(
-        how.kind, how.sigmas, delays, flip, change, kl, found, error, skipped, what, how.feedback, how.clip
-    )
+    return Contamination(sigmas, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what)
 
 
 def _compare(model: Any, what: str, raw: Tensor, decisions: Ints, sigmas: int) -> tuple[Floats, ...]:
@@ -292,12 +261,12 @@ def disturbed_frames(frames: Tensor, places: Ints, sigmas: Floats, clip: bool, s
     return noisy.clamp(0.0, WHITE) if clip else noisy
 
 
-def _noisy_versions(policy: Policy, window: Window, places: Ints, noisy: Tensor) -> _Versions:
+def _noisy_versions(policy: Policy, window: Window, places: Ints, noisy: Tensor) -> Versions:
     """A version for each noisy frame, those of one place in a row."""
     rows = policy.features(window.frames).repeat(1 + len(noisy), 1, 1)
     index = torch.as_tensor(places.repeat(len(noisy) // len(places)))
     rows[torch.arange(1, 1 + len(noisy)), index] = policy.features(noisy)
-    return _Versions(rows, places, int(places.min()))
+    return Versions(rows, places, int(places.min()))
 
 
 def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -> Ints:
@@ -311,9 +280,9 @@ def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -
     return order
 
 
-def _shuffled_versions(policy: Policy, window: Window, order: Ints, first: int, last: int) -> _Versions:
+def _shuffled_versions(policy: Policy, window: Window, order: Ints) -> Versions:
     features = policy.features(window.frames)
-    return _Versions(torch.stack([features, features[torch.as_tensor(order)]]), np.array([last]), first)
+    return Versions(torch.stack([features, features[torch.as_tensor(order)]]), np.array([LAST]), FIRST)
 
 
 @torch.no_grad()
@@ -336,36 +305,23 @@ def replayed(policy: Policy, window: Window, features: Tensor, changed: int, fee
     return torch.cat(parts, 1)
 
 
-@dataclass(frozen=True)
-class Examples:
-    """One trajectory, undisturbed and disturbed in several ways: pictures, and what the agent then thought.
+class Examples(NamedTuple):
+    """One trajectory, undisturbed (row 0) and disturbed in several ways: pictures, and what the agent then thought."""
 
-    Attributes:
-        frames: uint8 [R, F, S, S, 3], some frames of each version; row 0 is undisturbed.
-        names: int [R, F], the index of each frame.
-        values: float64 [R, A] at the last step: relative Q-values (minus their mean), or probabilities.
-        labels: [R], what was done.
-        target: which outputs.
-        n: index of the last step.
-    """
-
-    frames: NDArray[np.uint8]
-    names: Ints
-    values: Floats
-    labels: tuple[str, ...]
+    frames: NDArray[np.uint8]  # [R, F, S, S, 3], some frames of each version
+    names: Ints  # [R, F], the index of each frame
+    values: Floats  # [R, A] at the last step: Q-values minus their mean, or probabilities
+    labels: tuple[str, ...]  # [R], what was done
     target: str
-    n: int
+    n: int  # index of the last step
 
 
 @torch.no_grad()
 def examples(model: Any, window: Window, hits: Sequence[int] = (), seed: int = 0) -> Examples:
-    """What noise of strength 1 on one frame each does to the decision on the last frame of a window.
+    """What noise of strength 1 on a frame does to the decision on the last frame of a window.
 
-    Args:
-        model: see `policy_of`.
-        window: the trajectory.
-        hits: index of the noisy frame of each version; without any, the early frames are shuffled instead.
-        seed: of the noise, or the order.
+    There is a version for each frame of ``hits``; without any, the early frames are shuffled instead. The seed is that
+    of the noise, or the order.
 
     Raises:
         ValueError: a hit lies outside the window, or the window is too short for a shuffle.
@@ -385,7 +341,7 @@ def examples(model: Any, window: Window, hits: Sequence[int] = (), seed: int = 0
             labels = ("clean", *(f"noise on frame {hit}" for hit in hits))
         else:
             order = shuffle_order(window.n + 1, FIRST, LAST, np.random.default_rng(seed))
-            versions = _shuffled_versions(policy, window, order, FIRST, LAST)
+            versions = _shuffled_versions(policy, window, order)
             late = list(range(max(LAST + 1, window.n - 2), window.n + 1))
             names = [[*early, *late] for early in (range(FIRST + 1, FIRST + 4), order[FIRST + 1 : FIRST + 4].tolist())]
             pictures, labels = window.frames[torch.tensor(names)], ("clean", "shuffled beginning")

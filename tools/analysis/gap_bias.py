@@ -7,25 +7,50 @@ J is the normalised return, averaged over tasks.
 Source: POPGym Arcade (ICML 2026), definitions of Gap and Bias. Intervals: stratified bootstrap over seeds.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import (
-    Array,
-    Interval,
-    iqm,
-    mean_over_tasks,
-    measured_coverage,
-    percentile_interval,
-    resampled,
-)
-from arcade_torch.tools.analysis.normalise import game_of, normalise
+from arcade_torch.tools.analysis import bootstrap
+from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
 from arcade_torch.tools.runs import Score, Source, find_baseline, read_scores
 
 TWINS = ("full", "partial")
+NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm")
+"""Columns of the table that have an interval."""
+SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
+"""Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already."""
+DIFFICULTIES = ("Easy", "Medium", "Hard")
+
+Value = TypeVar("Value", float, Array)
+
+
+def game_of(env_id: str) -> str:
+    """The game of an environment id, without difficulty and version.
+
+    Example:
+        >>> game_of("MineSweeperEasy-v0")
+        'MineSweeper'
+    """
+    game = re.sub(rf"({'|'.join(DIFFICULTIES)})?(-v\d+)?$", "", env_id)
+    return "NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game
+
+
+def normalise(env_id: str, value: Value) -> Value:
+    """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for five games, x for the others.
+
+    Returns outside a game's range stay outside [0, 1]. The id may have its version or not.
+
+    Source: POPGym Arcade (ICML 2026), text on the return figure; the rule gives the aggregates that the text quotes.
+
+    Example:
+        >>> normalise("TetrisEasy-v0", -0.5), normalise("CartPoleEasy-v0", 0.5)
+        (0.25, 0.5)
+    """
+    return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value
 
 
 @dataclass(frozen=True)
@@ -82,7 +107,7 @@ class GapBias:
     confidence: float
     draws: int
     without: Mapping[str, tuple[AgentRow, ...]] = field(default_factory=dict)
-    _draws: Mapping[tuple[str, str], Array] = field(default_factory=dict, repr=False)
+    _values: Mapping[str, Mapping[str, Array]] = field(default_factory=dict, repr=False)
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
@@ -100,14 +125,21 @@ class GapBias:
         return self._difference("pomdp", first, second)
 
     def _difference(self, name: str, first: str, second: str) -> Interval:
-        a, b = (getattr(self.row(agent), name) for agent in (first, second))
-        draws = self._draws[first, name] - self._draws[second, name]
-        return percentile_interval(a.value - b.value, draws, self.confidence, not np.isnan(a.low + b.low))
+        known = min(self.row(first).seeds, self.row(second).seeds) > 1
+        values = self._values[first][name] - self._values[second][name]
+        return percentile_interval(values[0], values[1:], self.confidence, known)
 
     def table(self) -> list[dict[str, Any]]:
         """Plain rows, for a CSV file; games left out stand in column ``without``."""
-        found = [_plain(row, "") for row in self.rows]
-        return found + [_plain(row, game) for game, rows in self.without.items() for row in rows]
+        found = []
+        for without, rows in {"": self.rows, **self.without}.items():
+            for row in rows:
+                values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
+                for name in NUMBERS:
+                    interval: Interval = getattr(row, name)
+                    values |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+                found.append(values | {"coverage": row.coverage})
+        return found
 
 
 def gap_and_bias(
@@ -152,14 +184,15 @@ def gap_and_bias(
     tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]
     if not tasks:
         raise ValueError("no task has finished runs of every agent on both twins: nothing to compare yet")
-    rows, kept = _rows(cells, agents, tasks, draws, confidence, seed)
+    values = _values(cells, agents, tasks, draws, seed)
     games = list(dict.fromkeys(game_of(task) for task in tasks))
     without = {}
     for game in games if len(games) > 1 else []:
         rest = [task for task in tasks if game_of(task) != game]
-        without[game] = _rows(cells, agents, rest, draws, confidence, seed, with_iqm=False)[0]
+        without[game] = _rows(cells, rest, _values(cells, agents, rest, draws, seed, with_iqm=False), confidence)
     dropped = tuple(game for game in every if game not in tasks)
-    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, kept)
+    rows = _rows(cells, tasks, values, confidence)
+    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, values)
 
 
 Cells = dict[tuple[str, str, str], Array]
@@ -176,55 +209,35 @@ def _cells(scores: Sequence[Score]) -> Cells:
     return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
 
 
-def _rows(
-    cells: Cells,
-    agents: Sequence[str],
-    tasks: Sequence[str],
-    draws: int,
-    confidence: float,
-    seed: int,
-    with_iqm: bool = True,
-) -> tuple[tuple[AgentRow, ...], dict[tuple[str, str], Array]]:
-    """A row an agent, the memory-free one first; and (agent, ``gap`` or ``pomdp``) -> draws."""
-    found: dict[tuple[str, str], dict[str, tuple[float, Array]]] = {}  # values and draws
+def _values(
+    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, seed: int, with_iqm: bool = True
+) -> dict[str, dict[str, Array]]:
+    """Agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its bootstrap draws."""
+    found: dict[str, dict[str, Array]] = {}
     for i, agent in enumerate(agents):
-        for j, twin in enumerate(TWINS):
-            raw = [cells[agent, task, twin] for task in tasks]
-            drawn_raw = resampled(raw, draws, np.random.default_rng([seed, i, j]))
-            scaled, drawn = (
-                [normalise(task, each) for task, each in zip(tasks, every, strict=True)] for every in (raw, drawn_raw)
-            )
-            found[agent, twin] = {
-                "raw": (_mean(raw), mean_over_tasks(drawn_raw)),
-                "mean": (_mean(scaled), mean_over_tasks(drawn)),
-                "iqm": (float(iqm(scaled)), iqm(drawn) if with_iqm else np.full(1, np.nan)),
-            }
-    counts = {key: tuple(len(cells[key[0], task, key[1]]) for task in tasks) for key in found}
-    rows, kept = list[AgentRow](), dict[tuple[str, str], Array]()
-    free, free_seeds = found[agents[0], "full"]["mean"], min(counts[agents[0], "full"])
-    for agent in agents:
-        full, partial = found[agent, "full"], found[agent, "partial"]
-        seeds = min(counts[agent, "full"] + counts[agent, "partial"])
-        kept[agent, "gap"], kept[agent, "pomdp"] = full["mean"][1] - partial["mean"][1], partial["mean"][1]
-        values = {"mdp_raw": full["raw"], "pomdp_raw": partial["raw"], "mdp": full["mean"], "pomdp": partial["mean"]}
-        values |= {"mdp_iqm": full["iqm"], "pomdp_iqm": partial["iqm"]}
-        values["gap"] = (full["mean"][0] - partial["mean"][0], kept[agent, "gap"])
-        intervals = {name: percentile_interval(*pair, confidence, seeds > 1) for name, pair in values.items()}
-        bias = full["mean"][0] - free[0], full["mean"][1] - free[1]
-        intervals["bias"] = percentile_interval(*bias, confidence, min(seeds, free_seeds) > 1)
-        both = counts[agent, "full"], counts[agent, "partial"]
-        coverage = measured_coverage(*both, confidence) if seeds > 1 else float("nan")
-        rows.append(AgentRow(agent, seeds, coverage=coverage, **intervals))
-    return tuple(rows), kept
+        mine = found[agent] = {}
+        for j, (twin, name) in enumerate(zip(TWINS, ("mdp", "pomdp"), strict=True)):
+            seeds = [cells[agent, task, twin] for task in tasks]
+            drawn = bootstrap.resampled(seeds, draws, np.random.default_rng([seed, i, j]))
+            raw = [np.vstack([first, again]) for first, again in zip(seeds, drawn, strict=True)]
+            scaled = [normalise(task, each) for task, each in zip(tasks, raw, strict=True)]
+            mine[f"{name}_raw"], mine[name] = bootstrap.mean_over_tasks(raw), bootstrap.mean_over_tasks(scaled)
+            mine[f"{name}_iqm"] = bootstrap.iqm(scaled if with_iqm else [each[:1] for each in scaled])
+        mine["gap"] = mine["mdp"] - mine["pomdp"]
+        mine["bias"] = mine["mdp"] - found[agents[0]]["mdp"]
+    return found
 
 
-def _mean(cells: Sequence[Array]) -> float:
-    return float(np.mean([cell.mean() for cell in cells]))
-
-
-def _plain(row: AgentRow, without: str) -> dict[str, Any]:
-    values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
-    for name in ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm"):
-        interval: Interval = getattr(row, name)
-        values |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
-    return values | {"coverage": row.coverage}
+def _rows(
+    cells: Cells, tasks: Sequence[str], values: Mapping[str, Mapping[str, Array]], confidence: float
+) -> tuple[AgentRow, ...]:
+    """A row an agent, the memory-free one first."""
+    rows, free_seeds = list[AgentRow](), 0
+    for agent, mine in values.items():
+        full, partial = (tuple(len(cells[agent, task, twin]) for task in tasks) for twin in TWINS)
+        seeds, free_seeds = min(full + partial), free_seeds or min(full)
+        known = {name: min(seeds, free_seeds if name == "bias" else seeds) > 1 for name in mine}
+        ends = {name: percentile_interval(x[0], x[1:], confidence, known[name]) for name, x in mine.items()}
+        coverage = bootstrap.measured_coverage(full, partial, confidence) if seeds > 1 else float("nan")
+        rows.append(AgentRow(agent, seeds, coverage=coverage, **ends))
+    return tuple(rows)

@@ -1,6 +1,6 @@
 """The paper's published returns: its table of aggregates, with the intervals that its standard deviations allow."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Interval
-from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
-from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, game_of
+from arcade_torch.tools.analysis.gap_bias import SIGNED_GAMES, TWINS, AgentRow, GapBias, game_of, gap_and_bias
 from arcade_torch.tools.files import read_csv
 
 PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
@@ -56,40 +55,30 @@ def paper_table() -> PaperTable:
     Intervals are normal and 95 %, from the published standard deviations, with independent tasks; errors of Gap and
     Bias add in quadrature, as both sides are separate runs.
     """
-    table, deviations = gap_and_bias(PAPER_RETURNS, draws=1), _deviations()
-
-    def errors(twin: str, without: str = "") -> dict[str, Spread]:
-        return {row.agent: _spread(deviations[row.agent, twin], without) for row in table.rows}
-
-    def widened(rows: Sequence[AgentRow], without: str = "") -> tuple[AgentRow, ...]:
-        full, partial = errors("full", without), errors("partial", without)
-        base = full[table.baseline].half_width
-        found = []
-        for row in rows:
-            mdp, pomdp = full[row.agent].half_width, partial[row.agent].half_width
-            bias = 0.0 if row.agent == table.baseline else float(np.hypot(mdp, base))
-            halves = {"mdp": mdp, "pomdp": pomdp, "gap": float(np.hypot(mdp, pomdp)), "bias": bias}
-            values = {name: (getattr(row, name).value, half) for name, half in halves.items()}
-            intervals: Any = {name: Interval(x, x - half, x + half) for name, (x, half) in values.items()}
-            found.append(replace(row, seeds=SEEDS, **intervals))
-        return tuple(found)
-
-    without = {game: widened(part, game) for game, part in table.without.items()}
-    return PaperTable(replace(table, rows=widened(table.rows), without=without), errors("full"), errors("partial"))
-
-
-def _deviations() -> dict[tuple[str, str], list[tuple[str, float]]]:
-    """(agent, twin) -> normalised standard deviations over seeds, with the game of each."""
-    found: dict[tuple[str, str], list[tuple[str, float]]] = {}
-    for row in read_csv(PAPER_RETURNS):
-        game = game_of(row["env"])
+    table, deviations = gap_and_bias(PAPER_RETURNS, draws=1), dict[tuple[str, str], list[tuple[str, float]]]()
+    for line in read_csv(PAPER_RETURNS):
+        game = game_of(line["env"])
         scale = 0.5 if game in SIGNED_GAMES else 1.0
         for twin, column in (("full", "mdp_std"), ("partial", "pomdp_std")):
-            found.setdefault((row["model"], twin), []).append((game, scale * float(row[column])))
-    return found
+            deviations.setdefault((line["model"], twin), []).append((game, scale * float(line[column])))
 
+    def spread(agent: str, twin: str, without: str = "") -> Spread:
+        kept = np.array([value for game, value in deviations[agent, twin] if game != without])
+        half = 1.96 * np.sqrt((kept**2 / SEEDS).sum()) / kept.size
+        return Spread(float(kept.mean() / np.sqrt(SEEDS * kept.size)), float(half))
 
-def _spread(deviations: list[tuple[str, float]], without: str) -> Spread:
-    kept = np.array([value for game, value in deviations if game != without])
-    half = 1.96 * np.sqrt((kept**2 / SEEDS).sum()) / kept.size
-    return Spread(float(kept.mean() / np.sqrt(SEEDS * kept.size)), float(half))
+    def widened(row: AgentRow, without: str = "") -> AgentRow:
+        mdp, pomdp, base = (
+            spread(agent, twin, without).half_width
+            for agent, twin in ((row.agent, "full"), (row.agent, "partial"), (table.baseline, "full"))
+        )
+        bias = 0.0 if row.agent == table.baseline else np.hypot(mdp, base)
+        halves = {"mdp": mdp, "pomdp": pomdp, "gap": np.hypot(mdp, pomdp), "bias": bias}
+        values = {name: (getattr(row, name).value, float(half)) for name, half in halves.items()}
+        intervals: Any = {name: Interval(x, x - half, x + half) for name, (x, half) in values.items()}
+        return replace(row, seeds=SEEDS, **intervals)
+
+    rows = tuple(map(widened, table.rows))
+    without = {game: tuple(widened(row, game) for row in part) for game, part in table.without.items()}
+    mdp, pomdp = ({row.agent: spread(row.agent, twin) for row in rows} for twin in TWINS)
+    return PaperTable(replace(table, rows=rows, without=without), mdp, pomdp)

@@ -36,8 +36,6 @@ class Saliency:
         per_frame: float64 [n + 1], for each frame sum over actions of the norm over all pixels and channels.
         output: float32 [A], what was differentiated, at step n.
         n: index of the step whose decision is explained.
-        reduce: how actions were put together.
-        norm: which norm.
         target: which output.
     """
 
@@ -45,8 +43,6 @@ class Saliency:
     per_frame: NDArray[np.float64]
     output: NDArray[np.float32]
     n: int
-    reduce: str
-    norm: str
     target: str
 
     def shares(self) -> NDArray[np.float64]:
@@ -113,19 +109,12 @@ def saliency(
     with policy.evaluating(), torch.enable_grad():
         features = policy.features(frames[:steps], chunk, dtype)
         before = policy.initial_state(1) if state is None else state
-        jacobian, output = _memory_jacobian(
-            policy, scalars, features, actions[:steps], starts[:steps].bool(), before, reduce
-        )
+        how = features, actions[:steps], starts[:steps].bool(), before, reduce
+        jacobian, output = _memory_jacobian(policy, scalars, *how)
         maps, totals = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
-    return Saliency(
-        maps.to(torch.float32).cpu().numpy(),
-        totals.double().cpu().numpy(),
-        output.float().cpu().numpy(),
-        steps - 1,
-        reduce,
-        norm,
-        resolve(model, target),
-    )
+    values = output.float().cpu().numpy()
+    sums = totals.double().cpu().numpy()
+    return Saliency(maps.float().cpu().numpy(), sums, values, steps - 1, resolve(model, target))
 
 
 def _memory_jacobian(
@@ -198,7 +187,7 @@ def episode_saliency(
     target: Target = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> EpisodeSaliency:
-    """Saliency of the last decision of a greedy episode in the agent's own game.
+    """Saliency of the last decision of a greedy episode in the agent's own game; see `saliency` for the other options.
 
     Args:
         agent: an agent of this package.
@@ -207,7 +196,6 @@ def episode_saliency(
         show: frames that are wanted: episodes are played until one has as many; else the longest counts.
         tries: at most so many episodes.
         observability: another twin than the one trained on.
-        reduce: as for `saliency`, and so are ``norm`` and ``target``.
         progress: called once, with (1, 1).
     """
     windows: list[Window] = []
@@ -215,8 +203,8 @@ def episode_saliency(
         at = seed + len(windows)
         windows.append(episode_window(agent, seed=at, observability=observability, max_steps=max_steps))
     w = max(windows, key=lambda window: window.n)
-    how: Any = {"reduce": reduce, "norm": norm, "target": target}
-    found = saliency(agent, w.frames, w.last_action, w.is_init, w.state, **how)
+    seen = w.frames, w.last_action, w.is_init, w.state
+    found = saliency(agent, *seen, reduce=reduce, norm=norm, target=target)
     if progress is not None:
         progress(1, 1)
     return EpisodeSaliency(**vars(found), frames=w.frames.cpu().numpy(), action=w.action.cpu().numpy())

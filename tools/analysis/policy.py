@@ -130,9 +130,7 @@ def resolve(model: Any, what: str) -> str:
 def outputs(model: Any, what: str = "auto") -> Callable[[Tensor], Tensor]:
     """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns, [..., R].
 
-    Args:
-        model: see `policy_of`.
-        what: ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
+    ``what`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
     """
     policy, name = policy_of(model), resolve(model, what)
     return lambda out: policy.read(out, name)

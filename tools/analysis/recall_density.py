@@ -18,15 +18,7 @@ from numpy.typing import NDArray
 
 from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, saliency
 from arcade_torch.tools.analysis.policy import Target, resolve
-from arcade_torch.tools.analysis.windows import (
-    MAX_STEPS,
-    MIN_STEPS,
-    End,
-    Twin,
-    Window,
-    greedy_windows,
-    resolve_agent,
-)
+from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Twin, Window, greedy_windows, resolve_agent
 
 Array = NDArray[np.float64]
 
@@ -41,9 +33,6 @@ class RecallDensity:
         ended: bool [m], whether the trajectory ends with the decision that ended its episode.
         dropped: trajectories left out because they have fewer than three frames.
         silent: trajectories left out because all their gradients vanish.
-        end: ``last`` or ``random``, see `greedy_windows`.
-        norm: of the gradients.
-        reduce: how actions were put together.
         target: what was differentiated.
     """
 
@@ -52,9 +41,6 @@ class RecallDensity:
     ended: NDArray[np.bool_]
     dropped: int
     silent: int
-    end: str
-    norm: str
-    reduce: str
     target: str
 
     @property
@@ -95,7 +81,6 @@ def recall_density(
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
-    chunk: int = 8,
     progress: Callable[[int, int], None] | None = None,
 ) -> RecallDensity:
     """Recall density of an agent over whole greedy episodes.
@@ -112,7 +97,6 @@ def recall_density(
         norm: of the gradient of one action over all pixels and channels; ``l1`` is the paper's.
         reduce: ``per_action`` sums the norms of single actions, ``sum`` takes the norm of the sum over actions.
         target: what is differentiated, see `outputs`: Q-values or, for a policy, action probabilities by default.
-        chunk: frames pushed through the encoder at once; bounds memory.
         progress: called with (trajectories done, episodes).
 
     Returns:
@@ -124,39 +108,30 @@ def recall_density(
     player, env = resolve_agent(agent, env, observability)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     done = (lambda count: progress(count, episodes)) if progress is not None else None
-    return density_of_windows(
-        player, windows, end=end, norm=norm, reduce=reduce, target=target, chunk=chunk, progress=done
-    )
+    return density_of_windows(player, windows, norm=norm, reduce=reduce, target=target, progress=done)
 
 
 def density_of_windows(
     model: Any,
     windows: Iterable[Window],
     *,
-    end: str = "last",
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
-    chunk: int = 8,
     progress: Callable[[int], None] | None = None,
 ) -> RecallDensity:
     """Recall density over windows of experience of your own; the last frame of each is explained.
 
-    Args:
-        model: see `policy_of`.
-        windows: consumed one by one. A start flag inside one leaves exactly nothing on the frames before it.
-        end: kept as a note.
-        norm: see `recall_density`, also for ``reduce``, ``target`` and ``chunk``.
-        progress: called with the number of windows done.
+    A start flag inside a window leaves exactly nothing on the frames before it; ``progress`` is called with the number
+    of windows done. Everything else is as for `recall_density`.
     """
     shares, ended, dropped, silent = [], [], 0, 0
     for count, w in enumerate(windows, start=1):
         if w.n + 1 < MIN_STEPS:
             dropped += 1
         else:
-            found = saliency(
-                model, w.frames, w.last_action, w.is_init, w.state, reduce=reduce, norm=norm, target=target, chunk=chunk
-            )
+            seen = w.frames, w.last_action, w.is_init, w.state
+            found = saliency(model, *seen, reduce=reduce, norm=norm, target=target)
             if found.per_frame.sum() > 0:
                 shares.append(found.shares())
                 ended.append(w.ended)
@@ -165,8 +140,7 @@ def density_of_windows(
         if progress is not None:
             progress(count)
     lengths, flat = np.array([share.size for share in shares], dtype=np.int64), np.concatenate([*shares, np.zeros(0)])
-    what = resolve(model, target)
-    return RecallDensity(flat, lengths, np.array(ended, dtype=np.bool_), dropped, silent, end, norm, reduce, what)
+    return RecallDensity(flat, lengths, np.array(ended, dtype=np.bool_), dropped, silent, resolve(model, target))
 
 
 def binned(shares: Array, bins: int) -> Array:
@@ -174,13 +148,6 @@ def binned(shares: Array, bins: int) -> Array:
 
     Step t of N owns the interval [t/N, (t+1)/N) and bin b of B owns [b/B, (b+1)/B); the mass of a step is split by the
     overlap of the intervals. Every trajectory therefore keeps its whole mass, whatever its length.
-
-    Args:
-        shares: float64 [N], mass of every step, oldest first.
-        bins: B.
-
-    Returns:
-        float64 [B], with the sum of ``shares``.
 
     Raises:
         ValueError: there is no step or no bin.

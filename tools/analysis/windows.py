@@ -13,14 +13,9 @@ from torch import Tensor
 
 from arcade_torch.tools.analysis.policy import policy_of
 
-MAX_STEPS = 512
-"""Longest window; what is cut, and where, stands with the functions."""
-
-MIN_STEPS = 3
-"""A shorter trajectory says nothing about memory: recall density leaves it out and counts it."""
-
-SIDE_BY_SIDE = 16
-"""Episodes played at once where the caller brings no environments: at most 512 of their frames each are in memory."""
+MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
+MIN_STEPS = 3  # a shorter trajectory says nothing about memory: recall density leaves it out and counts it
+SIDE_BY_SIDE = 16  # episodes played at once where the caller brings no environments
 
 End = Literal["last", "random"]
 Twin = Literal["full", "partial"]
@@ -103,9 +98,6 @@ def greedy_windows(
             drawn uniformly from index 2 on. An episode longer than ``cap`` ends at a random frame in either case.
         cap: longest window: the last so many frames before its end, with the recurrent state before them.
 
-    Yields:
-        Windows.
-
     Raises:
         ValueError: a number is below 1, or ``end`` is unknown.
     """
@@ -115,8 +107,7 @@ def greedy_windows(
         raise ValueError(f"episodes must be at least 1 and the cap at least {MIN_STEPS}, got {episodes} and {cap}")
     size = int(env.batch_size[0])
     for group in range(-(-episodes // size)):
-        rng = np.random.default_rng([seed, group])
-        batch_seed = _episode_seed(seed, group)
+        rng, batch_seed = np.random.default_rng([seed, group]), _episode_seed(seed, group)
         windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
         ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
         if (late := ends >= cap).any():  # these windows begin later than what was kept: play the very same again
@@ -147,26 +138,12 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
 
 @torch.no_grad()
 def play(
-    agent: Any,
-    env: Any,
-    *,
-    seed: int,
-    keep: int,
-    max_steps: int | None = None,
-    first: Sequence[int] | None = None,
+    agent: Any, env: Any, *, seed: int, keep: int, max_steps: int | None = None, first: Sequence[int] | None = None
 ) -> tuple[list[Window], NDArray[np.int64]]:
     """Play the first episode of every env of a batch greedily.
 
-    Args:
-        agent: as for `greedy_window`.
-        env: ``ArcadeEnv`` [N].
-        seed: of the batch.
-        keep: frames of each episode to keep.
-        max_steps: episodes are cut after this many steps; never by default.
-        first: index of the first frame to keep, one for every env; 0 by default.
-
-    Returns:
-        A window of each episode, and all lengths int64 [N]. The frame after an ending action is never part of a window.
+    From frame ``first`` on (0 by default; one for every env) ``keep`` frames of each episode are kept; episodes are cut
+    after ``max_steps``, never by default. Returns a window of each episode, and all lengths int64 [N].
     """
     size = int(env.batch_size[0])
     starts = torch.as_tensor([0] * size if first is None else first)
@@ -202,11 +179,11 @@ def play(
 
 
 def resolve_agent(agent: Any, env: Any = None, observability: Twin | None = None) -> tuple[Any, Any]:
-    """Something that acts, and environments for it.
+    """Something that acts, and environments for it: by default 16 of the agent's own game, on the twin that is named.
 
     Args:
         agent: an agent, the path of its run folder or checkpoint, or with ``env`` given anything `policy_of` takes.
-        env: environments; 16 of the agent's own game by default.
+        env: environments.
         observability: another twin than the one trained on (without ``env``).
 
     Raises:

@@ -1,6 +1,6 @@
-"""Gap and Bias: one point an agent, also by size of the memory; and bars of returns, Gap and Bias."""
+"""Gap and Bias: one point an agent, also by size of the memory; bars of returns, Gap and Bias; returns of people."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, seed_coverage
-from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
-from arcade_torch.tools.analysis.paper import SEEDS, paper_table
-from arcade_torch.tools.figures.registry import Made, Picture, Progress, ScoreOptions, SweepOptions
-from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, agent_colours, panels, seeds_note, whiskers
+from arcade_torch.tools.analysis.gap_bias import DIFFICULTIES, AgentRow, GapBias, gap_and_bias
+from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
+from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
+from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
+from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.runs import Score, agent_names, find_runs, is_baseline, read_scores
 from arcade_torch.tools.tables import Table
 
@@ -71,14 +72,40 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     return Made([Picture("size-sweep", figure, f"labels: layers x width; {options.metric}, {seeds}", rows)], notes)
 
 
+def human(options: PaperOptions, progress: Progress | None) -> Made:
+    """The figure ``human``; runs are not looked at."""
+    table = read_csv(PAPER_RETURNS)
+    people = [row for row in table if row["model"] == "human"]
+    machine = {(row["env"], row["difficulty"]): row for row in table if row["model"] == "MLP"}
+    figure, axes = panels(2, 5, (12.5, 5.6), sharey=True)
+    x = np.arange(len(DIFFICULTIES))
+    for axis, game in zip(axes.flat, dict.fromkeys(row["env"] for row in people), strict=True):
+        here = [row for row in people if row["env"] == game]
+        for side, (colour, twin) in enumerate(zip(TWIN_COLOURS.values(), ("mdp", "pomdp"), strict=True)):
+            places = x + (side - 0.5) * 0.36
+            mean, std = ([float(row[f"{twin}_{what}"]) for row in here] for what in ("mean", "std"))
+            style = {"fmt": "os"[side], "color": colour, "capsize": 2, "lw": 1.2}
+            axis.errorbar(places, mean, std, label=f"people, {twin.upper()}", **style)
+            plain = [float(machine[game, row["difficulty"]][f"{twin}_mean"]) for row in here]
+            label = "memory-free agent" if side else None
+            axis.plot(places, plain, "_", mew=2, color=agent_colours(["mlp"])["mlp"], label=label)
+        axis.axhline(0.0, color="#bbbbbb", lw=0.8)
+        axis.set_xticks(x, DIFFICULTIES)
+        axis.set_title(game)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("return, not normalised")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    note = f"published; n = {SEEDS} people, bars: one standard deviation over people"
+    notes = ["people cannot be measured again: --runs is not looked at"] if options.runs else []
+    return Made([Picture("human", figure, note, people)], notes)
+
+
 def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     """Draw a point an agent, with both intervals and the name beside it; people have no Bias."""
     colours = agent_colours([row.agent for row in rows])
     for place, row in enumerate(row for row in rows if not _is_person(row.agent)):
         point, colour = (row.bias.value, row.gap.value), colours[row.agent]
-        xerr, yerr = (
-            whiskers(*line[:, None]) if np.isfinite(line).all() else None for line in _ends(row.bias, row.gap)
-        )
+        xerr, yerr = (whiskers(*line[:, None]) for line in _ends(row.bias, row.gap))
         axis.errorbar(*point, yerr, xerr, fmt=MARKERS[place % len(MARKERS)], color=colour, capsize=2, lw=1)
         axis.annotate(row.agent, point, (6, 5), textcoords="offset points", color=colour, fontsize="small")
     axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
@@ -94,12 +121,10 @@ def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     chosen = [row for row in rows if not (name == "bias" and _is_person(row.agent))]
     ends = _ends(*(getattr(row, name) for row in chosen))
     colours = agent_colours([row.agent for row in rows])
-    places, known = np.arange(len(chosen)), np.isfinite(ends[:, 0])
-    axis.bar(places, ends[:, 1], 0.72, color=[colours[row.agent] for row in chosen])
-    axis.errorbar(places[known], ends[known, 1], whiskers(*ends[known].T), fmt="none", ecolor="black", capsize=3, lw=1)
+    places, errors = range(len(chosen)), {"yerr": whiskers(*ends.T), "error_kw": {"lw": 1}, "capsize": 3}
+    axis.bar(places, ends[:, 1], 0.72, color=[colours[row.agent] for row in chosen], **errors)
     axis.set_xticks(places, [row.agent for row in chosen], rotation=35, ha="right", rotation_mode="anchor")
-    title, unit = PANELS[name]
-    axis.set(title=title, ylabel=unit)
+    axis.set(title=PANELS[name][0], ylabel=PANELS[name][1])
     if name in ("gap", "bias"):
         axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
 
@@ -115,12 +140,10 @@ def _without_each(table: GapBias) -> Any:
             if name == "bias" and (_is_person(agent) or agent == table.baseline):
                 continue
             ends = _ends(*(getattr(rows[place], name) for rows in columns.values()))
-            errors = whiskers(*ends.T) if np.isfinite(ends).all() else None
             style = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
-            axis.errorbar(places + offsets[place], ends[:, 1], errors, label=agent, **style)
-        title, unit = PANELS[name]
-        axis.set_title(title, loc="left")
-        axis.set_ylabel(unit)
+            axis.errorbar(places + offsets[place], ends[:, 1], whiskers(*ends.T), label=agent, **style)
+        axis.set_title(PANELS[name][0], loc="left")
+        axis.set_ylabel(PANELS[name][1])
         axis.axvline(0.5, color=NEUTRAL, lw=0.8)
         if name != "pomdp":
             axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
@@ -166,14 +189,14 @@ def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
     """Scores of tables, and of the finished runs below folders."""
     if not options.runs:
         raise ValueError("name at least one study folder, run folder or CSV file")
-    known = [path for path in options.runs if path.is_file() or _is_bare(path)]
-    if len(known) == len(options.runs):
-        return read_scores(known, options.metric), []
-    found = find_runs([path for path in options.runs if path not in known])
+    tables = [path for path in options.runs if path.is_file() or _is_bare(path)]
+    if len(tables) == len(options.runs):
+        return read_scores(tables, options.metric), []
+    found = find_runs([path for path in options.runs if path not in tables])
     notes = found.notes + found.single_seeds()
-    if not known:
+    if not tables:
         return found.scores(options.metric), notes
-    return read_scores([*known, *(run.path for run in found.runs)], options.metric), notes
+    return read_scores([*tables, *(run.path for run in found.runs)], options.metric), notes
 
 
 def _is_bare(path: Path) -> bool:
@@ -188,10 +211,8 @@ def _printed(table: GapBias, what: str) -> Table:
         ends = "" if np.isnan(interval.low) else f"\n{interval.low:+.3f} {interval.high:+.3f}"
         return f"{interval.value:+.3f}{ends}"
 
-    names: Mapping[str, str] = {
-        **{"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias"},
-        **{"mdp_iqm": "MDP IQM", "pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"},
-    }
+    names = ("mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm", "mdp_raw", "pomdp_raw")
+    head = ("MDP", "POMDP", "gap", "bias", "MDP IQM", "POMDP IQM", "MDP raw", "POMDP raw")
     rows = [(row.agent, row.seeds, *(cell(getattr(row, name)) for name in names)) for row in table.rows]
     coverage = {row.seeds: row.coverage for row in table.rows if row.coverage == row.coverage}
     measured = ", ".join(f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in sorted(coverage.items()))
@@ -200,4 +221,4 @@ def _printed(table: GapBias, what: str) -> Table:
         if measured
         else "no intervals: a single seed"
     )
-    return Table(f"gap and bias over {what}", ("agent", "seeds", *names.values()), rows, caption)
+    return Table(f"gap and bias over {what}", ("agent", "seeds", *head), rows, caption)

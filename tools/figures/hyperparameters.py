@@ -9,6 +9,7 @@ from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Pro
 from arcade_torch.tools.figures.style import panels
 from arcade_torch.tools.files import write_text
 from arcade_torch.tools.runs import find_runs, flatten
+from arcade_torch.tools.tables import markdown_table
 
 NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
 """Fields that tell runs apart, or decide nothing."""
@@ -38,10 +39,8 @@ def settings(options: PaperOptions, progress: Progress | None) -> Made:
     for (line, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("#d0d0d0")
         cell.set_text_props(weight="normal" if line else "bold")
-    lines = [f"| {' | '.join(line)} |" for line in (head, *table)]
-    lines.insert(1, f"|{'---|' * len(head)}")
     base, _ = options.path("hyperparameters")
-    page = write_text(base.with_suffix(".md"), "\n".join(lines) + "\n")
+    page = write_text(base.with_suffix(".md"), markdown_table(head, table) + "\n")
     return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=[page])
 
 

@@ -1,38 +1,27 @@
 """Recall density: bars of few bins with all memory models pooled, curves of many bins for each model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Pooled
-from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_run, with_names
-from arcade_torch.tools.analysis.recall_density import RecallDensity, no_memory, recall_density
-from arcade_torch.tools.figures.registry import DensityOptions, Made, Picture, Progress, tell
-from arcade_torch.tools.figures.style import (
-    MDP_THIRDS,
-    NEUTRAL,
-    POMDP_THIRDS,
-    TWIN_COLOURS,
-    TWIN_NAMES,
-    panels,
-    rows_of,
-    seeds_note,
-)
+from arcade_torch.tools.analysis import recall_density as measure
+from arcade_torch.tools.analysis.bootstrap import Pooled, pooled
+from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_runs
+from arcade_torch.tools.figures import style
+from arcade_torch.tools.figures.registry import DensityOptions, Made, Picture, Progress
+from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.runs import is_baseline, listed
 from arcade_torch.tools.tables import Table
 
-BARS_UP_TO = 6
-"""Up to so many bins are drawn as stacked bars, more as curves."""
-
+BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
 MEMORY_FREE = ("mlp", "feedforward")
 THIRDS = ("oldest third", "middle third", "most recent third")
 POINTS = 101
 
-Densities = Sequence[tuple[Label, RecallDensity]]
-Masses = Mapping[tuple[str, str, str], Pooled]
-"""(agent, game, twin) -> mass in bins: mean over trajectories of a checkpoint, then over seeds."""
+Densities = Sequence[tuple[Label, measure.RecallDensity]]
+Masses = Mapping[tuple[str, str, str], Pooled]  # (agent, game, twin) -> mass in bins, over trajectories, then seeds
 
 
 def densities(options: DensityOptions, progress: Progress | None) -> Made:
@@ -44,25 +33,23 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
     made = Made([], notes + more)
     for bins in options.bins:
         tasks = by_task([(label, density.mass(bins)) for label, density in measured])
-        masses = {task: Pooled.of(rows, options.confidence) for task, rows in tasks.items()}
-        figure, seeds = (_stacked_bars if bins <= BARS_UP_TO else _curves)(measured, masses, bins, options.confidence)
+        masses = {task: pooled(rows, options.confidence) for task, rows in tasks.items()}
+        few = bins <= BARS_UP_TO
+        figure, seeds = _stacked_bars(masses, bins) if few else _curves(measured, masses, bins, options.confidence)
         frames = np.concatenate([density.lengths for _, density in measured])
         counts = _range([len(density.lengths) for _, density in measured])
         end = "the one that ended the episode" if options.end == "last" else "at a random step"
         note = f"{seeds} x {counts} greedy trajectories (mean length {frames.mean():.0f} frames); decision: {end}"
-        note += "; dotted: uniform memory; without memory: all in the most recent part" * (bins <= BARS_UP_TO)
-        numbers = [row for task, value in masses.items() for row in _rows(task, value, bins)]
+        note += "; dotted: uniform memory; without memory: all in the most recent part" * few
+        numbers = []
+        for (agent, game, twin), value in masses.items():
+            what = {"agent": agent, "game": game, "observability": twin, "bins": bins, "bin": np.arange(bins)}
+            numbers += style.rows_of(**what, seeds=len(value.seeds), mass=value.mean, low=value.low, high=value.high)
         arrays = _arrays(measured) if bins == options.bins[0] else {}
         made.pictures.append(Picture(f"recall-density-{bins}", figure, note, numbers, arrays))
     cells = [
-        (
-            label,
-            len(density.lengths),
-            f"{density.lengths.mean():.1f}",
-            f"{100 * density.last_share():.1f}",
-            " / ".join(f"{100 * mass:.1f}" for mass in density.mass(3)),
-        )
-        for label, density in measured
+        (label, len(one.lengths), f"{one.lengths.mean():.1f}", f"{100 * one.last_share():.1f}", _percent(one.mass(3)))
+        for label, one in measured
     ]
     head = ("run", "trajectories", "mean length", "on the last frame %", "thirds %")
     made.tables.append(Table("share of the gradient of the last decision", head, cells))
@@ -74,33 +61,29 @@ def _measure(paths: Sequence[Any], options: DensityOptions, progress: Progress |
     how = {name: getattr(options, name) for name in ("episodes", "end", "norm", "reduce", "target", "seed")}
     how["cap"] = options.max_frames
     twin = options.observability
-    every = [measure_run(path, recall_density, how, twin, tell(progress, path.name)) for path in paths]
-    found = [(label, density) for label, density in every if density.lengths.size]
-    empty = [
-        f"{label.path.name} ({density.dropped} too short, {density.silent} without gradient)"
-        for label, density in every
-        if not density.lengths.size
-    ]
+    every = measure_runs(paths, measure.recall_density, how, twin, progress)
+    found = [(label, one) for label, one in every if one.lengths.size]
+    bare = [(label.path.name, one) for label, one in every if not one.lengths.size]
+    empty = [f"{name} ({one.dropped} too short, {one.silent} without gradient)" for name, one in bare]
     if not found:
         raise ValueError(f"no trajectory is left of any checkpoint: {listed(empty)}")
     notes = [f"left out, no trajectory: {listed(empty)}"] if empty else []
     short = sum(density.dropped for _, density in found)
     notes += [f"{short} trajectories with fewer than 3 frames were left out"] if short else []
-    found = with_names(found)
     tasks = list(by_task(found))
     cells = [task[:2] for task in tasks]
     alone = [f"{agent} on {game}" for agent, game in dict.fromkeys(cells) if cells.count((agent, game)) < 2]
     return found, notes + ([f"only one twin is there: {listed(alone)}"] if alone else [])
 
 
-def _stacked_bars(measured: Densities, masses: Masses, bins: int, confidence: float) -> tuple[Any, str]:
+def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
     """Two panels, MDP and POMDP; a bar a game, all memory models and seeds pooled; the darkest part is most recent."""
     remembering = {
         task: value for task, value in masses.items() if not any(is_baseline(task[0], name) for name in MEMORY_FREE)
     } or dict(masses)
     games = list(dict.fromkeys(game for _, game, _ in remembering))
-    figure, axes = panels(1, 2, (max(8.0, 3.4 + 1.1 * len(games)), 4.2), sharey=True)
-    for axis, twin, shades in zip(axes[0], TWIN_NAMES, (MDP_THIRDS, POMDP_THIRDS), strict=True):
+    figure, axes = style.panels(1, 2, (max(8.0, 3.4 + 1.1 * len(games)), 4.2), sharey=True)
+    for axis, twin, shades in zip(axes[0], TWIN_NAMES, (style.MDP_THIRDS, style.POMDP_THIRDS), strict=True):
         drawn = [[value.mean for (_, name, t), value in remembering.items() if (name, t) == (g, twin)] for g in games]
         here = [i for i, rows in enumerate(drawn) if rows]
         parts = np.array([np.mean(drawn[i], axis=0) for i in here]).reshape(len(here), bins)
@@ -110,7 +93,7 @@ def _stacked_bars(measured: Densities, masses: Masses, bins: int, confidence: fl
             colour = shades[part] if bins == 3 else blend(part / max(1, bins - 1))
             axis.bar(here, parts[:, part], 0.7, parts[:, :part].sum(1), color=colour, label=label)
         for level in np.arange(1, bins) / bins:
-            axis.axhline(level, color=NEUTRAL, lw=0.9, ls=":", zorder=3)
+            axis.axhline(level, color=style.NEUTRAL, lw=0.9, ls=":", zorder=3)
         axis.set_xticks(range(len(games)), games, rotation=30, ha="right", rotation_mode="anchor")
         axis.set(xlim=(-0.6, len(games) - 0.4), ylim=(0, 1.05), title=TWIN_NAMES[twin])
         if here:
@@ -126,13 +109,13 @@ def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -
     agents = list(dict.fromkeys(agent for agent, _, _ in masses))
     games = list(dict.fromkeys(game for _, game, _ in masses))
     size = max(6.4, 3.4 * len(games)), 1.1 + 2.7 * len(agents)
-    figure, axes = panels(len(agents), len(games), size, sharex=True, sharey=True)
+    figure, axes = style.panels(len(agents), len(games), size, sharex=True, sharey=True)
     handles: dict[str, Any] = {}
     for agent, line in zip(agents, axes, strict=True):
         for game, axis in zip(games, line, strict=True):
             lengths = [int(n) for label, d in measured if label.task[:2] == (agent, game) for n in d.lengths]
             twins = [twin for twin in TWIN_NAMES if (agent, game, twin) in masses]
-            series = {TWIN_NAMES[twin]: (masses[agent, game, twin], TWIN_COLOURS[twin]) for twin in twins}
+            series = {TWIN_NAMES[twin]: (masses[agent, game, twin], style.TWIN_COLOURS[twin]) for twin in twins}
             plot(series, axis, bins, lengths)
             axis.set_title(f"{agent}, {game}")
             handles |= {label: handle for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
@@ -141,7 +124,7 @@ def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -
     for axis in axes[:, 0]:
         axis.set_ylabel(f"share in 1/{bins}")
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=4)
-    return figure, seeds_note([len(value.seeds) for value in masses.values()], confidence, "bands")
+    return figure, style.seeds_note([len(value.seeds) for value in masses.values()], confidence, "bands")
 
 
 def plot(series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths: Sequence[int] = ()) -> None:
@@ -151,19 +134,18 @@ def plot(series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths
         if np.isfinite(value.low).all():
             axis.stairs(value.high, edges, baseline=value.low, color=colour, alpha=0.22, fill=True, lw=0)
         axis.stairs(value.mean, edges, color=colour, label=name, ls="-" if place % 2 == 0 else (0, (4, 1)), lw=1.8)
-    axis.stairs(np.full(bins, 1 / bins), edges, color=NEUTRAL, lw=1, ls=":", label="uniform memory")
+    axis.stairs(np.full(bins, 1 / bins), edges, color=style.NEUTRAL, lw=1, ls=":", label="uniform memory")
     if len(lengths):
-        axis.stairs(no_memory(lengths, bins), edges, color=NEUTRAL, lw=1, ls="-.", label="no memory")
+        axis.stairs(measure.no_memory(lengths, bins), edges, color=style.NEUTRAL, lw=1, ls="-.", label="no memory")
     axis.set(xlim=(0, 1), ylim=(0, 1.05))
+
+
+def _percent(shares: Iterable[float]) -> str:
+    return " / ".join(f"{100 * share:.1f}" for share in shares)
 
 
 def _range(counts: Sequence[int]) -> str:
     return str(min(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-
-
-def _rows(task: tuple[str, str, str], value: Pooled, bins: int) -> list[dict[str, Any]]:
-    what = {**dict(zip(("agent", "game", "observability"), task, strict=True)), "bins": bins, "bin": np.arange(bins)}
-    return rows_of(**what, seeds=len(value.seeds), mass=value.mean, low=value.low, high=value.high)
 
 
 def _arrays(measured: Densities) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -202,7 +201,7 @@ FIGURES = {
         "--runs runs/bench.csv",
     ),
     "human": Entry(
-        PaperOptions, "human.returns", "returns of people beside those of the memory-free agent", "--out figures"
+        PaperOptions, "gap_bias.human", "returns of people beside those of the memory-free agent", "--out figures"
     ),
     "hyperparameters": Entry(
         PaperOptions, "hyperparameters.settings", "table of the settings of runs, or of the paper's preset", "--paper"
@@ -237,8 +236,3 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
         for picture in made.pictures:
             made.files += save(options, picture)
     return made
-
-
-def tell(progress: Progress | None, name: str) -> Callable[[int, int], None] | None:
-    """Progress of one part."""
-    return None if progress is None else partial(progress, name)

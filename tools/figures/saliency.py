@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_run, with_names
+from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.figures.registry import Made, Picture, Progress, SaliencyOptions
 from arcade_torch.tools.figures.style import TWIN_NAMES, rows_of
@@ -14,11 +14,9 @@ from arcade_torch.tools.optional import need
 from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.tables import Table
 
-SIGMA_PX = 6.0
-"""Width of the smoothing at 128 px, as in the paper's figures; scales with the frame."""
+SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
 
-Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]
-"""Title, frames uint8 [T, H, W, 3], maps float [T, H, W]; ends at the explained step."""
+Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]  # title, frames [T, H, W, 3], maps [T, H, W] up to step n
 
 
 def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
@@ -30,14 +28,10 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         first = [runs[0].path for runs in find_runs(paths).groups().values()]
         paths = [path for path in paths if path in first or path in options.runs]
     how = {name: getattr(options, name) for name in ("seed", "max_steps", "reduce", "norm", "target")}
-    measured = []
-    for done, path in enumerate(paths, start=1):
-        measured.append(measure_run(path, episode_saliency, how, options.observability))
-        if progress is not None:
-            progress("saliency", done, len(paths))
+    measured = measure_runs(paths, episode_saliency, how, options.observability, progress)
     drawn, cells = list[Row](), list[tuple[str, int, str]]()
     arrays, numbers = dict[str, Any](), list[dict[str, Any]]()
-    for index, (label, found) in enumerate(with_names(measured)):
+    for index, (label, found) in enumerate(measured):
         title = f"{label.agent}, {label.game} ({TWIN_NAMES[label.observability]}), seed {label.seed}"
         shares = found.shares()
         drawn.append((title, found.frames, found.maps))
@@ -50,13 +44,12 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         f"{measured[0][1].target}, brightness is its square root; no interval"
     )
     picture = Picture("saliency", saliency_figure(drawn, show=options.show), note, numbers, arrays)
-    return Made(
-        [picture], notes, [Table("gradient of the last decision", ("run", "frames", "on the last frame"), cells)]
-    )
+    table = Table("gradient of the last decision", ("run", "frames", "on the last frame"), cells)
+    return Made([picture], notes, [table])
 
 
 def saliency_figure(rows: Sequence[Row], *, show: int = 8, sigma_px: float | None = None, alpha: float = 0.5) -> Any:
-    """Draw frames with their saliency maps, a row a trajectory.
+    """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose top it names.
 
     Args:
         rows: one ``(title, frames, maps)`` each, see `Row`.
@@ -65,10 +58,7 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, sigma_px: float | Non
         alpha: weight of the heat over the frame.
 
     Returns:
-        A matplotlib figure. Each row has a scale of its own, and says the value that is drawn brightest.
-
-    Raises:
-        MissingPackage: matplotlib is not installed.
+        A matplotlib figure.
     """
     columns = min(show, max(frames.shape[0] for _, frames, _ in rows))
     figure = need("matplotlib.pyplot").figure(figsize=(1.7 * columns, 2.2 * len(rows)), layout="constrained")

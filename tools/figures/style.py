@@ -33,19 +33,12 @@ AGENT_COLOURS = {
 
 SPARE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#5e3c10", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)))
-"""Lines that lie on one another are seen both."""
-
-MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")
+DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)))  # lines that lie on one another are seen both
+MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")  # recall density: the darkest is the most recent third
 POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
-"""Recall density: the darkest is the most recent third."""
-
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
-
-CLEAN_BEST, DISTURBED_BEST, OTHER_BAR = "#354e6a", "#a33a2f", "#b3b3b3"
-"""Bars of contamination examples."""
-
+CLEAN_BEST, DISTURBED_BEST, OTHER_BAR = "#354e6a", "#a33a2f", "#b3b3b3"  # bars of contamination examples
 NEUTRAL = "#555555"
 
 _RC: dict[str, dict[str, Any]] = {
@@ -86,15 +79,12 @@ _SHARED = {
     "figure.facecolor": "white",
     "axes.titlesize": "medium",
 }
-_PRINT_SCALE = 0.62
-"""Sizes of figures are given for a screen; on a page they are so much smaller."""
+_PRINT_SCALE = 0.62  # sizes of figures are given for a screen; on a page they are so much smaller
 
 
 @contextmanager
 def drawing(style: str) -> Iterator[Any]:
     """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
-    if style not in _RC:
-        raise ValueError(f"unknown style {style!r}: allowed are {', '.join(_RC)}")
     need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
     with plt.rc_context(_SHARED | _RC[style]):
@@ -106,32 +96,25 @@ def drawing(style: str) -> Iterator[Any]:
 
 def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
     """A figure of ``size`` inches and its axes [rows, columns]; options are those of ``matplotlib.pyplot.subplots``."""
-    figure, axes = need("matplotlib.pyplot").subplots(
-        rows, columns, figsize=size, squeeze=False, layout="constrained", **options
-    )
-    return figure, axes
-
-
-def agent_colour(name: str, place: int = 0) -> str:
-    """Colour of an agent: that of its memory, or a spare one by its place in the figure."""
-    memory = name.lower().split()[0].rpartition("-")[2]
-    return AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
+    how = {"figsize": size, "squeeze": False, "layout": "constrained"} | options
+    found: tuple[Any, Any] = need("matplotlib.pyplot").subplots(rows, columns, **how)
+    return found
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for every agent: that of its memory, or a spare one where another agent has that already."""
+    """A colour for every agent: that of its memory, or a spare one where there is none or another agent has it."""
     found: dict[str, str] = {}
     for place, name in enumerate(names):
-        colour = agent_colour(name, place)
+        memory = name.lower().split()[0].rpartition("-")[2]
+        colour = AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
         free = [spare for spare in SPARE_COLOURS if spare not in found.values()]
         found[name] = free[0] if colour in found.values() and free else colour
     return found
 
 
 def whiskers(low: Any, value: Any, high: Any) -> Any:
-    """Lengths of error bars [2, n] for matplotlib; 0 where there is no interval."""
-    ends = np.array([np.asarray(value) - np.asarray(low), np.asarray(high) - np.asarray(value)])
-    return np.nan_to_num(np.maximum(ends, 0.0))
+    """Lengths of error bars [2, n] for matplotlib; NaN, which is not drawn, where there is no interval."""
+    return np.maximum([np.asarray(value) - low, np.asarray(high) - value], 0.0)
 
 
 def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:

@@ -14,8 +14,7 @@ NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "
 OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
 LIMIT = "writing the same bytes"
 
-Series = Mapping[int, float]
-"""One line: number of envs -> frames consumed per second."""
+Series = Mapping[int, float]  # one line: number of envs -> frames consumed per second
 
 
 def rates(options: Options, progress: Progress | None) -> Made:
@@ -23,7 +22,12 @@ def rates(options: Options, progress: Progress | None) -> Made:
 
     ``options.runs`` is the one file; rates have the checksum over every frame inside the clock.
     """
-    rows = read_rows(_one_file(options.runs))
+    if len(options.runs) != 1:
+        raise ValueError(
+            f"throughput is drawn from one file of `arcade-torch bench envs --out FILE.csv`, got {len(options.runs)}: "
+            "give --runs FILE.csv"
+        )
+    rows = read_rows(options.runs[0])
     sizes = sorted({int(row["obs_size"]) for row in rows})
     here = [row for row in rows if int(row["obs_size"]) == sizes[0]]
     notes = [f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"] * (len(sizes) > 1)
@@ -49,9 +53,8 @@ def rates(options: Options, progress: Progress | None) -> Made:
         axis.set_xticks(counts, [str(count) for count in counts])
         axis.minorticks_off()
         axis.set(xlabel="environments", title=title)
-        axis.legend(
-            fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2 if len(axis.lines) < 9 else 3
-        )
+        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16)}
+        axis.legend(fontsize="small", ncols=2 if len(axis.lines) < 9 else 3, **below)
     left.set_ylabel("frames/s")
     first = here[0]
     note = (
@@ -68,6 +71,8 @@ def rates(options: Options, progress: Progress | None) -> Made:
 
 def read_rows(path: Path) -> list[dict[str, str]]:
     """Rows of a benchmark's file."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: give the CSV file that `arcade-torch bench envs --out` wrote")
     rows = read_csv(path)
     missing = [name for name in NEEDED if not rows or name not in rows[0]]
     if missing:
@@ -97,17 +102,6 @@ def mean_series(rows: Sequence[Mapping[str, str]], games: Sequence[str], measure
     every = [series(rows, game, measure) for game in games]
     shared = sorted(set.intersection(*map(set, every)))
     return {count: float(np.mean([one[count] for one in every])) for count in shared}
-
-
-def _one_file(paths: Sequence[Path]) -> Path:
-    if len(paths) != 1:
-        raise ValueError(
-            f"throughput is drawn from one file of `arcade-torch bench envs --out FILE.csv`, got {len(paths)}: "
-            "give --runs FILE.csv"
-        )
-    if paths[0].is_dir():
-        raise ValueError(f"{paths[0]} is a folder: give the CSV file that `arcade-torch bench envs --out` wrote")
-    return paths[0]
 
 
 def _line(axis: Any, one: Series, colour: str, marker: str, style: str, label: str | None) -> None:

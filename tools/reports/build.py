@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import percentile_interval, resampled_means
-from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias
-from arcade_torch.tools.analysis.normalise import normalise
+from arcade_torch.tools.analysis.bootstrap import over_seeds
+from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.files import write_csv, write_text
@@ -22,15 +21,11 @@ from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
-MANY_PANELS = 8
-"""From here on pictures of learning are small."""
-MANY_ROWS = 24
-"""From here on long tables are folded away behind a short one."""
-MANY_RUNS = 48
-"""From here on the runs stand in one table, without their commands."""
+MANY_PANELS = 8  # from here on pictures of learning are small
+MANY_ROWS = 24  # from here on long tables are folded away behind a short one
+MANY_RUNS = 48  # from here on the runs stand in one table, without their commands
 
-Players = Mapping[str, Mapping[str, Baseline]]
-"""Game -> player -> what it earned."""
+Players = Mapping[str, Mapping[str, Baseline]]  # game -> player -> what it earned
 
 
 def report(
@@ -44,7 +39,7 @@ def report(
     references: bool = True,
     progress: Progress | None = None,
 ) -> Path:
-    """Write the page of a study: one HTML file that loads nothing.
+    """Write the page of a study, one HTML file that loads nothing, and return its path.
 
     Missing analyses are made on the way and kept, in the study's folder or in those of its runs, under ``analysis``. Of
     a large study only a few agents and games are looked into, and the page says which.
@@ -58,9 +53,6 @@ def report(
         contamination: whether to measure state contamination.
         references: whether to draw the returns of the random policy and the oracles.
         progress: called with (what, done, total).
-
-    Returns:
-        Path of the page.
 
     Raises:
         FileNotFoundError: ``root`` is no study.
@@ -126,12 +118,9 @@ def _learning(runs: Runs, finals: Finals, agents: Sequence[str], players: Player
     for (game, twin), by_agent in finals.items():
         sentences.append(findings.learning_sentence(game, twin, by_agent, levels.get(game, {})))
         for agent, values in by_agent.items():
-            array = np.array(values, dtype=np.float64)
-            mean = float(array.mean())
-            draws = resampled_means([array], 2000, np.random.default_rng(0))
+            mean, low, high = map(float, over_seeds(np.array(values, dtype=np.float64)))
             row: dict[str, Any] = {"game": game, "twin": TWIN_NAMES[twin], "task": f"{game}-{twin}", "agent": agent}
-            row |= {"mean": mean, "interval": percentile_interval(mean, draws, 0.95, len(values) > 1)}
-            row |= {"seeds": "  ".join(f"{value:.3f}" for value in values)}
+            row |= {"mean": mean, "low": low, "high": high, "seeds": "  ".join(f"{value:.3f}" for value in values)}
             rows.append(row | {"way": findings.way(mean, levels.get(game, {}))})
     small = len(finals) > MANY_PANELS
     return {
@@ -161,8 +150,7 @@ def _overviews(finals: Finals, agents: Sequence[str]) -> list[dict[str, Any]]:
 def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[str, Any]:
     """Gap and bias by both metrics, also written as CSV, and what they say; or why there are none."""
     baseline = study.baseline if len(study.algorithms) == 1 else f"{study.algorithms[0]}-{study.baseline}"
-    tables: dict[str, GapBias | None] = {}
-    trouble: list[str] = []
+    tables, trouble = dict[str, GapBias | None](), list[str]()
     for name in sorted(METRICS, key=lambda name: name != metric):
         try:
             table = tables[name] = gap_and_bias(runs.scores(name), metric=name, baseline=baseline)
@@ -172,11 +160,7 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
             tables[name] = None
             trouble.append(str(error))
     first, second = tables.values()
-    sentences = []
-    for row in sorted(first.rows[1:], key=lambda row: -row.pomdp.value) if first else []:
-        assert first is not None
-        sentences += [findings.gap_sentence(first, row.agent), findings.pomdp_sentence(first, row.agent)]
-        sentences += [findings.bias_sentence(row)]
+    sentences = findings.score_sentences(first) if first else []
     return {
         "table": first,
         "second": second,

@@ -5,26 +5,26 @@ from collections.abc import Mapping, Sequence
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias
 
-TRUSTED_COVERAGE = 0.85
-"""Below this measured coverage a difference is reported of the seeds that were run, not of the agent."""
-
-
+TRUSTED_COVERAGE = 0.85  # below this measured coverage a difference is one of the seeds that were run
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 def number_words(count: int) -> str:
-    """Small numbers as words.
-
-    Example:
-        >>> number_words(2), number_words(30)
-        ('two', '30')
-    """
+    """Small numbers as words."""
     return _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
 
 
 def ends(interval: Interval) -> str:
     """The interval alone, empty if there is none."""
     return "" if interval.low != interval.low else f" [{interval.low:+.2f}, {interval.high:+.2f}]"
+
+
+def score_sentences(table: GapBias) -> list[str]:
+    """Three sentences about every agent with memory, the strongest on the POMDP first."""
+    found = []
+    for row in sorted(table.rows[1:], key=lambda row: -row.pomdp.value):
+        found += [gap_sentence(table, row.agent), pomdp_sentence(table, row.agent), bias_sentence(row)]
+    return found
 
 
 def gap_sentence(table: GapBias, agent: str) -> str:
@@ -42,7 +42,9 @@ def gap_sentence(table: GapBias, agent: str) -> str:
         verb = "narrows" if narrowed.value > 0 else "widens"
         weak = min(base.coverage, row.coverage) < TRUSTED_COVERAGE
         where = f"over these {seeds} seeds memory" if weak else "memory"
-        return f"{facts}: {where} {verb} the observability gap by {abs(narrowed.value):.2f}{_size(narrowed)}."
+        low, high = sorted((abs(narrowed.low), abs(narrowed.high)))
+        by = f"{abs(narrowed.value):.2f} [{low:.2f}, {high:.2f}]"
+        return f"{facts}: {where} {verb} the observability gap by {by}."
     direction = "smaller" if narrowed.value > 0 else "larger"
     return (
         f"{facts}: with memory the gap is {abs(narrowed.value):.2f} {direction}, but the interval{ends(narrowed)} "
@@ -103,7 +105,3 @@ def learning_sentence(game: str, twin: str, finals: Mapping[str, Sequence[float]
     kind = "MDP" if twin == "full" else "POMDP"
     tail = f"; a seed of {' and of '.join(below)} did not get above random" if below else ", every seed above random"
     return f"{game} {kind}, share of the way from random to oracle: {said}{tail}."
-
-
-def _size(interval: Interval) -> str:
-    return f" [{min(abs(interval.low), abs(interval.high)):.2f}, {max(abs(interval.low), abs(interval.high)):.2f}]"

@@ -12,39 +12,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Array, Pooled, over_seeds
+from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
 from arcade_torch.tools.analysis.contamination import contamination as noise
-from arcade_torch.tools.analysis.curves import curves_of_runs
-from arcade_torch.tools.analysis.gap_bias import GapBias
-from arcade_torch.tools.analysis.normalise import normalise
+from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.analysis.recall_density import recall_density as density_of
 from arcade_torch.tools.figures import contamination, curves, gap_bias, recall_density, saliency
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, drawing, png, svg
 from arcade_torch.tools.runs import Runs, is_baseline
 
-FULL, SMALL = (4.9, 3.0), (3.3, 2.3)
-"""Sizes in inches; small ones for many tasks."""
-BINS = 8
-"""Parts of an episode, or as many as the shortest episode of a task has frames."""
+FULL, SMALL = (4.9, 3.0), (3.3, 2.3)  # inches; small ones for many tasks
+BINS = 8  # parts of an episode, or as many as the shortest episode of a task has frames
 DENSITY: Mapping[str, Any] = {"episodes": 16, "cap": 96}
-"""Options of `recall_density` for the page; a figure for a paper takes 100 whole episodes."""
 NOISE: Mapping[str, Any] = {"sigmas": (0.3,), "delays": (0, 1, 2, 5, 10, 20), "starts": 32, "cap": 96}
-"""Options of `contamination` for the page."""
-SHOW, TRIES = 8, 10
-"""Frames of a saliency strip; episodes that are tried until one has as many."""
+"""Options of `recall_density` and `contamination` for the page; a figure for a paper takes whole episodes, and more."""
+SHOW, TRIES = 8, 10  # frames of a saliency strip; episodes that are tried until one has as many
 LEVEL_NAMES = {"random": "random", "state": "oracle", "frames": "frames oracle"}
+MOST_CELLS = 12  # up to so many (game, twin, agent) are all looked into
+MOST_GAMES = MOST_SEEDS = 3
 
-MOST_CELLS = 12
-"""Up to so many (game, twin, agent) are all looked into."""
-MOST_GAMES = 3
-MOST_SEEDS = 3
-
-Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
-"""(game, twin) -> agent -> final returns of its finished seeds."""
-Levels = Mapping[str, Mapping[str, float]]
-"""Game -> player -> mean return."""
+Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]  # (game, twin) -> agent -> final returns of its seeds
+Levels = Mapping[str, Mapping[str, float]]  # game -> player -> mean return
 Progress = Callable[[str, int, int], None]
 
 
@@ -75,12 +64,11 @@ class Cell(NamedTuple):
 
 def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell], str]:
     """The cells that are looked into, and a note on those that are not."""
-    paths = {
-        key: [run.path for run in group if (run.path / "checkpoints").is_dir()] for key, group in runs.groups().items()
-    }
+    groups = runs.groups()
+    paths = {task: [run.path for run in group if (run.path / "checkpoints").is_dir()] for task, group in groups.items()}
     bare = len(runs.runs) - sum(map(len, paths.values()))
     notes = [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."] if bare else []
-    cells = [Cell(*key, tuple(found[:MOST_SEEDS])) for key, found in paths.items() if found]
+    cells = [Cell(*task, tuple(found[:MOST_SEEDS])) for task, found in paths.items() if found]
     most = max(map(len, paths.values()), default=0)
     seeds = f"the first {MOST_SEEDS} of {most} seeds" if most > MOST_SEEDS else ""
     if len(cells) <= MOST_CELLS:
@@ -118,17 +106,9 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
     return pair, there[:MOST_GAMES]
 
 
-def picture(name: str, size: tuple[float, float], plot: Callable[[Any], object]) -> str:
-    """Draw on one axis; returns an SVG element."""
-    with drawing("light") as plt:
-        figure, axis = plt.subplots(figsize=size, layout="constrained")
-        plot(axis)
-        return svg(figure, name)
-
-
 def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], small: bool) -> list[Panel]:
     """One picture a task; the twins of a game share their y axis."""
-    every, panels = curves_of_runs(runs.groups(), kind), []
+    every, panels = curves.curves_of_runs(runs.groups(), kind), []
     for game, twin in dict.fromkeys((curve.game, curve.observability) for curve in every):
         here = [curve for curve in every if (curve.game, curve.observability) == (game, twin)]
         seen = np.concatenate([curve.seeds.ravel() for curve in every if curve.game == game])
@@ -141,22 +121,27 @@ def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], s
                 near = next((name for name, at in shown.items() if abs(at - mean) < 2 * margin), None)
                 name = LEVEL_NAMES[player]
                 shown |= {name: mean} if near is None else {f"{near}, {name}": shown.pop(near)}
-
-        def plot(axis: Any) -> None:
-            curves.plot(here, axis, agents, shown)  # noqa: B023  (drawn at once)
-            axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")  # noqa: B023
-
+        with drawing("light") as plt:
+            figure, axis = plt.subplots(figsize=SMALL if small else FULL, layout="constrained")
+            curves.plot(here, axis, agents, shown)
+            axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")
+            drawn = svg(figure, f"{kind} {game}, {TWIN_NAMES[twin]}")
         counts = sorted({len(curve.seeds) for curve in here})
         seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
         caption = f"mean of {seeds}" + ("; band: interval over seeds" if counts != [1] else "")
-        drawn = picture(f"{kind} {game}, {TWIN_NAMES[twin]}", SMALL if small else FULL, plot)
         panels.append(Panel(drawn, "" if small else caption, f"{game}-{twin}"))
     return panels
 
 
 def score_panels(table: GapBias) -> list[Panel]:
     """Normalised returns on both twins, Gap and Bias."""
-    return [Panel(picture(name, FULL, partial(gap_bias.plot_bars, table.rows, name=name))) for name in gap_bias.PANELS]
+    panels = []
+    for name in gap_bias.PANELS:
+        with drawing("light") as plt:
+            figure, axis = plt.subplots(figsize=FULL, layout="constrained")
+            gap_bias.plot_bars(table.rows, axis, name)
+            panels.append(Panel(svg(figure, name)))
+    return panels
 
 
 def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[dict[str, Any]]:
@@ -189,16 +174,15 @@ def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progr
         if not found:
             raise ValueError("no episode of three frames")
         shares = [share for density in found for share in density.shares]
-        row = {"seeds": len(found), "episodes": len(shares), "length": float(np.mean([s.size for s in shares]))}
-        row |= {"last": float(np.mean([s[-1] for s in shares])), "first": float(np.mean([s[0] for s in shares]))}
-        return found, row | {"older": float(np.mean([density.mass(2)[0] for density in found]))}
+        row = {"seeds": len(found), "episodes": len(shares), "length": np.mean([s.size for s in shares])}
+        row |= {"last": np.mean([s[-1] for s in shares]), "first": np.mean([s[0] for s in shares])}
+        return found, row | {"older": np.mean([density.mass(2)[0] for density in found])}
 
     def plot(here: Mapping[str, Any], axis: Any) -> None:
         bins = min(BINS, *(int(density.lengths.min()) for found in here.values() for density in found))
-        series = {}
-        for agent, found in here.items():
-            series[agent] = (Pooled.of([density.mass(bins) for density in found]), agent_colours(agents)[agent])
-        recall_density.plot(series, axis, bins)
+        colours = agent_colours(agents)
+        masses = {agent: pooled([density.mass(bins) for density in found]) for agent, found in here.items()}
+        recall_density.plot({agent: (mass, colours[agent]) for agent, mass in masses.items()}, axis, bins)
         axis.set_xlabel("time in the episode (1: the decision)")
 
     return _section(("recall density", "recall"), cells, measure, plot, progress)
@@ -210,18 +194,18 @@ def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress
     def measure(cell: Cell, tell: Any) -> tuple[Any, dict[str, Any]]:
         measured = [measure_run(path, noise, NOISE, None, tell) for path in cell.runs]
         found = [one for _, one in measured]
-        (pooled,) = contamination.pool(by_task(measured)).values()
+        (every,) = contamination.pool(by_task(measured)).values()
         flips = np.array([item.mean("flip")[0] for item in found])
-        change = over_seeds(np.array([item.mean("change")[0] for item in found]))[0]
         later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
-        row = {"seeds": len(found), "points": sum(len(item.points) for item in found), "change": float(change[1])}
-        return pooled, row | {"at_once": _mean(flips[:, 0]), "one": _mean(flips[:, 1]), "later": _mean(later)}
+        row: dict[str, Any] = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
+        row |= {"change": every["change"].mean[0, 1], "at_once": _mean(flips[:, 0])}
+        return every, row | {"one": _mean(flips[:, 1]), "later": _mean(later)}
 
     def plot(here: Mapping[str, Any], axis: Any) -> None:
         delays = NOISE["delays"][: contamination.reached(here.values())]
         contamination.plot(here, axis, "flip", 0, delays, agent_colours(agents))
-        top = max(axis.get_ylim()[1], contamination.LEAST_SCALE)
-        axis.set(xlabel="steps after the noisy frame", ylim=(-0.05 * top, top))
+        contamination.from_zero(axis)
+        axis.set_xlabel("steps after the noisy frame")
 
     return _section(("contamination", "noise"), cells, measure, plot, progress)
 
@@ -245,16 +229,15 @@ def _section(
         tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = found
         made.rows.append({"agent": cell.agent, "game": cell.game, "twin": twin} | row)
     for (game, twin), here in tasks.items():
-        title = f"{game}, {TWIN_NAMES[twin]}"
-
-        def draw(axis: Any) -> None:
-            plot(here, axis)  # noqa: B023  (drawn at once)
-            axis.set_title(title)  # noqa: B023
-
-        made.panels.append(Panel(picture(f"{names[1]} {title}", SMALL, draw), "", f"{game}-{twin}"))
+        with drawing("light") as plt:
+            figure, axis = plt.subplots(figsize=SMALL, layout="constrained")
+            plot(here, axis)
+            axis.set_title(title := f"{game}, {TWIN_NAMES[twin]}")
+            made.panels.append(Panel(svg(figure, f"{names[1]} {title}"), "", f"{game}-{twin}"))
     return made
 
 
-def _mean(values: Array) -> float:
+def _mean(values: Any) -> float:
+    """Mean of what is not NaN; NaN of nothing."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else float("nan")

@@ -143,8 +143,6 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     policy = linear_policy(0.5, dtype=torch.float32)
     with pytest.raises(ValueError, match=message):
         contamination(policy, ToyEnv([5]), **options)
-    with pytest.raises(ValueError, match="at least two"):
-        shuffled_beginning(policy, ToyEnv([5]), first=1, last=2)
     with pytest.raises(ValueError, match="long enough: 11 frames are needed"):
         shuffled_beginning(policy, ToyEnv([5]), starts=1)
 
