@@ -46,13 +46,8 @@ class DQN(Learner):
 
     def __init__(self, network: TensorDictModuleBase, config: DQNConfig, training: Training) -> None:
         has_target = config.target_every > 0
-        loss = DQNLoss(
-            network,
-            time_limit=config.time_limit,
-            burn_in=config.burn_in,
-            delay_value=has_target,
-            functional=has_target,
-        )
+        options: Any = {"burn_in": config.burn_in, "delay_value": has_target, "functional": has_target}
+        loss = DQNLoss(network, time_limit=config.time_limit, **options)
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
         if has_target:

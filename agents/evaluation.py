@@ -76,7 +76,7 @@ def evaluate(
     seed: int = 0,
     env: Any = None,
 ) -> EvalResult:
-    """Play greedily and report the first finished episode of each of ``episodes`` fresh environments.
+    """Play greedily; gives returns and lengths of the first finished episode of each of ``episodes`` environments.
 
     Every environment contributes exactly one episode, so long episodes count as much as short ones.
 
@@ -88,9 +88,6 @@ def evaluate(
         seed: evaluation seed in [0, 2**30); the same seed plays the same episodes for every agent. Disjoint from all
             training seeds, see :func:`held_out_seed`.
         env: environments from :func:`make_eval_env` to use again (saves compiling); their number replaces ``episodes``.
-
-    Returns:
-        Returns and lengths.
 
     Raises:
         ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is unknown.

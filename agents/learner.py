@@ -135,13 +135,7 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """RAdam (PQN, DQN; eps 1e-8) or Adam (PPO; eps 1e-5) with the constants of the paper: betas 0.9, 0.999, no decay.
 
-    Args:
-        parameters: what to train.
-        learning_rate: initial step size; :func:`set_learning_rate` moves it.
-        kind: which of the two.
-
-    Returns:
-        The optimiser, multi-tensor; on CUDA with a step size that a graph can read.
+    On CUDA the step size, which :func:`set_learning_rate` moves, is a tensor that a graph can read.
 
     Source: Liu et al., "On the variance of the adaptive learning rate and beyond", arXiv 1908.03265;
     Kingma & Ba, arXiv 1412.6980.
@@ -175,10 +169,8 @@ class FusedRAdam(torch.optim.Adam):
         factor = (length - 4) * (length - 2) * largest / ((largest - 4) * (largest - 2) * length)
         group["lr"] = lr * math.sqrt(factor) if length > 5 else 0.0  # 0: only the averages move
         group["eps"] = eps / math.sqrt(correction)
-        try:
-            result = super().step(closure)
-        finally:
-            group["lr"], group["eps"] = lr, eps
+        result = super().step(closure)
+        group["lr"], group["eps"] = lr, eps
         if length <= 5:
             for parameter, state in self.state.items():
                 parameter.add_(state["exp_avg"], alpha=-lr / (1 - beta1**t))

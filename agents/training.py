@@ -330,12 +330,8 @@ class _Run:
             "frames": self.trainer.frames,
             "seconds": self.trainer.seconds,
             "eval_seconds": time.perf_counter() - began,
-            "mean": result.mean,
-            "std": result.std,
-            "ci": result.ci,
-            "train_max_ewm": score,
-            "returns": result.returns.tolist(),
-            "lengths": result.lengths.tolist(),
+            **{"mean": result.mean, "std": result.std, "ci": result.ci, "train_max_ewm": score},
+            **{"returns": result.returns.tolist(), "lengths": result.lengths.tolist()},
         }
         write_json(self.folder.path / "eval.json", final)
         self._report("finished", mean=result.mean)
