@@ -169,4 +169,4 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
         raise CheckpointError(f"the weights in {checkpoint.path} do not fit the network: {reason}") from error
     if device is None:
         device = config.device if config.device == "cpu" or torch.cuda.is_available() else "cpu"
-    return Agent(config, network.to(device), checkpoint.frames).eval()
+    return Agent(config, network.to(device), checkpoint.frames).eval()  # type: ignore[no-any-return]
