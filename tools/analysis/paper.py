@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.normalise import SIGNED_GAMES, game_of
+from arcade_torch.tools.files import read_csv
 
 PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
 """Mean and standard deviation of 9 agents on 30 tasks and both twins, raw, rounded to two decimals."""

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.analysis.normalise import DIFFICULTIES
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress
 from arcade_torch.tools.figures.style import TWIN_COLOURS, agent_colour, panels
+from arcade_torch.tools.files import read_csv
 
 
 def returns(options: PaperOptions, progress: Progress | None) -> Made:

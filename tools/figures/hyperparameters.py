@@ -5,9 +5,9 @@ from typing import Any, get_args, get_type_hints
 
 from arcade_torch.agents import preset
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress
 from arcade_torch.tools.figures.style import panels
+from arcade_torch.tools.files import write_text
 from arcade_torch.tools.runs import find_runs, flatten
 
 NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
@@ -41,7 +41,7 @@ def settings(options: PaperOptions, progress: Progress | None) -> Made:
     lines = [f"| {' | '.join(line)} |" for line in (head, *table)]
     lines.insert(1, f"|{'---|' * len(head)}")
     base, _ = options.path("hyperparameters")
-    page = write_atomic(base.with_suffix(".md"), "\n".join(lines) + "\n")
+    page = write_text(base.with_suffix(".md"), "\n".join(lines) + "\n")
     return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=[page])
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.figures.registry import Made, Options, Picture, Progress
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, SPARE_COLOURS, panels, rows_of
+from arcade_torch.tools.files import read_csv
 
 NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "frames_per_s_with_check")
 OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
