@@ -323,7 +323,7 @@ class _Run:
     def _finish(self) -> TrainResult:
         began = time.perf_counter()
         result = self._evaluate()
-        history = read_csv(self.folder.path / "metrics.csv")
+        history = read_csv(self.folder.path / "metrics.csv", strict=False)
         score = paper_score([int(r["frames"]) for r in history], [float(r["train_return_last"]) for r in history])
         final = {
             "status": "finished",

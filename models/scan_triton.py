@@ -11,7 +11,7 @@ line that is fetched is used whole. 64 steps make 8 KiB of each tensor on their 
 256 programs of B = 16 and H = 512 that is 4 MiB of inputs, more than what a fast card needs in flight to be busy
 (3 TB/s at a delay of 1 us: 3 MB), where one step at a time would have 64 KiB. With 4 warps a thread holds 16 entries of
 a real chunk; compiled for sm_80 and sm_90, no kernel spills registers. How fast it is on a card has not been measured;
-``arcade-torch bench memory`` does it where there is one.
+``arcade-torch bench memory --device cuda`` does it where there is one.
 
 Like every parallel form it multiplies factors of several steps. Where |a| is far above 1 such a product can overflow
 though no state does; memories have |a| <= 1.

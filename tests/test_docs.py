@@ -138,20 +138,15 @@ def test_every_command_is_one_that_the_parser_takes(words: tuple[str, ...], monk
     imports, rest = extensions.take_imports(list(words))
     assert all(Path(path).is_file() for path in imports)
     command, options = cli.split_command(rest)
-    module = importlib.import_module(f"arcade_torch.tools.commands.{cli.COMMANDS[command].module}")
     try:
-        if hasattr(module, "parse"):
-            module.parse(options, f"arcade-torch {command}")
-        else:
-            cli.parse(module.COMMAND, options, f"arcade-torch {command}")
+        cli.read_command(command, options)
     except SystemExit as stop:
         assert "--help" in options and not stop.code
 
 
 def test_the_parser_refuses_what_does_not_exist() -> None:
-    module = importlib.import_module("arcade_torch.tools.commands.list")
     with pytest.raises(ValueError, match="--stepps"):
-        cli.parse(module.COMMAND, ["--stepps", "3"], "arcade-torch list")
+        cli.read_command("list", ["--stepps", "3"])
 
 
 def test_every_command_in_a_sentence_exists() -> None:

@@ -12,12 +12,12 @@ from tensordict import TensorDict
 import arcade_torch
 from arcade_torch.agents import TrainConfig, load, preset
 from arcade_torch.agents.runs.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
-from arcade_torch.agents.runs.files import CsvLog, checksum, is_final
+from arcade_torch.agents.runs.files import CsvLog, checksum, is_final, read_csv, read_json
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools.figures.curves import curves_of_runs
 from arcade_torch.tools.figures.throughput import read_rows
-from arcade_torch.tools.files import read_csv, read_json, write_between
-from arcade_torch.tools.name_value import name_and_value
+from arcade_torch.tools.files import write_between
+from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
 from arcade_torch.tools.runs import Run, find_runs, read_scores
 from arcade_torch.tools.studies.folder import StudyFolder

@@ -37,16 +37,16 @@ class Command(NamedTuple):
 
 
 COMMANDS: dict[str, Command] = {
-    "demo": Command("demo", "small study of one game: learning, gap, bias and saliency in one HTML page"),
+    "demo": Command("study", "small study of one game: learning, gap, bias and saliency in one HTML page"),
     "list": Command("list", "games, memory models, what scripted players earn, and pictures of the games"),
     "train": Command("train", "train one agent into a run folder"),
     "evaluate": Command("evaluate", "greedy returns of a trained agent"),
     "study": Command("study", "run a grid of trainings from one TOML file, resumable run by run"),
-    "report": Command("report", "write the HTML page of a study"),
+    "report": Command("study", "write the HTML page of a study"),
     **{f"analyze {name}": Command("figure", entry.summary) for name, entry in FIGURES.items() if entry.analysis},
     **{f"figure {name}": Command("figure", entry.summary) for name, entry in FIGURES.items()},
     "play": Command("play", "play a game by hand, in a window or in the terminal"),
-    "record": Command("record", "a GIF or MP4 of a random, scripted or trained player"),
+    "record": Command("play", "a GIF or MP4 of a random, scripted or trained player"),
     **{f"bench {name}": Command("bench", summary) for name, summary in BENCHES.items()},
     "bench all": Command("bench", "every benchmark into one file, and a page of its tables"),
     "bench compare": Command("bench", "what became better or worse between two such files"),
@@ -69,10 +69,7 @@ arcade-torch COMMAND --help explains a command and gives an example.
 
 
 def split_command(words: Sequence[str]) -> tuple[str, list[str]]:
-    """Separate the name of the command from its options.
-
-    Raises:
-        ValueError: there is no such command; names the nearest.
+    """Separate the name of the command from its options; a ``ValueError`` names the nearest if there is none.
 
     Example:
         >>> split_command(["analyze", "gap-bias", "runs/demo"])
@@ -102,15 +99,25 @@ def _terminate(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
+def command_class(name: str) -> Any:
+    """The dataclass of a command; where options decide more than tyro reads, `read_command` asks its module."""
+    module = import_module(f"arcade_torch.tools.commands.{COMMANDS[name].module}")
+    return module.COMMANDS.get(name) or next(iter(module.COMMANDS.values()))
+
+
+def read_command(name: str, options: Sequence[str]) -> Any:
+    """A command with its options, ready to ``run``; a ``ValueError`` says in one line what cannot be read."""
+    module, prog = import_module(f"arcade_torch.tools.commands.{COMMANDS[name].module}"), f"arcade-torch {name}"
+    command = module.parse(options, prog) if hasattr(module, "parse") else parse(command_class(name), options, prog)
+    command.argv = tuple(options)
+    return command
+
+
 def _run(words: Sequence[str], state: dict[str, Any]) -> int:
     name, options = split_command(words)
     load_extensions(state["imports"])
-    module = import_module(f"arcade_torch.tools.commands.{COMMANDS[name].module}")
-    prog = f"arcade-torch {name}"
-    command = module.parse(options, prog) if hasattr(module, "parse") else parse(module.COMMAND, options, prog)
-    command.argv = tuple(options)
-    state["command"] = command
-    return int(command.run() or EXIT_OK)
+    state["command"] = read_command(name, options)
+    return int(state["command"].run() or EXIT_OK)
 
 
 def _report(error: Exception) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.tools.files import write_bytes
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.optional import need
 
 Picture = npt.NDArray[np.uint8]
@@ -77,7 +77,7 @@ def write_png(picture: Picture, path: Path) -> Path:
     """Write a picture as PNG, atomically and without loss."""
     buffer = io.BytesIO()
     need("PIL.Image").fromarray(picture).save(buffer, format="PNG", optimize=True)
-    return write_bytes(path, buffer.getvalue())
+    return write_atomic(path, buffer.getvalue())
 
 
 def _joined(pictures: Sequence[Picture], axis: int) -> Picture:

@@ -14,13 +14,7 @@ VARIABLE = "ARCADE_TORCH_IMPORT"
 
 
 def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate ``--import`` from a command line.
-
-    Returns:
-        What to import (files as absolute paths), and the remaining words.
-
-    Raises:
-        ValueError: ``--import`` stands at the end, with nothing to import.
+    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the remaining words.
 
     Example:
         >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
@@ -40,10 +34,7 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def load_extensions(names: Sequence[str] = ()) -> None:
-    """Import what registers games or memory models, each once a process, and everything that a parent process did.
-
-    Args:
-        names: files ending in ``.py``, or modules on the import path.
+    """Import files and modules that register games or memory models, once a process, and all that a parent process did.
 
     Raises:
         FileNotFoundError: there is no such file or module.

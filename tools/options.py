@@ -1,5 +1,6 @@
-"""Options of a command, read into its dataclass by tyro."""
+"""Options of a command, read into its dataclass by tyro; whole numbers, and NAME=VALUE."""
 
+import json
 import re
 from collections.abc import Sequence
 from contextlib import redirect_stderr
@@ -39,12 +40,7 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
 
 
 def flatten_parser_message(text: str, prog: str) -> str:
-    """Turn the framed message of the option parser into one line.
-
-    Args:
-        text: what the parser wrote to stderr.
-        prog: the command, for example ``arcade-torch train``.
-    """
+    """Turn the framed message that the option parser wrote to stderr into one line."""
     parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", text))]
     said = [part for part in parts if part and part not in _TITLES] or ["the options could not be read"]
     near = [part.split()[3] for part in said if part.startswith("Perhaps you meant: ")]
@@ -73,9 +69,6 @@ def _registry() -> Any:
 def whole_number(text: str) -> int:
     """A whole number, also as 2e7 or 40_000.
 
-    Raises:
-        ValueError: the text is none.
-
     Example:
         >>> whole_number("2e7"), whole_number("40_000")
         (20000000, 40000)
@@ -86,3 +79,19 @@ def whole_number(text: str) -> int:
         return int(text)
     except ValueError:
         raise ValueError(f"{text!r} is no whole number") from None
+
+
+def name_and_value(text: str) -> tuple[str, Any]:
+    """Read ``NAME=VALUE``; the value as JSON where it is JSON, otherwise as a word.
+
+    Example:
+        >>> name_and_value("tail=previous"), name_and_value("random_start=True")
+        (('tail', 'previous'), ('random_start', True))
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name:
+        raise ValueError(f"an option is written NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value.lower() if value in ("True", "False") else value)
+    except (ValueError, RecursionError):  # no JSON, or numbers and nesting that Python does not read
+        return name, value

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.files import read_csv, read_json, write_csv, write_json
+from arcade_torch.agents.runs.files import read_csv, read_json, write_json
+from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.tables import markdown_table
 
 PLAYERS = ("random", "state", "frames")
 """Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
@@ -104,14 +106,12 @@ def markdown(rows: Iterable[Baseline]) -> str:
     games: dict[str, dict[str, Baseline]] = {}
     for row in rows:
         games.setdefault(row.id, {})[row.player] = row
-    lines = [
-        "| id | random | state oracle | frames oracle | highest | steps: random, state, frames | episodes |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    columns = ("id", "random", "state oracle", "frames oracle", "highest", "steps: random, state, frames", "episodes")
+    lines = []
     for id, by_player in games.items():
         found = [by_player.get(player) for player in PLAYERS]
-        returns = " | ".join(f"{r.mean:.3f} ± {r.half_width:.3f}" if r else "" for r in found)
+        returns = [f"{r.mean:.3f} ± {r.half_width:.3f}" if r else "" for r in found]
         steps = ", ".join(f"{r.steps:.0f}" if r else "" for r in found)
         count = ", ".join(dict.fromkeys(f"{r.episodes}" for r in found if r))
-        lines.append(f"| `{id}` | {returns} | {make(id).return_range[1]:.4g} | {steps} | {count} |")
-    return "\n".join(lines)
+        lines.append([f"`{id}`", *returns, f"{make(id).return_range[1]:.4g}", steps, count])
+    return markdown_table(columns, lines)

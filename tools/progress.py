@@ -17,7 +17,7 @@ LINE_EVERY_S = 15.0
 
 @dataclass
 class Speed:
-    """Frames per second over a sliding window."""
+    """How fast frames come, over a sliding window."""
 
     window_s: float = WINDOW_S
     seen: deque[tuple[float, int]] = field(default_factory=deque)
@@ -29,6 +29,12 @@ class Speed:
             self.seen.popleft()
         span = now_s - self.seen[0][0]
         return max(0.0, (frames - self.seen[0][1]) / span) if span > 0 else 0.0
+
+    def words(self, frames: int, total: int) -> str:
+        """Speed and time left, after a comma; nothing as long as there is no speed."""
+        speed = self.update(time.monotonic(), frames)
+        left = f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
+        return f", {speed:,.0f} frames/s{left}" if speed > 0 else ""
 
 
 def clock(seconds: float) -> str:
@@ -44,11 +50,7 @@ def clock(seconds: float) -> str:
 
 
 class Bars:
-    """Shows how much of each named part is done; use it as a context manager.
-
-    Args:
-        stream: where to write, stderr by default.
-        first_line_s: seconds until the first line.
+    """Shows on stderr, or another stream, how much of each named part is done; use it as a context manager.
 
     Example:
         >>> with Bars() as bars:
@@ -78,15 +80,7 @@ class Bars:
             self._bars.stop()
 
     def update(self, name: str, done: int, total: int | None, text: str = "", line: str = "") -> None:
-        """Show how much of a part is done.
-
-        Args:
-            name: of the part.
-            done: how much is done.
-            total: of how much; None where nobody knows.
-            text: behind the bar.
-            line: what to print where there are no bars; ``name: done of total`` by default.
-        """
+        """Show how much of a part is done; ``text`` stands behind its bar, ``line`` is for where there are no bars."""
         now = time.monotonic()
         if self._bars is not None:
             if name not in self._tasks:
@@ -110,12 +104,7 @@ class Bars:
 
 
 class TrainBar(Bars):
-    """Shows the rows of ``metrics.csv`` as they come; use it as a context manager and give `show` to ``train``.
-
-    Args:
-        title: name of the run.
-        stream: where to write, stderr by default.
-    """
+    """Shows the rows of ``metrics.csv`` as they come; use it as a context manager and give `show` to ``train``."""
 
     def __init__(self, title: str, stream: Any = None) -> None:
         super().__init__(stream, first_line_s=0.0)
@@ -124,9 +113,7 @@ class TrainBar(Bars):
     def show(self, row: Mapping[str, Any]) -> None:
         """Show one update: a row of ``metrics.csv`` with ``total_frames``."""
         frames, total, reached = int(row["frames"]), int(row["total_frames"]), standing(row)
-        speed = self.speed.update(time.monotonic(), frames)
-        pace = f", {speed:,.0f} frames/s" if speed > 0 else ""
-        pace += f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
+        pace = self.speed.words(frames, total)
         line = f"{frames:,} of {total:,} frames{pace}; {reached}"
         self.update(self.title, frames, total, f"{pace}  {reached}".lstrip(", "), line)
 
@@ -143,10 +130,7 @@ _SHOWN = {
 
 
 def standing(row: Mapping[str, Any]) -> str:
-    """How a run stands, in a few words: returns, loss, exploration, step size; what there is not yet is left out.
-
-    Args:
-        row: of ``metrics.csv``, with ``eval_return``.
+    """How a run stands by a row of ``metrics.csv``, in a few words; what there is not yet is left out.
 
     Example:
         >>> standing({"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "epsilon": 0.2, "lr": 5e-5})

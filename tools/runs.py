@@ -11,8 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.runs import files as run_files
-from arcade_torch.tools.files import read_csv, read_json
+from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 
 METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
@@ -78,11 +77,8 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
     for key in every:
         same = [other for other in every if other.memory == key.memory]
         name = f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
-        parts = (
-            [key.size or preset_size(key.network or "paper")]
-            if sized or len({other.size for other in same}) > 1
-            else []
-        )
+        several = sized or len({other.size for other in same}) > 1
+        parts = [key.size or preset_size(key.network or "paper")] if several else []
         parts += [key.network] if len(networks) > 1 and key.network else []
         shared = set.intersection(*(set(other.options) for other in same))
         parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
@@ -140,7 +136,7 @@ class Run:
             values = read_json(self.path / "eval.json")
         except (OSError, ValueError):
             return None
-        return values if run_files.is_final(values, ("mean", "returns")) else None
+        return values if is_final(values, ("mean", "returns")) else None
 
     def progress(self) -> tuple[int, int, str]:
         """Frames done, frames wanted, and status, of ``progress.json``; zeros if there is none to read."""
@@ -152,7 +148,7 @@ class Run:
 
     def table(self, name: str) -> list[dict[str, str]]:
         """Rows of ``metrics.csv`` or ``eval.csv``; none if there is no such file."""
-        return run_files.read_csv(file) if (file := self.path / name).exists() else []
+        return read_csv(file, strict=False) if (file := self.path / name).exists() else []
 
     @cached_property
     def key(self) -> AgentKey:

@@ -1,9 +1,8 @@
-"""Tables: on the terminal, in Markdown, as CSV."""
+"""Tables: on the terminal, in Markdown."""
 
-import csv
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,11 +68,3 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: 
     left = len(columns) if left is None else left
     lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (columns, *rows)]
     return "\n".join([lines[0], "|---" * left + "|---:" * (len(columns) - left) + "|", *lines[1:]])
-
-
-def print_csv(rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows as CSV to stdout."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    writer = csv.DictWriter(sys.stdout, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)

@@ -1,21 +1,15 @@
 """What a result was made with."""
 
-import contextlib
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from arcade_torch.agents.runs import folder
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package, its commit, Python and the packages that decide a result, those that are installed."""
-    from arcade_torch import __version__
-
-    found = {"arcade-torch": __version__, "commit": commit(), "python": platform.python_version()}
-    for name in ("torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy"):
-        with contextlib.suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found | {"platform": f"{platform.system()} {platform.machine()}"}
+    """Versions of what decides a result, the commit of this package, and the platform."""
+    return folder.versions() | {"commit": commit(), "platform": f"{platform.system()} {platform.machine()}"}
 
 
 def commit() -> str:

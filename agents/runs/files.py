@@ -2,9 +2,11 @@
 
 import csv
 import hashlib
+import io
 import json
 import os
 import re
+import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,20 +19,23 @@ class CheckpointError(RuntimeError):
         super().__init__(" ".join(message.splitlines()))  # names of files may have line breaks
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Replace a text file in one step: readers see the old content or the new, never a part."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+def write_atomic(path: Path, data: str | bytes) -> Path:
+    """Replace a file in one step: readers see the old content or the new, never a part; missing folders are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Others may write the same file on another machine; names may be as long as the system allows.
+    temporary = path.with_name(f".{path.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}")
     try:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
         os.replace(temporary, path)
     except BaseException:  # a full disk, for one
         temporary.unlink(missing_ok=True)
         raise
+    return path
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Any) -> Path:
     """Replace a JSON file in one step."""
-    write_atomic(path, json.dumps(value, indent=1) + "\n")
+    return write_atomic(path, json.dumps(value, indent=1, default=str) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -70,7 +75,7 @@ class CsvLog:
 
     def __init__(self, path: Path, columns: Sequence[str], keep_frames: int = 0) -> None:
         self.path, self.columns = path, list(columns)
-        rows = read_csv(path) if path.exists() else []
+        rows = read_csv(path, strict=False) if path.exists() else []
         kept = [[row.get(name, "") for name in columns] for row in rows if int(row["frames"]) <= keep_frames]
         write_atomic(path, "".join(",".join(cells) + "\n" for cells in [columns, *kept]))
         self._stream = path.open("a", newline="", encoding="utf-8")
@@ -85,20 +90,37 @@ class CsvLog:
         self._stream.close()
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """Rows of a table (else ``ValueError``) whose first column is ``frames``, without unfinished or damaged ones."""
+def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
+    """Rows of a table with a header.
+
+    Args:
+        path: the file.
+        strict: refuse a line of another length; else the file is a log, its first column is ``frames``, and unfinished
+            or damaged lines are left out.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no text, has no header or a name twice in it, or has such a line.
+    """
     try:
-        text = path.read_text(encoding="utf-8")
-        rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines()))
+        with path.open(newline="", encoding="utf-8") as file:
+            text = file.read()
+        text = text if strict else text[: text.rfind("\n") + 1]
+        header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is damaged, it is no table: {error}") from error
-    if not rows:
-        return []
-    header = rows[0]
-    if header.count("frames") != 1 or header[0] != "frames":
-        raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
-    whole = [row for row in rows[1:] if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])]
-    return [dict(zip(header, row, strict=True)) for row in whole]
+        raise ValueError(f"{path} is {'not CSV in UTF-8' if strict else 'damaged, it is no table'}: {error}") from error
+    if not strict:
+        if header and (header.count("frames") != 1 or header[0] != "frames"):
+            raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
+        rows = [row for row in rows if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])]
+    elif not header:
+        raise ValueError(f"{path} is empty: expected CSV with a header line")
+    elif len(set(header)) != len(header) or any(name.splitlines() not in ([name], []) for name in header):
+        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
+    elif wrong := next((row for row in rows if len(row) != len(header)), None):
+        which = "more" if len(wrong) > len(header) else "fewer"
+        raise ValueError(f"{path} has a line with {which} cells than its header names")
+    return [dict(zip(header, row, strict=True)) for row in rows]
 
 
 def _cell(value: Any) -> str:

@@ -129,6 +129,7 @@ def wait_until_free(path: Path, limit_s: float) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    others = {name: importlib.metadata.version(name) for name in ("torch", "torchrl", "tensordict", "jax", "numpy")}
-    return {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__, **others}
+    """Versions of this package, Python and the packages that decide a result."""
+    others = ("torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy")
+    found = {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__}
+    return found | {name: importlib.metadata.version(name) for name in others}

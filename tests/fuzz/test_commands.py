@@ -6,7 +6,6 @@ import io
 import os
 import random
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -30,8 +29,7 @@ def _nothing_runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     patch = pytest.MonkeyPatch()
     patch.chdir(tmp_path_factory.mktemp("commands"))
     for name in cli.COMMANDS:
-        module = import_module(f"arcade_torch.tools.commands.{cli.COMMANDS[name].module}")
-        patch.setattr(module.COMMAND, "run", lambda self: 0)
+        patch.setattr(cli.command_class(name), "run", lambda self: 0)
     yield
     assert not list(Path().iterdir()), "parsing wrote files"
     patch.undo()
@@ -50,8 +48,7 @@ def main(words: list[str]) -> None:
 
 
 def _words(rng: random.Random, name: str) -> list[str]:
-    module = import_module(f"arcade_torch.tools.commands.{cli.COMMANDS[name].module}")
-    flags = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(module.COMMAND)]
+    flags = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(cli.command_class(name))]
     flags += ["--help", "--pqn.gamma", "--env", "--total-frames", "--no-report", "-h", "--", "-x", "--debug=1", "--im"]
     words = name.split()
     for _ in range(rng.randrange(5)):

@@ -179,8 +179,7 @@ def test_benchmark_files_are_compared_or_refused(tmp_path_factory: pytest.TempPa
 
     def look() -> None:
         found = read_results(file)
-        for change in compare(RESULTS, found):
-            change.verdict(0.2), change.line()
+        compare(RESULTS, found, 0.2)
         page(found)
 
     attempt("bench compare", look)

@@ -26,9 +26,10 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from arcade_torch.agents.runs.files import read_csv, write_atomic
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.tools.bench.registry import TABLES
-from arcade_torch.tools.files import read_csv, write_csv, write_text
+from arcade_torch.tools.files import write_csv
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
@@ -83,11 +84,11 @@ def stages(folder: Path, device: str) -> list[Stage]:
         for form in FORMS[:1] if tiny else FORMS:
             bench(f"train-{network}-{form}", "--networks", network, "--forms", form, "--device", device, *short)
     memory = ("gru", "--steps", "8", "--layers", "1", "--size", "8", "--batch", "2", "--frames", "4", *turns)
-    bench("memory", *(memory if tiny else ("--layers", "1")))
+    bench("memory", *(memory if tiny else ("--layers", "1")), "--device", device)
     for game in () if tiny else games[2:]:
         bench(f"envs-{game}", "--games", game, "--batches", *sizes, *turns)
     for name, plan in studies(games, device).items():
-        toml = write_text(folder / f"study-{name}.toml", "".join(f"{key} = {value}\n" for key, value in plan.items()))
+        toml = write_atomic(folder / f"study-{name}.toml", "".join(f"{key} = {value}\n" for key, value in plan.items()))
         words = ("-m", "arcade_torch.tools", "study", str(toml), "--out", str(folder / f"study-{name}"), "--no-report")
         words += ("--engine", "inline") if tiny else ("--engine", "processes", "--workers", "4")
         found.append(Stage(f"study-{name}", words, resumes=True))
@@ -126,7 +127,7 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
         state[stage.name] = found
         (folder / f"{stage.name}.failed").unlink(missing_ok=True)
         if not goes_on:
-            write_text(folder / f"{stage.name}.{found}", f"exit code {code}, {took:.0f} s\n")
+            write_atomic(folder / f"{stage.name}.{found}", f"exit code {code}, {took:.0f} s\n")
         print(f"{stage.name}: {found}, {took:.0f} s", flush=True)
         if found == "failed":
             print(*tail(folder / f"{stage.name}.log"), sep="\n", flush=True)
@@ -234,7 +235,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no stage is called {' or '.join(options.only)}; there are {', '.join(s.name for s in found)}")
     state = run(chosen, folder, 60 * options.minutes)
     command = f"make gpu DEVICE={options.device}"
-    print(write_text(options.page or folder / "gpu.md", page(folder, state, command)))
+    print(write_atomic(options.page or folder / "gpu.md", page(folder, state, command)))
     left = Counter(state.values())
     print(", ".join(f"{count} {name}" for name, count in left.items()))
     return 1 if left["failed"] else 0 if left["done"] == len(state) else 2

@@ -1,6 +1,5 @@
 """``make gpu`` rehearsed on the CPU: every stage in a tiny form, what a second call does, and the page."""
 
-import importlib
 import re
 import subprocess
 import sys
@@ -8,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.registry import TABLES
-from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.studies.grid import Study
 from tests.gpu import stages
 from tests.gpu.stages import ROOT, Stage, run
@@ -57,9 +56,7 @@ def test_every_command_for_a_card_is_one_that_the_parser_takes(tmp_path: Path) -
     for stage in found:
         if "arcade_torch.tools" in stage.argv:
             command, options = cli.split_command(stage.argv[2:])
-            module = importlib.import_module(f"arcade_torch.tools.commands.{cli.COMMANDS[command].module}")
-            prog = f"arcade-torch {command}"
-            module.parse(options, prog) if hasattr(module, "parse") else cli.parse(module.COMMAND, options, prog)
+            cli.read_command(command, options)
     runs = Study.load(tmp_path / "study-small.toml")
     assert len(runs.runs()) == 20 and {runs.config(run).device for run in runs.runs()} == {"cuda"}
     paper = Study.load(tmp_path / "study-paper.toml")

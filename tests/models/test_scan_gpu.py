@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from arcade_torch.models.scan import _back_end_of, back_end
-from arcade_torch.tools.bench.back_ends import bench_back_ends
+from arcade_torch.tools.bench.memory import COPY, bench_scans
 from tests.models.scan_cases import LENGTHS, assert_equals_the_loop, assert_nothing_crosses_a_start, problem
 
 DTYPES = [torch.float32, torch.float64, torch.complex64, torch.complex128]
@@ -50,8 +50,12 @@ def test_without_triton_the_doubling_form_is_the_loop_too(dtype: torch.dtype, de
 
 @NEEDS_TRITON
 def test_long_scans_beat_the_doubling_form_and_are_compared_with_a_copy(cuda: str) -> None:
-    rows = list(bench_back_ends(torch.device(cuda), (1024,), names=("triton", "doubling")))
-    for ours, doubling in zip(rows[::2], rows[1::2], strict=True):
-        assert ours.error < 1e-4
-        assert ours.forward_ms < doubling.forward_ms and ours.backward_ms < doubling.backward_ms
-        warnings.warn(f"{ours}", stacklevel=1)  # shown at the end of the run
+    rows = list(bench_scans(16, 1024, 512, torch.device(cuda), 0.1, 3))
+    for numbers in ("real", "complex"):
+        ours, doubling, copy = (
+            next(row for row in rows if (row["form"], row["numbers"]) == (form, numbers))
+            for form in ("triton", "doubling", COPY)
+        )
+        assert ours["error"] < 1e-4
+        assert ours["forward_ms"] < doubling["forward_ms"] and ours["both_ms"] < doubling["both_ms"]
+        warnings.warn(f"{ours}; a copy: {copy}", stacklevel=1)  # shown at the end of the run

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
-from arcade_torch.tools.files import write_text
 from arcade_torch.tools.versions import versions
 from tests.parity.faults import FAULTS, Fault, take_all
 
@@ -122,7 +122,7 @@ def main() -> None:
     head, found, rest = page.partition(BEGIN)
     if not found or END not in rest:
         raise SystemExit(f"{PAGE} has no place for the effects: a line {BEGIN!r} and below it a line {END!r}")
-    write_text(PAGE, head + BEGIN + text + END + rest.partition(END)[2])
+    write_atomic(PAGE, head + BEGIN + text + END + rest.partition(END)[2])
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
-from arcade_torch.tools.files import write_text
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.versions import versions
 from tests.parity.reference import PACKAGE
 from tests.parity.translations import TASKS
@@ -61,7 +61,7 @@ def write(path: Path, rows: Mapping[str, Row]) -> str:
     made = ", ".join(f"{name} {value}" for name, value in {**versions(), PACKAGE: version(PACKAGE)}.items())
     text = HEAD.format(published=version(PACKAGE)) + "\n".join([*lines, line("all", (total[0], total[1]))])
     text += f"\n\nMade with {made}.\n"
-    write_text(path, text)
+    write_atomic(path, text)
     return text
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from arcade_torch.tools.files import read_csv, read_json
+from arcade_torch.agents.runs.files import read_csv, read_json
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 RUNS = 24

@@ -21,12 +21,12 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
     monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")
     words = ["--networks", "small", "--memories", "gru", "--env", "SignpostEasy", "--grad-steps", "2", "--repeats", "1"]
     words += ["--forms", "amp", "compiled+amp"]
-    assert cli.main(["bench", "train", *words, "--note", "loaded machine", "--out", str(file)]) == cli.EXIT_OK
+    assert cli.main(["bench", "train", *words, "--out", str(file)]) == cli.EXIT_OK
     with file.open(newline="") as stream:
         row, compiled = csv.DictReader(stream)
     assert (row["form"], compiled["form"]) == ("amp", "compiled+amp")
     assert float(compiled["train_fps"]) > 0
-    assert (row["memory"], row["num_envs"], row["grad_steps"], row["note"]) == ("gru", "8", "8", "loaded machine")
+    assert (row["memory"], row["num_envs"], row["grad_steps"], row["device"]) == ("gru", "8", "8", "cpu")
     shares = [float(value) for key, value in row.items() if key.startswith("learning: ")]
     assert len(shares) >= 6 and sum(shares) == pytest.approx(1, abs=1e-2)
     assert float(row["learning: convolutions"]) > 0

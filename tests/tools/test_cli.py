@@ -5,7 +5,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +140,7 @@ def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
 
 
 def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from arcade_torch.tools.commands import demo as command
+    from arcade_torch.tools.commands import study as command
 
     def interrupted(self: object) -> int:
         raise KeyboardInterrupt
@@ -166,8 +165,7 @@ def test_the_hint_after_an_interruption_keeps_every_option(
     def interrupted(self: object) -> int:
         raise KeyboardInterrupt
 
-    command = import_module(f"arcade_torch.tools.commands.{words[0]}").COMMAND
-    monkeypatch.setattr(command, "run", interrupted)
+    monkeypatch.setattr(cli.command_class(words[0]), "run", interrupted)
     own_game = str(ROOT / "examples/own_game.py")
     said = one_error(capsys, [*words, "--import", own_game], cli.EXIT_INTERRUPTED)
     assert said.endswith(f": arcade-torch {' '.join(words)} --import {own_game}\n")

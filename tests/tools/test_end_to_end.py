@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, keep_memory, players
 from arcade_torch.tools.bench.envs import read_all
 from arcade_torch.tools.figures.throughput import NEEDED
-from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.studies.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]

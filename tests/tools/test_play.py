@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 import arcade_torch
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES
 from arcade_torch.tools import cli
-from arcade_torch.tools.files import read_csv, write_csv
+from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.play import terminal, window
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay, score_row
 from arcade_torch.tools.play.session import KEYS, Attempt, Session

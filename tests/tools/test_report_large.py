@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from arcade_torch.agents import preset, train
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, report
-from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.reports import build, panels
 from arcade_torch.tools.reports.panels import representatives, select_cells
 from arcade_torch.tools.runs import Runs, open_run

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, gap_and_bias
-from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.play.scores import COLUMNS
 from arcade_torch.tools.runs import AgentKey, agent_names, find_runs, read_scores
 from arcade_torch.tools.studies.grid import RunSpec

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from arcade_torch.tools.files import read_csv
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.progress import Speed
 from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -222,6 +222,21 @@ def test_a_damaged_record_of_the_study_is_written_anew(tmp_path: Path) -> None:
     again = Fabricator(what)
     carry_out(what, root, again)
     assert again.done == [] and StudyFolder(root).load() == what
+
+
+def test_a_study_killed_while_it_wrote_its_first_file_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The half file was called otherwise than the folder expected, and the folder was refused as somebody else's."""
+    what, root = small_study(), tmp_path / "s"
+    with monkeypatch.context() as killed:
+        killed.setattr(os, "replace", lambda *paths: os.kill(os.getpid(), signal.SIGINT))
+        killed.setattr(Path, "unlink", lambda *args, **how: None)
+        with pytest.raises(KeyboardInterrupt):
+            StudyFolder(root).claim(what)
+    assert [path.name[:12] for path in root.iterdir()] == [".study.json."]
+    StudyFolder(root).claim(what)
+    assert StudyFolder(root).load() == what
 
 
 def python_engine(workers: int = 2) -> Processes:

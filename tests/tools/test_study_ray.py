@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from arcade_torch.tools.studies import ray_engine
-from arcade_torch.tools.studies.engines import Job, JobResult
-from arcade_torch.tools.studies.ray_engine import ClusterLostError, Ray, carry_out
+from arcade_torch.tools.studies import engines
+from arcade_torch.tools.studies.engines import ClusterLostError, Job, JobResult, Ray, carry_out
 from arcade_torch.tools.studies.runner import study
 from tests.tools.fabricated import small_study
 
@@ -127,7 +126,7 @@ def _small_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
             (job.folder / name).write_text(str(job.config.read_bytes()))
 
     monkeypatch.setattr(Job, "train", train)
-    monkeypatch.setattr(ray_engine.tempfile, "gettempdir", lambda: str(tmp_path / "far"))
+    monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path / "far"))
 
 
 @pytest.mark.usefixtures("_small_training")

@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.figures import throughput
-from arcade_torch.tools.files import read_csv, write_csv
+from arcade_torch.tools.files import write_csv
 
 RATES = {"step+draw": 100.0, "step": 1000.0, "env": 60.0, "collector": 80.0, "fill": 5000.0, "copy": 4000.0}
 

@@ -1,4 +1,4 @@
-"""What all benchmarks share: measures in turns with every result consumed, the machine, memory, kinds of operation.
+"""What all benchmarks share: measures in turns with every result consumed, the machine, kinds of operation.
 
 Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is torch's, which waits for
 the device.
@@ -9,7 +9,6 @@ import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import accumulate
 from statistics import median
 from typing import Any
 
@@ -27,51 +26,33 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def no_check(_: object) -> int:
-    """The check of eager torch, which computes all that it is asked for: there is nothing to consume."""
-    return 0
-
-
 @dataclass(frozen=True)
 class Measure:
-    """Something to time.
-
-    Attributes:
-        work: does it once and returns the result; JAX is waited for, torch's device is by the clock.
-        check: reads all of the result and returns a whole number.
-        units: how many units one ``work`` makes.
-    """
+    """Something to time."""
 
     work: Callable[[], object]
-    check: Callable[[Any], int] = no_check
+    """Does it once and returns the result; waits for JAX (the clock waits for torch's device)."""
+    check: Callable[[Any], int] = lambda result: 0
+    """Reads all of the result and returns a whole number; eager torch computes all anyway."""
     units: int = 1
+    """How many one ``work`` makes."""
 
 
 @dataclass
 class Measured:
-    """What one measure did over all repeats.
-
-    Attributes:
-        rates: units per second of each repeat, the check of the results left out.
-        rates_with_check: the same with the check inside the clock.
-        units: how many were made and consumed in all timed repeats.
-        checksum: sum over everything that was made, modulo 2**64.
-    """
+    """What one measure did over all repeats: units a second of each, and all units made and consumed."""
 
     rates: list[float] = field(default_factory=list)
     rates_with_check: list[float] = field(default_factory=list)
+    """With the check of the results inside the clock."""
     units: int = 0
     checksum: int = 0
+    """Over everything that was made, modulo 2**64."""
 
     @property
     def rate(self) -> float:
         """Median units per second."""
         return median(self.rates)
-
-    @property
-    def rate_with_check(self) -> float:
-        """Median units per second with the check inside the clock."""
-        return median(self.rates_with_check)
 
     @property
     def best_ms(self) -> float:
@@ -82,14 +63,7 @@ class Measured:
 def interleaved(
     measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 3
 ) -> dict[str, Measured]:
-    """Time several things in turns.
-
-    Args:
-        measures: name -> what to time.
-        seconds: for each measure in each repeat; at least one ``work`` is done.
-        repeats: number of turns.
-        warm_ups: how often each is done before, outside the clock.
-    """
+    """Time several things in turns, each so many seconds (or one ``work``) a turn, after warm-ups outside the clock."""
     from torch.utils.benchmark import timer
 
     for measure in measures.values():
@@ -128,21 +102,6 @@ def machine() -> dict[str, Any]:
         "torch_threads": torch.get_num_threads(),
         **versions(),
     }
-
-
-def peak_bytes(work: Callable[[], object]) -> int:
-    """Most bytes that torch's CPU allocator handed out at a time while ``work`` ran, above what stood before.
-
-    Read from the memory events of torch's profiler: exact and the same on every machine, whatever else runs. Scratch
-    space inside a matrix library is not in it.
-    """
-    from torch.profiler import ProfilerActivity, profile
-
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as run:
-        work()
-    events = [event for event in run.profiler.kineto_results.events() if event.name() == "[memory]"]
-    events.sort(key=lambda event: event.start_ns())
-    return max(accumulate((int(event.nbytes()) for event in events), initial=0))
 
 
 KINDS = {

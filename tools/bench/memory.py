@@ -1,25 +1,50 @@
 """Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency; costs."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from arcade_torch.models import fast_weights, lru, make_memory, matrix_scan_loop, memory_names, mingru
-from arcade_torch.tools.bench.back_ends import bench_back_ends
-from arcade_torch.tools.bench.harness import Measure, interleaved, peak_bytes, torch_threads
+from arcade_torch.models import fast_weights, linear_scan, lru, make_memory, matrix_scan_loop, memory_names, mingru
+from arcade_torch.models.scan import back_end
+from arcade_torch.models.scan_triton import runs_triton
+from arcade_torch.tools.bench.harness import Measure, interleaved, torch_threads
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.bench.scans import RESETS, Run, bench_scans, both_passes, time_passes, unbind_loop
 
 TORCH_GRU = "torch.nn.GRU"
 """It knows no starts and ignores them."""
+LOOP, COPY = "loop over unbind", "copy of as many bytes"
+FORWARD_TENSORS, BACKWARD_TENSORS = 3, 5
+"""Tensors [B, T, H] a scan has to read or write: a, b, h; and a, h, the gradients of h, a and b."""
+RESETS = 0.02
+"""Share of the steps that open an episode."""
+QUEUED = 10
+"""Passes on a card between two looks at the clock, so that the device is timed and not the launches."""
 ACTING_ENVS, MINIBATCH_STEPS = 16, 132
 """The paper's envs, and the steps of its minibatch of them all: 128 and 4 before them."""
+
+Run = Callable[..., Tensor]
+Key = TypeVar("Key")
+T = TypeVar("T")
+
+
+def unbind_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
+    """The loop that is fastest under autograd; the function of ``linear_scan`` for one state ``h0`` or none.
+
+    Indexing ``b[:, t]`` instead makes the backward pass quadratic in T.
+    """
+    h = b.new_zeros(b[:, 0].shape) if h0 is None else h0
+    begins = [None] * b.shape[1] if start is None else start.reshape(*start.shape, *[1] * (b.ndim - 2)).unbind(1)
+    states = []
+    for a_t, b_t, begins_t in zip(a.expand(b.shape).unbind(1), b.unbind(1), begins, strict=True):
+        h = torch.addcmul(b_t, a_t, h if begins_t is None else h.masked_fill(begins_t, 0))
+        states.append(h)
+    return torch.stack(states, dim=1)
 
 
 def _matrix_loop(*args: Any) -> tuple[Tensor, Tensor]:
@@ -37,11 +62,10 @@ LOOPS: dict[str, tuple[Any, str, Callable[..., Any]]] = {
 
 @dataclass
 class Options(BenchOptions):
-    """Time and memory of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; of saliency.
+    """Time of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; and of saliency.
 
-    Measures take turns; the best turn counts. Peak memory is what torch's allocator had handed out in both passes above
-    what stood before (weights and input), the same on every machine. With a CUDA device, a further table has the back
-    ends of the scan there, as shares of the speed of a copy.
+    Measures take turns; the best turn counts. The scans stand beside a copy of the bytes that they have to read and
+    write, the least that any form of them could take.
 
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
@@ -58,6 +82,8 @@ class Options(BenchOptions):
     """Sequences."""
     frames: int = 64
     """Of the episode whose last decision saliency explains."""
+    device: str = "cpu"
+    """Torch device."""
     threads: int = 1
     """Of torch."""
     seconds: float = 0.3
@@ -77,25 +103,24 @@ SIZES: dict[str, dict[str, Any]] = {
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Rows of the tables ``models``, ``scans``, ``saliency`` and, with CUDA, ``back_ends``."""
-    batch, size, how = options.batch, options.size, (options.seconds, options.repeats)
+    """Rows of the tables ``models``, ``scans`` and ``saliency``."""
+    batch, size = options.batch, options.size
     if min((1, *options.steps, *options.layers, size, batch, options.threads, options.frames)) < 1:
         raise ValueError("steps, layers, size, batch, frames and threads must be at least 1")
+    if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
+        raise ValueError(f"device must be cpu, or cuda where torch finds a card, got {options.device!r}")
+    how = (torch.device(options.device), options.seconds, options.repeats)
     with torch_threads(options.threads):
         for steps in options.steps:
             for layers in options.layers:
                 log(f"memory models, T = {steps}, layers: {layers}")
-                compared = forms(options.memories or memory_names(), layers, size)
+                compared = forms(options.memories or memory_names(), layers, size, how[0])
                 yield from (("models", row) for row in bench_models(compared, layers, (batch, steps, size), *how))
         for steps in options.steps:
             log(f"scans, T = {steps}")
             yield from (("scans", row) for row in bench_scans(batch, steps, size, *how))
         log("saliency")
         yield from (("saliency", row) for row in bench_saliency(options.frames, *how))
-    if torch.cuda.is_available():
-        log("back ends on CUDA")
-        for row in bench_back_ends(torch.device("cuda"), options.steps, batch, size):
-            yield "back_ends", row._asdict()
 
 
 class Stack(nn.Module):
@@ -112,17 +137,48 @@ class Stack(nn.Module):
         return x
 
 
-def forms(names: Sequence[str], layers: int, size: int) -> dict[tuple[str, str], Run]:
+def forms(
+    names: Sequence[str], layers: int, size: int, device: torch.device | str = "cpu"
+) -> dict[tuple[str, str], Run]:
     """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T]) to y."""
     found: dict[tuple[str, str], Run] = {}
     for name in names:
-        stack = Stack(name, layers, size)
+        stack = Stack(name, layers, size).to(device)
         found[name, "scan" if name in LOOPS else "own"] = stack
         if name in LOOPS:
             found[name, "loop"] = patch.object(*LOOPS[name])(stack.forward)
-    gru = nn.GRU(size, size, num_layers=layers, batch_first=True)
+    gru = nn.GRU(size, size, num_layers=layers, batch_first=True).to(device)
     found[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
     return found
+
+
+def _repeated(work: Callable[[], object], device: torch.device) -> Measure:
+    """A measure of some work; on a card of several passes in a row."""
+    count = QUEUED if device.type == "cuda" else 1
+    return Measure(lambda: [work() for _ in range(count)][-1], units=count)
+
+
+def time_passes(
+    runs: Mapping[Key, Run],
+    backward: Callable[[Tensor], None],
+    inputs: tuple[Tensor, ...],
+    seconds: float,
+    repeats: int,
+    around: Callable[[Key, Callable[[], object]], Callable[[], object]] = lambda key, work: work,
+) -> dict[Key, dict[str, float]]:
+    """Best milliseconds of the forward pass alone and of both passes, measured in turns, each inside ``around``."""
+    leaves, measures = [x.clone().requires_grad_(x.dtype != torch.bool) for x in inputs], dict[str, Measure]()
+
+    def both(run: Run) -> None:
+        for leaf in leaves:
+            leaf.grad = None
+        backward(run(*leaves))
+
+    for key, run in runs.items():
+        for part, work in (("forward", torch.no_grad()(partial(run, *inputs))), ("both", partial(both, run))):
+            measures[f"{key} {part}"] = _repeated(around(key, work), inputs[0].device)
+    found = interleaved(measures, seconds, repeats, warm_ups=1)
+    return {key: {f"{part}_ms": found[f"{key} {part}"].best_ms for part in ("forward", "both")} for key in runs}
 
 
 def _learn(y: Tensor) -> None:
@@ -130,42 +186,78 @@ def _learn(y: Tensor) -> None:
 
 
 def bench_models(
-    compared: dict[tuple[str, str], Run], layers: int, shape: tuple[int, int, int], seconds: float, repeats: int
+    compared: dict[tuple[str, str], Run],
+    layers: int,
+    shape: tuple[int, int, int],
+    device: torch.device,
+    seconds: float,
+    repeats: int,
 ) -> Iterator[dict[str, Any]]:
     """Models over whole sequences [B, T, H] in turns, one row each."""
-    inputs = (torch.randn(shape), torch.rand(shape[:2]) < RESETS)
-    times = time_passes(compared, _learn, inputs, seconds, repeats)
-    for (model, form), work in compared.items():
-        peak = peak_bytes(both_passes(work, _learn, inputs)) / 2**20
-        about = {"model": model, "form": form, "layers": layers, "steps": shape[1]}
-        yield about | times[model, form] | {"peak_mib": peak}
+    inputs = (torch.randn(shape, device=device), torch.rand(shape[:2], device=device) < RESETS)
+    for (model, form), found in time_passes(compared, _learn, inputs, seconds, repeats).items():
+        yield {"model": model, "form": form, "layers": layers, "steps": shape[1]} | found
 
 
-def bench_saliency(frames: int, seconds: float, repeats: int) -> list[dict[str, Any]]:
+def scan_forms(device: torch.device) -> tuple[str, ...]:
+    """Ways to solve h_t = a_t h_{t-1} + b_t: the back ends for the device, and a loop under autograd."""
+    if device.type != "cuda":
+        return "serial", "doubling", LOOP
+    return (*(["triton"] if runs_triton(torch.empty(0, device=device)) else []), "doubling", LOOP)
+
+
+def solve(form: str, work: Callable[[], T]) -> Callable[[], T]:
+    """Some work whose scans are solved by a back end of that name."""
+    return work if form == LOOP else back_end(form)(work)
+
+
+def bench_scans(
+    batch: int, steps: int, size: int, device: torch.device, seconds: float, repeats: int
+) -> Iterator[dict[str, Any]]:
+    """Every form in turns, one row each, real and complex, from zeros, starts folded in as a_t = 0; then a copy."""
+    for numbers, dtype, exact in (
+        ("real", torch.float32, torch.float64),
+        ("complex", torch.complex64, torch.complex128),
+    ):
+        a, b = (torch.randn(batch, steps, size, dtype=dtype, device=device) for _ in "ab")
+        a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, steps, size, device=device)
+        a[torch.rand(batch, steps, device=device) < RESETS] = 0
+        compared: dict[str, Run] = {name: unbind_loop if name == LOOP else linear_scan for name in scan_forms(device)}
+        backward, right = partial(Tensor.backward, gradient=torch.randn_like(b)), linear_scan(a.to(exact), b.to(exact))
+        times = time_passes(compared, backward, (a, b), seconds, repeats, solve)
+        for name, form in compared.items():
+            error = float((solve(name, partial(form, a, b))() - right).abs().max())
+            yield {"form": name, "steps": steps, "numbers": numbers} | times[name] | {"error": error}
+        one, both = (tensors * b.numel() // 2 for tensors in (FORWARD_TENSORS, FORWARD_TENSORS + BACKWARD_TENSORS))
+        source, target = (torch.zeros(both, dtype=dtype, device=device) for _ in "st")  # a copy reads and writes
+        copies = {
+            "forward_ms": _repeated(partial(target[:one].copy_, source[:one]), device),
+            "both_ms": _repeated(partial(target.copy_, source), device),
+        }
+        found = interleaved(copies, seconds, repeats)
+        least = {name: measured.best_ms for name, measured in found.items()}
+        yield {"form": COPY, "steps": steps, "numbers": numbers} | least | {"error": 0.0}
+
+
+def bench_saliency(frames: int, device: torch.device, seconds: float, repeats: int) -> list[dict[str, Any]]:
     """Maps of one decision on the small network with LRU: two stages against the whole network action by action."""
     from arcade_torch.agents import preset
     from arcade_torch.agents.policy import build_network
     from arcade_torch.tools.analysis.pixel_saliency import saliency
 
-    network: Any = build_network(preset("small", memory="lru")).eval()
-    seen = torch.randint(0, 256, (frames, 128, 128, 3), dtype=torch.uint8)
-    actions, starts = torch.randint(0, 5, (frames,)), torch.arange(frames) == 0
+    network: Any = build_network(preset("small", memory="lru", device=str(device))).eval()
+    seen = torch.randint(0, 256, (frames, 128, 128, 3), dtype=torch.uint8, device=device)
+    actions, starts = torch.randint(0, 5, (frames,), device=device), torch.arange(frames, device=device) == 0
 
-    def whole() -> Tensor:
+    def whole() -> None:
         x = seen.float().requires_grad_()
         q, _ = network.remember(network.encode(x)[None], actions[None], starts[None], network.initial_state(1))
-        rows = (torch.autograd.grad(value, x, retain_graph=True)[0].square().sum(-1) for value in q[0, -1])
-        return sum(rows, torch.zeros(seen.shape[:3]))
+        for value in q[0, -1]:
+            torch.autograd.grad(value, x, retain_graph=True)[0].square().sum(-1)
 
-    ways: dict[str, Callable[[], object]] = {
-        "two stages": partial(saliency, network, seen, actions, starts),
-        "whole network": whole,
-    }
-    found = interleaved({way: Measure(work) for way, work in ways.items()}, seconds, repeats, warm_ups=1)
-    return [
-        {"way": way, "frames": frames, "both_ms": found[way].best_ms, "peak_mib": peak_bytes(work) / 2**20}
-        for way, work in ways.items()
-    ]
+    ways = {"two stages": Measure(partial(saliency, network, seen, actions, starts)), "whole network": Measure(whole)}
+    found = interleaved(ways, seconds, repeats, warm_ups=1)
+    return [{"way": way, "frames": frames, "both_ms": found[way].best_ms} for way in ways]
 
 
 class MemoryCost(NamedTuple):

@@ -10,8 +10,9 @@ the episodes wait for ``delay`` steps and the others for 1 to ``delay``, drawn e
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,10 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.models import MemoryBlock, memory_names
 from arcade_torch.tools.bench.harness import torch_threads
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.files import read_csv, write_between, write_csv
+from arcade_torch.tools.files import write_between, write_csv
 from arcade_torch.tools.tables import markdown_table
 
 SYMBOLS, DISTRACTORS = 4, 4
@@ -44,15 +46,14 @@ class Options(BenchOptions):
     """Delayed recall: see one of four symbols, wait among distractors, name it when asked.
 
     Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget is spent; chance is
-    25 %. Where the windows of attention end is measured too. Keeps a CSV file that it goes on with after an
-    interruption, and can write the table into a Markdown page.
+    25 %. Keeps a CSV file that it goes on with after an interruption, and can write the table into a Markdown page.
 
     Example: arcade-torch bench recall lru attention --delays 8 32 --out recall.csv
     """
 
     resumable: ClassVar[bool] = True
     memories: tuple[str, ...] = ()
-    """Memory models; all of them, and attention with several windows, by default."""
+    """Memory models; all of them by default."""
     delays: tuple[int, ...] = (8, 32, 96)
     """Steps between symbol and question."""
     hidden_size: int = 64
@@ -74,20 +75,6 @@ SIZES: dict[str, dict[str, Any]] = {
 }
 
 
-class Entry(NamedTuple):
-    """A model in the table: its name, number of cells one above the other, and options."""
-
-    memory: str
-    layers: int = 1
-    options: Mapping[str, Any] = {}
-
-    @property
-    def label(self) -> str:
-        """Name, options and layers in one line."""
-        options = "".join(f", {key}={value}" for key, value in self.options.items())
-        return f"{self.memory}{options}" + (f", {self.layers} layers" if self.layers > 1 else "")
-
-
 class Recall(NamedTuple):
     """What one model reached at one delay: a row of the table."""
 
@@ -103,16 +90,6 @@ class Recall(NamedTuple):
     state_numbers: int
 
 
-CAPACITY: tuple[tuple[Entry, int], ...] = (
-    (Entry("attention", 1, {"window": 32}), 32),
-    (Entry("attention", 1, {"window": 34}), 32),
-    (Entry("attention", 2, {"window": 17}), 32),
-    (Entry("attention", 2, {"window": 24}), 32),
-)
-"""Where theory puts a border. The question comes delay + 1 = 33 steps after the symbol; L layers of attention over
-windows of W steps reach L (W - 1) steps back: 31, 33, 32 and 46."""
-
-
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``recall``; those that the file holds already are not measured again."""
     if options.seconds <= 0 or options.hidden_size < 1 or not options.delays or min(options.delays) < 1:
@@ -120,17 +97,15 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
             "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
             f"{options.seconds}, {options.hidden_size} and {options.delays}"
         )
-    cases = [(Entry(name), delay) for name in options.memories or memory_names() for delay in options.delays]
-    cases += [] if options.memories else [case for case in CAPACITY if case[1] in options.delays]
     rows = read_recall(options.out) if options.out is not None and options.out.exists() else []
     known = {row[:4]: row for row in rows}
     asked = []
     with torch_threads(1):
-        for entry, delay in cases:
-            key = (entry.label, delay, options.hidden_size, options.seed)
+        for memory, delay in product(options.memories or memory_names(), options.delays):
+            key = (memory, delay, options.hidden_size, options.seed)
             if key not in known:
-                log(f"{entry.label}, delay {delay}")
-                known[key] = train(entry, delay, options.hidden_size, options.seconds, options.seed)
+                log(f"{memory}, delay {delay}")
+                known[key] = train(memory, delay, options.hidden_size, options.seconds, options.seed)
                 if options.out is not None:
                     write_csv(options.out, [row._asdict() for row in known.values()], Recall._fields)
             asked.append(known[key])
@@ -171,10 +146,9 @@ def windows(rng: np.random.Generator, rows: int, delay: int, *, mixed: bool = Fa
 class Reader(nn.Module):
     """Tokens to logits: one-hot, memory block, linear."""
 
-    def __init__(self, entry: Entry, hidden_size: int) -> None:
+    def __init__(self, memory: str, hidden_size: int) -> None:
         super().__init__()
-        options = dict(entry.options)
-        self.block = MemoryBlock(TOKENS, hidden_size, entry.memory, layers=entry.layers, memory_options=options)
+        self.block = MemoryBlock(TOKENS, hidden_size, memory, layers=1)
         self.head = nn.Linear(hidden_size, SYMBOLS)
 
     def forward(self, batch: Windows) -> tuple[Tensor, Tensor]:
@@ -186,12 +160,12 @@ class Reader(nn.Module):
 
 
 def train(
-    entry: Entry, delay: int, hidden_size: int = 64, seconds: float = 60.0, seed: int = 0, answers: int = ANSWERS
+    memory: str, delay: int, hidden_size: int = 64, seconds: float = 60.0, seed: int = 0, answers: int = ANSWERS
 ) -> Recall:
     """Train one model until it is right or the budget is spent, then test it on fresh data."""
     torch.manual_seed(seed)
     data, tests = (np.random.default_rng([seed, delay, part]) for part in range(2))
-    reader = Reader(entry, hidden_size)
+    reader = Reader(memory, hidden_size)
     optimizer = torch.optim.Adam(reader.parameters(), LEARNING_RATE)
     steps, spent, right, answered = 0, 0.0, 0.0, 0
     while right < SOLVED and spent < seconds:
@@ -208,7 +182,7 @@ def train(
     parameters = sum(p.numel() for p in reader.parameters())
     state = sum(leaf.numel() for leaf in reader.block.initial_state(1).values(True, True))
     result = (round(right, 4), answered, steps, round(spent, 2), parameters, state)
-    return Recall(entry.label, delay, hidden_size, seed, *result)
+    return Recall(memory, delay, hidden_size, seed, *result)
 
 
 @torch.no_grad()

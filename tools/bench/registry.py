@@ -18,7 +18,7 @@ FORMAT = 1
 BENCHES = {
     "envs": "frames per second of the games, every frame consumed",
     "train": "frames per second of training, and where the time goes",
-    "memory": "time and memory of the memory models, of the scans behind them, and of saliency",
+    "memory": "time of the memory models, of the scans behind them, and of saliency",
     "recall": "delayed recall: which model remembers one symbol for how long",
 }
 """Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`), ``SIZES`` and
@@ -59,15 +59,10 @@ TABLES: dict[str, Kind] = {
     "models": Kind(
         "Memory models over whole sequences",
         ("model", "form", "layers", "steps"),
-        {"forward_ms": "ms", "both_ms": "ms", "peak_mib": "MiB"},
+        {"forward_ms": "ms", "both_ms": "ms"},
     ),
     "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": "ms", "both_ms": "ms"}),
-    "saliency": Kind(
-        "Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms", "peak_mib": "MiB"}
-    ),
-    "back_ends": Kind(
-        "Back ends of the linear scan", ("back_end", "steps", "numbers"), {"forward_ms": "ms", "backward_ms": "ms"}
-    ),
+    "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms"}),
     "recall": Kind(
         "Delayed recall: right answers, and processor time until they were right",
         ("model", "delay", "hidden_size", "seed"),
@@ -85,16 +80,7 @@ def module_of(name: str) -> Any:
 
 
 def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[str, Any]:
-    """Run benchmarks one after another, those that keep freed memory last.
-
-    Args:
-        benches: name -> options.
-        size: what the file says of how much was measured.
-        log: told what is measured now.
-
-    Returns:
-        The content of a file, numbers with four digits.
-    """
+    """Run benchmarks one after another, those that keep freed memory last; the content of a file, four digits."""
     from arcade_torch.tools.bench.harness import machine
     from arcade_torch.tools.keep_memory import keep_freed_memory
 
@@ -112,12 +98,8 @@ def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[st
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a file of ``arcade-torch bench all``.
-
-    Raises:
-        ValueError: it is none, or a number in it is none.
-    """
-    from arcade_torch.tools.files import read_json
+    """Read a file of ``arcade-torch bench all``; a ``ValueError`` if it is none, or a number in it is none."""
+    from arcade_torch.agents.runs.files import read_json
 
     values = read_json(path)
     if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
@@ -154,40 +136,21 @@ def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
     return found
 
 
-class Change(NamedTuple):
-    """One number in two files."""
-
-    table: str
-    row: str
-    column: str
-    old: float | None
-    new: float | None
-    ratio: float
-
-    def verdict(self, tolerance: float) -> str:
-        """``better``, ``worse``, ``same``, ``missing`` or ``new``."""
-        if self.old is None or self.new is None:
-            return "new" if self.old is None else "missing"
-        if self.ratio < 1 - tolerance:
-            return "worse"
-        return "better" if self.ratio > 1 / (1 - tolerance) else "same"
-
-    def line(self) -> str:
-        """The change in words."""
-        values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (self.old, self.new))
-        unit = TABLES[self.table].numbers[self.column]
-        return f"{self.table}: {self.row}: {self.column} {values} {unit} (x {self.ratio:.2f})"
-
-
-def compare(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
-    """Number by number, what became of an old file in a new one."""
-    before, after, found = _numbers(old), _numbers(new), []
+def compare(old: Mapping[str, Any], new: Mapping[str, Any], tolerance: float) -> dict[str, list[str]]:
+    """What became of an old file in a new one: verdict -> a line for each number; a share of tolerance is the same."""
+    before, after = _numbers(old), _numbers(new)
+    found: dict[str, list[str]] = {verdict: [] for verdict in ("same", "worse", "better", "missing", "new")}
     for key in before | after:
-        was, now, ratio = before.get(key), after.get(key), 1.0
-        if was is not None and now is not None and was != now:
-            better, worse = (now, was) if TABLES[key[0]].numbers[key[2]] in MORE_IS_BETTER else (was, now)
-            ratio = better / worse if worse else math.inf
-        found.append(Change(*key, was, now, ratio))
+        (table, row, column), was, now = key, before.get(key), after.get(key)
+        ratio, unit = 1.0, TABLES[table].numbers[column]
+        if was is None or now is None:
+            verdict = "new" if was is None else "missing"
+        else:
+            good, bad = (now, was) if unit in MORE_IS_BETTER else (was, now)
+            ratio = 1.0 if was == now else good / bad if bad else math.inf
+            verdict = "worse" if ratio < 1 - tolerance else "better" if ratio > 1 / (1 - tolerance) else "same"
+        values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (was, now))
+        found[verdict].append(f"{table}: {row}: {column} {values} {unit} (x {ratio:.2f})")
     return found
 
 

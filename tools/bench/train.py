@@ -49,8 +49,6 @@ class Options(BenchOptions):
     """Gradient steps in each timed pass; those of an update are all alike."""
     repeats: int = 3
     """Passes; the median counts."""
-    note: str = ""
-    """Said about the machine in the result, for example that it was not idle."""
     keep_memory: bool = True
     """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
 

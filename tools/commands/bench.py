@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 import tyro
 
+from arcade_torch.agents.runs.files import write_atomic, write_json
 from arcade_torch.tools.bench import registry
-from arcade_torch.tools.files import write_csv, write_json, write_text
+from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.tables import Table, format_value
 
@@ -27,7 +28,7 @@ class Bench:
         if out is not None and out.suffix not in (".csv", ".json"):
             raise ValueError(f"--out must end in .csv or .json, got {out}")
         results = registry.measure({self.name: self.options}, "one", _log)
-        results["machine"] |= {name: about[name] for name in ("env", "device", "note") if name in about}
+        results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():
             title, key, _ = registry.TABLES[name]
             columns, cells = list(table["rows"][0]), [list(map(format_value, row.values())) for row in table["rows"]]
@@ -72,7 +73,7 @@ class BenchAll:
         options = {name: module.Options(**module.SIZES[self.size], out=None) for name, module in modules.items()}
         results = registry.measure(options, self.size, _log)
         print(write_json(self.out, results))
-        print(write_text(self.page or self.out.with_suffix(".md"), registry.page(results)))
+        print(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))
         return 0
 
 
@@ -101,33 +102,22 @@ class BenchCompare:
         }
         if differs := [f"{name} {was} and {now}" for name, (was, now) in pairs.items() if was != now]:
             print(f"not the same machine: {', '.join(differs)}")
-        changes: dict[str, list[registry.Change]] = {name: [] for name in ("same", "worse", "better", "missing", "new")}
-        for change in registry.compare(old, new):
-            changes[change.verdict(self.tolerance)].append(change)
+        changes = registry.compare(old, new, self.tolerance)
         for verdict in ("worse", "missing", "better", "new"):
-            for change in changes[verdict]:
-                print(f"{verdict}: {change.line()}")
-        print(", ".join(f"{len(found)} {verdict}" for verdict, found in changes.items()))
+            for line in changes[verdict]:
+                print(f"{verdict}: {line}")
+        print(", ".join(f"{len(lines)} {verdict}" for verdict, lines in changes.items()))
         return 1 if changes["worse"] else 0
 
 
-COMMAND = Bench
-_OTHERS: dict[str, Any] = {"all": BenchAll, "compare": BenchCompare}
+COMMANDS: dict[str, Any] = {"bench": Bench, "bench all": BenchAll, "bench compare": BenchCompare}
 
 
 def parse(words: Sequence[str], prog: str) -> Any:
-    """Read the options of one benchmark.
-
-    Args:
-        words: the options; what comes before the first flag are the memory models.
-        prog: the command, ``arcade-torch bench NAME``.
-
-    Raises:
-        ValueError: an option is unknown or malformed.
-    """
+    """Read the options of one benchmark; what comes before the first flag are the memory models."""
     name = prog.split()[-1]
-    if name in _OTHERS:
-        return parse_options(_OTHERS[name], words, prog)
+    if f"bench {name}" in COMMANDS:
+        return parse_options(COMMANDS[f"bench {name}"], words, prog)
     if words and not words[0].startswith("-") and name in ("memory", "recall"):
         words = ["--memories", *words]
     return Bench(name, parse_options(registry.module_of(name).Options, words, prog))

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import tyro
 
-from arcade_torch.tools.files import write_json
+from arcade_torch.agents.runs.files import write_json
 
 
 @dataclass
@@ -45,4 +45,4 @@ class Evaluate:
         return 0
 
 
-COMMAND = Evaluate
+COMMANDS = {"evaluate": Evaluate}

@@ -26,17 +26,18 @@ class Figure:
 
     def run(self) -> int:
         """Measure, draw, save, print."""
+        from arcade_torch.tools.files import csv_text
         from arcade_torch.tools.keep_memory import keep_freed_memory
         from arcade_torch.tools.optional import need
         from arcade_torch.tools.progress import Bars
-        from arcade_torch.tools.tables import print_csv
 
         keep_freed_memory()
         need("matplotlib")
         with Bars() as bars:
             made = registry.make_figure(self.name, self.options, bars.update)
         if self.options.csv:
-            print_csv([row for picture in made.pictures for row in picture.rows])
+            rows = [row for picture in made.pictures for row in picture.rows]
+            print(csv_text(rows, list(dict.fromkeys(name for row in rows for name in row))), end="")
             return 0
         for table in made.tables:
             table.show()
@@ -45,19 +46,11 @@ class Figure:
         return 0
 
 
-COMMAND = Figure
+COMMANDS = {"figure": Figure}
 
 
 def parse(words: Sequence[str], prog: str) -> Figure:
-    """Read the options of one figure; runs are named with or without ``--runs``.
-
-    Args:
-        words: the options.
-        prog: the command, ``arcade-torch figure NAME`` or ``arcade-torch analyze NAME``.
-
-    Raises:
-        ValueError: an option is unknown or malformed.
-    """
+    """Read the options of one figure; runs are named with or without ``--runs``."""
     _, group, name = prog.split()
     entry = FIGURES[name]
     words = [word.removeprefix("--runs=") for word in words if word != "--runs"]

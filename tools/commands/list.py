@@ -102,7 +102,7 @@ class List:
             print("us: microseconds for one step of one env; acting: 16 envs; learning: both passes, 16 x 132 steps")
 
 
-COMMAND = List
+COMMANDS = {"list": List}
 
 
 def _environments() -> None:

@@ -1,4 +1,4 @@
-"""``arcade-torch play``."""
+"""``arcade-torch play`` and ``arcade-torch record``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +34,7 @@ class Play:
     key_repeat: int = 0
     """A held key repeats every so many milliseconds; 0 for not at all."""
     rules: Literal["default", "reference"] = "default"
-    """Law of the game."""
+    """Rules of the game."""
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
     terminal: bool = False
@@ -47,7 +47,7 @@ class Play:
     def run(self) -> int:
         """Play."""
         from arcade_torch.compiled import compiled_game
-        from arcade_torch.tools.name_value import name_and_value
+        from arcade_torch.tools.options import name_and_value
         from arcade_torch.tools.play import scores, terminal, window
         from arcade_torch.tools.play.session import LEGEND, Session
 
@@ -85,4 +85,102 @@ class Play:
         return 0
 
 
-COMMAND = Play
+@dataclass
+class Record:
+    """Record episodes of a player as a GIF or, with the extra video, as an MP4.
+
+    Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP twin), or the run folder
+    of a trained agent.
+
+    Example: arcade-torch record MineSweeperEasy --player frames-oracle --both --out sweep.gif
+    """
+
+    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
+    """Environment id."""
+    out: Path
+    """File, .gif or .mp4; replaced if it exists."""
+    player: str = "random"
+    """random, state-oracle, frames-oracle, or a run folder."""
+    observability: Literal["full", "partial"] | None = None
+    """Twin that is shown, and that an agent sees; by default its own, partial for the frames-oracle, otherwise full."""
+    both: bool = False
+    """Show both twins, the MDP on the left."""
+    seed: int = 0
+    """Of the first episode, each further one has the next."""
+    episodes: int = 1
+    """How many."""
+    max_steps: int = 1000
+    """The recording stops when an episode gets longer."""
+    fps: float = 10.0
+    """Frames a second."""
+    scale: int = 2
+    """Width of a frame's pixel in the picture."""
+    obs_size: Literal[128, 256] | None = None
+    """Side of the frame; the agent's, else 128."""
+    rules: Literal["default", "reference"] | None = None
+    """Rules of the game; the agent's, else default."""
+    env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE, an option of the game; may be given several times."""
+
+    def run(self) -> int:
+        """Record."""
+        from arcade_torch.compiled import compiled_game
+        from arcade_torch.envs_jax import resolve_id
+        from arcade_torch.tools.optional import need
+        from arcade_torch.tools.options import name_and_value
+        from arcade_torch.tools.play import recording
+        from arcade_torch.tools.play.session import Session
+
+        write = recording.writer_for(self.out)
+        for name in ("episodes", "max_steps", "scale"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        fastest = recording.FASTEST_FPS[self.out.suffix]
+        if not 0 < self.fps <= fastest:
+            raise ValueError(f"--fps must be above 0 and at most {fastest} for {self.out.suffix}, got {self.fps}")
+        game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
+        agent = None if self.player in recording.SCRIPTED else self._agent()
+        obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
+        if agent is not None:
+            config = agent.config
+            if self.obs_size not in (None, config.obs_size):
+                raise ValueError(f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}")
+            obs_size, rules, partial = config.obs_size, self.rules or config.rules, config.observability != "full"
+            if resolve_id(config.env) == game_id:
+                options = {**config.env_options, **options}
+            else:
+                print(f"note: this agent was trained on {config.env}")
+        if self.observability is not None:
+            partial = self.observability == "partial"
+        game = compiled_game(game_id, obs_size, rules, options)
+        views = {"partial": partial, "both": self.both}
+        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=_say, **views)
+        player = (
+            recording.scripted(self.player, session.game, self.seed)
+            if agent is None
+            else recording.trained(agent, partial)
+        )
+        how = {"max_steps": self.max_steps, "hold": max(1, round(self.fps)), "scale": self.scale}
+        frames = recording.recorded_frames(session, player, **how)
+        bar = need("tqdm").tqdm(frames, desc=str(self.out), unit=" frames", disable=None, leave=False)
+        write(self.out, bar, self.fps)
+        print(f"recording: {self.out}")
+        return 0
+
+    def _agent(self) -> Any:
+        """The agent in a run folder."""
+        from arcade_torch.agents import load
+        from arcade_torch.tools.play.recording import SCRIPTED
+
+        if not Path(self.player).is_dir():
+            raise ValueError(f"--player is {self.player!r}, allowed: {', '.join(SCRIPTED)}, or a run folder")
+        return load(self.player)
+
+
+def _say(attempt: Any) -> None:
+    """Report an episode."""
+    end = "cut at --max-steps" if attempt.end == "abandoned" else attempt.end
+    print(f"seed {attempt.seed}: return {attempt.total:+.3f} in {attempt.steps} steps, {end}")
+
+
+COMMANDS = {"play": Play, "record": Record}

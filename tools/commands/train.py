@@ -12,7 +12,7 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_json
 from arcade_torch.tools.extensions import command_line
-from arcade_torch.tools.name_value import name_and_value
+from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.progress import TrainBar
 
@@ -77,20 +77,11 @@ class Train:
         return f"go on with: {command_line(['train', *argv, '--resume'])}"
 
 
-COMMAND = Train
+COMMANDS = {"train": Train}
 
 
 def parse(argv: Sequence[str], prog: str) -> Train:
-    """Read the options; what is not given comes from the config file or the preset.
-
-    Args:
-        argv: the options.
-        prog: the command, for messages.
-
-    Raises:
-        ValueError: an option or the preset is unknown, or a value is not allowed.
-        FileNotFoundError: there is no such config file.
-    """
+    """Read the options; what is not given comes from the config file or the preset."""
     name, file = _peek(argv, "--preset"), _peek(argv, "--config")
     if name is not None and file is not None:
         raise ValueError("give --preset or --config to start from, not both")

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
 from arcade_torch.gym.window import enlarge
-from arcade_torch.tools.files import write_bytes
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.play.session import NEXT, QUIT, Frame, Session
 
@@ -96,7 +96,7 @@ def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     pictures, buffer = map(_picture, frames), io.BytesIO()
     duration_ms = 10 * max(1, round(100 / fps))
     next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0)
-    return write_bytes(path, buffer.getvalue())
+    return write_atomic(path, buffer.getvalue())
 
 
 def _picture(frame: Frame) -> Any:
@@ -127,7 +127,7 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
         if process.returncode:
             complaint = log.read_text(errors="replace").strip()
             raise ValueError(f"ffmpeg could not write {path}: {complaint or process.returncode}")
-        return write_bytes(path, film.read_bytes())
+        return write_atomic(path, film.read_bytes())
 
 
 class EvaluationVideos:

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
-from arcade_torch.tools.files import read_csv, write_csv
+from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.play.session import Attempt, Session
 
 COLUMNS = (

@@ -129,14 +129,7 @@ class Session:
         return f"{self.game.id} {twin}  {numbers}{why}{what_now}"
 
     def press(self, key: str) -> None:
-        """React to a key.
-
-        Args:
-            key: one of ``KEYS``: up, down, left, right, fire, restart, toggle, next, quit.
-
-        Raises:
-            ValueError: another key.
-        """
+        """React to one of ``KEYS``."""
         if key not in KEYS:
             raise ValueError(f"key is {key!r}, allowed: {', '.join(KEYS)}")
         if self.closed:

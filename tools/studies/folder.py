@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.files import read_json, write_csv, write_json
+from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.runs import Run, read_record
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.versions import versions

@@ -5,19 +5,17 @@ import errno
 import re
 import shutil
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arcade_torch.tools.files import write_json
-from arcade_torch.tools.progress import Bars, Speed, clock
+from arcade_torch.agents.runs.files import write_json
+from arcade_torch.tools.progress import Bars, Speed
 from arcade_torch.tools.runs import Run
-from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, available_cores
+from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, available_cores
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
-from arcade_torch.tools.studies.ray_engine import Ray
 
 if TYPE_CHECKING:
     from arcade_torch.agents.config import TrainConfig
@@ -197,9 +195,7 @@ class Display:
                 self.bars.update(bar, done, wanted)
             else:
                 self.bars.remove(bar)
-        speed = self.speed.update(time.monotonic(), frames)
-        pace = f", {speed:,.0f} frames/s" if speed > 0 else ""
-        pace += f", {clock((total - frames) / speed)} left" if speed > 0 and frames < total else ""
+        pace = self.speed.words(frames, total)
         share = 100 * frames / total if total else 0
         runs = f"{len(self.ended)}/{len(self.runs)} runs"
         line = f"{runs}, {frames:,} of {total:,} frames ({share:.0f} %){pace}"

@@ -133,5 +133,5 @@ def test_a_log_is_cut_back_to_a_frame_count(tmp_path):
     again = CsvLog(tmp_path / "m.csv", ("frames", "x"), keep_frames=20)
     again.append({"frames": 30, "x": None})
     again.close()
-    rows = [(r["frames"], r["x"]) for r in read_csv(tmp_path / "m.csv")]
+    rows = [(r["frames"], r["x"]) for r in read_csv(tmp_path / "m.csv", strict=False)]
     assert rows == [("10", "3.3333333"), ("20", "6.6666667"), ("30", "")]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from arcade_torch.agents import preset, train
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.figures.registry import FIGURES
 from arcade_torch.tools.figures.style import AGENT_COLOURS
-from arcade_torch.tools.files import read_csv
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import write_run
 
