@@ -13,7 +13,6 @@ from typing import Any
 from arcade_torch.agents.runs.files import read_csv, write_atomic
 
 __all__ = ["cached_arrays", "csv_text", "read_csv", "write_between", "write_csv", "write_npz"]
-write_text = write_bytes = write_atomic  # what figures and reports call it
 
 
 def write_between(page: Path, begin: str, end: str, text: str) -> Path:

@@ -5,9 +5,9 @@ from typing import Any, get_args, get_type_hints
 
 from arcade_torch.agents import preset
 from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress
 from arcade_torch.tools.figures.style import panels
-from arcade_torch.tools.files import write_text
 from arcade_torch.tools.runs import find_runs, flatten
 from arcade_torch.tools.tables import markdown_table
 
@@ -40,7 +40,7 @@ def settings(options: PaperOptions, progress: Progress | None) -> Made:
         cell.set_edgecolor("#d0d0d0")
         cell.set_text_props(weight="normal" if line else "bold")
     base, _ = options.path("hyperparameters")
-    page = write_text(base.with_suffix(".md"), markdown_table(head, table) + "\n")
+    page = write_atomic(base.with_suffix(".md"), markdown_table(head, table) + "\n")
     return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=[page])
 
 

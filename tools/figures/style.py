@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options, Picture
-from arcade_torch.tools.files import write_bytes, write_csv, write_npz
+from arcade_torch.tools.files import write_csv, write_npz
 from arcade_torch.tools.optional import need
 
 AGENT_COLOURS = {
@@ -160,7 +161,7 @@ def save(options: Options, picture: Picture) -> list[Path]:
     for ending in [ending for ending in endings if ending in PICTURES]:
         buffer = BytesIO()
         figure.savefig(buffer, format=ending[1:])
-        written.append(write_bytes(base.with_name(base.name + ending), buffer.getvalue()))
+        written.append(write_atomic(base.with_name(base.name + ending), buffer.getvalue()))
     if picture.rows:
         columns = list(dict.fromkeys(name for row in picture.rows for name in row))
         written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows, columns))

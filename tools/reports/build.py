@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import over_seeds
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
-from arcade_torch.tools.files import write_csv, write_text
+from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.optional import need
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings, panels
@@ -97,7 +98,7 @@ def report(
     environment = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, **strict)
     environment.filters["commas"] = "{:,}".format
     page = environment.get_template("report.html.j2").render(context)
-    return write_text(Path(out) if out is not None else folder.root / "report.html", page)
+    return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
 
 
 def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Players:
