@@ -1,5 +1,6 @@
 """Every example runs in a short form, and each shows something that is true of all of it."""
 
+import csv
 import importlib.util
 import math
 import sys
@@ -112,3 +113,17 @@ def test_a_thousand_steps_in_jax_do_not_leave_the_device() -> None:
 def test_a_script_written_for_gymnax_learns() -> None:
     first, last = example("jax_actor_critic").main()
     assert first < 0 and last > 0.15  # random play earns -0.6, the best without reading the sign 0.25
+
+
+def test_a_probe_reads_where_things_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "probe.csv"
+    words = "--games BreakoutEasy --encoders 32 --frames 2048 --passes 3 --out"
+    monkeypatch.setattr(sys, "argv", ["probe_encoders.py", *words.split(), str(out)])
+    threads = torch.get_num_threads()
+    try:
+        example("probe_encoders").main()
+    finally:
+        torch.set_num_threads(threads)
+    rows = {row["fact"]: row for row in csv.DictReader(out.open())}
+    assert {"action", "ball_x", "bricks"} <= set(rows) and rows["action"]["encoder"] == "32"
+    assert float(rows["pos"]["learned"]) > 0.3

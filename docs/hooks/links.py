@@ -11,6 +11,7 @@ PAGES = {
     "results/README.md": "results/measurements.md",
     "results/parity.md": "results/parity.md",
     "results/small.md": "results/small.md",
+    "results/probe.md": "results/probe.md",
     "examples/notebooks": "notebooks.md",
 }
 """Repository path to place on the site, for what does not lie in docs/."""

@@ -229,8 +229,12 @@ def test_a_study_killed_while_it_wrote_its_first_file_is_begun_again(
 ) -> None:
     """The half file was called otherwise than the folder expected, and the folder was refused as somebody else's."""
     what, root = small_study(), tmp_path / "s"
+
+    def interrupted(*paths: Path) -> None:
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as killed:
-        killed.setattr(os, "replace", lambda *paths: os.kill(os.getpid(), signal.SIGINT))
+        killed.setattr(os, "replace", interrupted)
         killed.setattr(Path, "unlink", lambda *args, **how: None)
         with pytest.raises(KeyboardInterrupt):
             StudyFolder(root).claim(what)
