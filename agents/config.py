@@ -199,7 +199,9 @@ class PPOConfig(LearnerConfig):
     clip: Positive = 0.2
     """How far the probability ratio, and the value, may move in an update before the gradient stops."""
     entropy_coeff: PositiveOrZero = 0.01
-    """Weight of the entropy bonus."""
+    """Weight of the entropy bonus at the start."""
+    entropy_end: Fraction = 1.0
+    """Share of that weight which is left at the end of the run, reached linearly; 1 keeps it."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
 

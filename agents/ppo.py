@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.learner import Learner, Training, linear
 from arcade_torch.agents.sequences import (
     NetworkInputs,
     as_steps,
@@ -185,10 +185,12 @@ class PPOLoss(ClipPPOLoss):
 
         Args:
             value_type: an estimator of TorchRL; None for :class:`SequenceGAE`.
-            **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``.
+            **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``, and ``critic``, where the loss's
+                own reads what the actor has written (``ActorCriticNetwork.estimator``).
         """
         if value_type is None:
-            self._value_estimator = SequenceGAE(self.critic_network, time_limit=self.time_limit, **hyperparams)
+            hyperparams = {"critic": self.critic_network, "time_limit": self.time_limit} | hyperparams
+            self._value_estimator = SequenceGAE(**hyperparams)
         else:
             super().make_value_estimator(value_type, **hyperparams)
 
@@ -274,7 +276,9 @@ class PPO(Learner):
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
         )
-        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches)
+        loss.make_value_estimator(
+            gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches, critic=network.estimator
+        )
         super().__init__(loss, config, training, optimizer="adam")
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
@@ -284,6 +288,8 @@ class PPO(Learner):
         data = self.loss.value_estimator(batch)
         for _ in range(config.epochs):
             for minibatch in self.minibatches(data):
+                left = linear(1.0, config.entropy_end, frames, self.training.total_frames)
+                self.loss.entropy_coeff.fill_(config.entropy_coeff * left)
                 self.gradient_step(minibatch, frames)
                 frames += self.frames_per_step
         metrics = self.take_metrics()

@@ -1,11 +1,12 @@
-"""Actor and critic with a memory each: two towers that share nothing but the frames."""
+"""Actor and critic with memory: a network each, or one for both."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential, dispatch
 from torch import Tensor, nn
 
 from arcade_torch.models.memory import Store
@@ -16,15 +17,19 @@ __all__ = ["ActorCriticNetwork", "make_actor_critic"]
 
 
 class ActorCriticNetwork(TensorDictModuleBase):
-    """Two networks as one TensorDict module: the actor writes A logits, the critic the value of the state.
+    """Actor and critic as one TensorDict module, which writes ``logits`` [*, A] and ``state_value`` [*, 1].
 
-    Each tower is a :class:`MemoryNetwork` of its own and can be used alone. The plain-tensor methods are those of
-    :class:`MemoryNetwork`; their output is [..., A + 1], the value last, and their state has an entry for each tower,
-    ``("actor", ...)`` and ``("critic", ...)``.
+    Either two networks that share nothing but the frames, as in the paper, or one for both at half the price, whose
+    last output is the value. The plain-tensor methods are those of :class:`MemoryNetwork`; their output is
+    [..., A + 1], the value last, and their state has an entry for each network.
 
     Args:
-        actor: gives A logits.
+        actor: gives A logits; without a critic A + 1 outputs.
         critic: gives one value; sees frames of the same size. Its output and state keys differ from the actor's.
+
+    Attributes:
+        actor, critic: TensorDict modules for the terms of a loss; where one network serves both, the critic reads what
+            the actor has written.
 
     Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent actor-critic.
     """
@@ -32,45 +37,53 @@ class ActorCriticNetwork(TensorDictModuleBase):
     offers = ("logits", "probs", "value")
     """What :meth:`select` can read an output as."""
 
-    def __init__(self, actor: MemoryNetwork, critic: MemoryNetwork) -> None:
+    def __init__(self, actor: MemoryNetwork, critic: MemoryNetwork | None = None) -> None:
         super().__init__()
-        self.actor, self.critic = actor, critic
-        self.in_keys = list(dict.fromkeys([*actor.in_keys, *critic.in_keys]))
-        self.out_keys = [*actor.out_keys, *critic.out_keys]
+        self.networks = {"both": actor} if critic is None else {"actor": actor, "critic": critic}
+        if critic is None:
+            logits, value = partial(self.select, what="logits"), partial(self.select, what="value")
+            self.actor = TensorDictSequential(actor, TensorDictModule(logits, [actor.out_key], ["logits"]))
+            self.critic = TensorDictModule(value, [actor.out_key], ["state_value"])
+        else:
+            self.actor, self.critic = actor, critic
+        self.in_keys = list(dict.fromkeys(key for network in self.networks.values() for key in network.in_keys))
+        self.out_keys = [*self.actor.out_keys, *self.critic.out_keys]
+
+    @property
+    def estimator(self) -> TensorDictModuleBase:
+        """What gives ``state_value`` from frames by itself."""
+        return self if "both" in self.networks else self.critic
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Run both towers, see :meth:`MemoryNetwork.forward`; the value is [*batch, 1]."""
+        """Run both, see :meth:`MemoryNetwork.forward`; the value is [*batch, 1]."""
         return self.critic(self.actor(tensordict))
 
     def compress(self, pixels: Tensor) -> Tensor:
-        """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for both towers."""
-        return self.actor.compress(pixels)
+        """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for both networks."""
+        return next(iter(self.networks.values())).compress(pixels)
 
     def calibrate(self, pixels: Tensor) -> None:
-        """Set the input scaling of both towers from frames of random play."""
-        self.actor.calibrate(pixels)
-        self.critic.calibrate(pixels)
+        """Set the input scaling from frames of random play."""
+        for network in self.networks.values():
+            network.calibrate(pixels)
 
     def encode(self, pixels: Tensor) -> Tensor:
-        """Frames to the features of both towers, float [..., 2 E], the actor's first."""
-        return torch.cat((self.actor.encode(pixels), self.critic.encode(pixels)), dim=-1)
+        """Frames to features, float [..., E], of two networks [..., 2 E], the actor's first."""
+        return torch.cat([network.encode(pixels) for network in self.networks.values()], dim=-1)
 
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
     ) -> tuple[Tensor, TensorDict]:
-        """Everything behind the encoders, see :meth:`MemoryNetwork.remember`: features are [B, T, 2 E], the output is
-        [B, T, A + 1], see :meth:`split`.
-        """
-        mine, theirs = features.split(features.shape[-1] // 2, dim=-1)
-        logits, actor = self.actor.remember(mine, last_action, is_init, state["actor"])
-        value, critic = self.critic.remember(theirs, last_action, is_init, state["critic"])
-        after = TensorDict({"actor": actor, "critic": critic}, batch_size=state.batch_size)
-        return torch.cat((logits, value), dim=-1), after
+        """Everything behind :meth:`encode`, see :meth:`MemoryNetwork.remember`; the output is [B, T, A + 1]."""
+        parts = zip(self.networks.items(), features.chunk(len(self.networks), dim=-1), strict=True)
+        read = {name: network.remember(part, last_action, is_init, state[name]) for (name, network), part in parts}
+        after = TensorDict({name: state for name, (_, state) in read.items()}, batch_size=state.batch_size)
+        return torch.cat([out for out, _ in read.values()], dim=-1), after
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """Recurrent state at the start of an episode, TensorDict [batch_size]."""
-        states = {"actor": self.actor.initial_state(batch_size), "critic": self.critic.initial_state(batch_size)}
+        states = {name: network.initial_state(batch_size) for name, network in self.networks.items()}
         return TensorDict(states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))
 
     @staticmethod
@@ -78,7 +91,8 @@ class ActorCriticNetwork(TensorDictModuleBase):
         """An output [..., A + 1] as (logits [..., A], value [...])."""
         return out[..., :-1], out[..., -1]
 
-    def select(self, out: Tensor, what: str) -> Tensor:
+    @classmethod
+    def select(cls, out: Tensor, what: str) -> Tensor:
         """Read an output as one of :attr:`offers`.
 
         Args:
@@ -91,8 +105,8 @@ class ActorCriticNetwork(TensorDictModuleBase):
         Raises:
             ValueError: another word.
         """
-        if what not in self.offers:
-            raise ValueError(f"an actor-critic offers {', '.join(self.offers)}, not {what!r}")
+        if what not in cls.offers:
+            raise ValueError(f"an actor-critic offers {', '.join(cls.offers)}, not {what!r}")
         if what == "value":
             return out[..., -1:]
         return out[..., :-1].softmax(-1) if what == "probs" else out[..., :-1]
@@ -108,7 +122,7 @@ def make_actor_critic(
     store: Store = "sequence",
     **options: Any,
 ) -> ActorCriticNetwork:
-    """Make an actor and a critic, separate from the first convolution on, each with its own initial weights.
+    """Make actor and critic: two networks, each with its own initial weights, or one (``towers=1``; "small").
 
     Args:
         preset: see :func:`make_network`; the heads are the preset's ``actor_critic_head`` unless ``head`` is given.
@@ -121,8 +135,7 @@ def make_actor_critic(
             the published table in this.
 
     Returns:
-        The two towers: the actor writes ``"logits"``, the critic ``"state_value"``; their states stand under
-        ``("memory", "actor")`` and ``("memory", "critic")``.
+        The module; states stand under ``("memory", "actor")`` and ``("memory", "critic")``, or ``("memory", "both")``.
 
     Raises:
         ValueError: unknown preset, memory, size, or value of an option.
@@ -136,20 +149,11 @@ def make_actor_critic(
         >>> [tuple(part.shape) for part in network.split(out)]
         [(2, 7, 5), (2, 7)]
     """
-    options.setdefault("head", preset_of(preset).actor_critic_head)
-    actor, critic = (
-        make_network(
-            preset,
-            memory,
-            obs_size=obs_size,
-            num_outputs=outputs,
-            num_actions=num_actions,
-            memory_options=memory_options,
-            out_key=key,
-            state_key=("memory", tower),
-            store=store,
-            **options,
-        )
-        for tower, outputs, key in (("actor", num_actions, "logits"), ("critic", 1, "state_value"))
-    )
-    return ActorCriticNetwork(actor, critic)
+    chosen = preset_of(preset)
+    make: Any = partial(make_network, preset, memory, obs_size=obs_size, num_actions=num_actions, store=store)
+    make = partial(make, memory_options=memory_options, **{"head": chosen.actor_critic_head} | options)
+    if options.get("towers", chosen.towers) == 1:
+        both = make(num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both"))
+        return ActorCriticNetwork(both)
+    actor = make(num_outputs=num_actions, out_key="logits", state_key=("memory", "actor"))
+    return ActorCriticNetwork(actor, make(num_outputs=1, out_key="state_value", state_key=("memory", "critic")))

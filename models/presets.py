@@ -35,7 +35,9 @@ class NetworkPreset:
     head: str = "reference"
     """see :func:`make_head`"""
     actor_critic_head: str = "actor_critic"
-    """head of the two towers of :func:`make_actor_critic`"""
+    """head of :func:`make_actor_critic`"""
+    towers: int = 2
+    """networks of :func:`make_actor_critic`: 2 for one each, 1 for both"""
     feedforward_size: int = 256
     """width of the layers that stand in for the memory block of a feed-forward network"""
     use_last_action: bool = True
@@ -54,6 +56,7 @@ PRESETS = {
         layers=1,
         head="linear",
         actor_critic_head="linear",
+        towers=1,
         feedforward_size=128,
         zero_action_on_reset=True,
         memory_options={"mingru": {"slow_gates": True}},
@@ -105,7 +108,7 @@ def make_network(
         store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at every ``is_init``;
             "step": every step has a stored state, see :class:`MemoryModule`; without ``zero_action_on_reset``.
         **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``, ``head``,
-            ``use_last_action``, ``zero_action_on_reset``, ``encoder``.
+            ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``encoder``.
 
     Returns:
         a :class:`MemoryNetwork`.
@@ -129,9 +132,11 @@ def make_network(
         allowed = ", ".join(NetworkPreset.__dataclass_fields__)
         raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
     chosen = replace(chosen, **options)
-    for name in ("hidden_size", "layers", "feedforward_size"):
+    for name in ("hidden_size", "layers", "feedforward_size", "towers"):
         if not isinstance(getattr(chosen, name), int):
             raise ValueError(f"{name} must be a whole number, got {getattr(chosen, name)!r}")
+    if chosen.towers not in (1, 2):
+        raise ValueError(f"towers must be 2 (actor and critic apart) or 1 (one network for both), got {chosen.towers}")
     encoder = chosen.encoder(obs_size)
     block: nn.Module
     if memory == FEED_FORWARD:  # its two layers take the place of a deep head's as well

@@ -1,15 +1,28 @@
 """The PPO loss against one written from a step-by-step play, number by number."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
-from arcade_torch.agents.learner import epsilon_at, learning_rate_at
-from arcade_torch.agents.ppo import normalise
-from tests.agents.fakes import GAMMA, LAM, chosen, play, stream, summed_errors, toy_actor_critic, with_two_states
+from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
+from arcade_torch.agents.ppo import PPO, normalise
+from arcade_torch.models import ActorCriticNetwork
+from tests.agents.fakes import (
+    GAMMA,
+    LAM,
+    chosen,
+    play,
+    stream,
+    summed_errors,
+    toy_actor_critic,
+    toy_network,
+    with_two_states,
+)
 
 CLIP = 0.2
 ESTIMATES = ("advantage", "value_target", "state_value")
@@ -124,6 +137,56 @@ def test_objective_and_entropy_are_those_of_torchrls_own_loss(form):
         torch.testing.assert_close(found[key], wanted[key])
 
 
+@pytest.mark.parametrize("form", ["sequences", "stock"])
+def test_one_network_for_both_learns_as_two_with_its_weights(form):
+    s = stream(3, 6, seed=10)
+    h = s.state["memory", "h"]
+
+    def batch_and_loss(network, names):
+        state = TensorDict({"memory": {name: {"h": h} for name in names}}, s.state.batch_size)
+        batch = getattr(replace(s, state=state), form)()
+        batch["action_log_prob"] = torch.full(s.action.shape, -1.6)
+        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP)
+        loss.make_value_estimator(gamma=GAMMA, lmbda=LAM, critic=network.estimator)
+        return loss.value_estimator(batch), loss
+
+    both = toy_network(3, 6, out_key="outputs", state_key=("memory", "both"))
+    apart = toy_actor_critic(3)
+    for tower, rows in ((apart.actor, slice(0, 5)), (apart.critic, slice(5, 6))):
+        tower.encoder.load_state_dict(both.encoder.state_dict())
+        tower.block.load_state_dict(both.block.state_dict())
+        with torch.no_grad():
+            tower.head.weight.copy_(both.head.weight[rows])
+            tower.head.bias.copy_(both.head.bias[rows])
+    batch, loss = batch_and_loss(ActorCriticNetwork(both), ["both"])
+    other, wanted = batch_and_loss(apart, ["actor", "critic"])
+    for key in ESTIMATES:
+        torch.testing.assert_close(batch[key], other[key])
+    found, parts = loss(batch), wanted(other)
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        torch.testing.assert_close(found[key], parts[key])
+    total(found).backward()
+    total(parts).backward()
+    for name, parameter in both.named_parameters():
+        mine, theirs = (tower.get_parameter(name).grad for tower in (apart.actor, apart.critic))
+        joined = torch.cat((mine, theirs)) if name.startswith("head") else mine + theirs
+        torch.testing.assert_close(parameter.grad, joined)
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in both.parameters()}
+
+
+def test_the_entropy_bonus_fades_over_the_run():
+    config = PPOConfig(num_envs=3, num_steps=6, epochs=2, minibatches=3, entropy_coeff=0.4, entropy_end=0.5)
+    network = toy_actor_critic(3)
+    training = Training(total_frames=36, generator=torch.Generator(), device=torch.device("cpu"))
+    learner, seen = PPO(network, config, training), []
+    learner.loss.register_forward_pre_hook(lambda loss, _: seen.append(round(float(loss.entropy_coeff), 4)))
+    batch = with_two_states(stream(3, 6, seed=11)).sequences()
+    batch["action_log_prob"] = torch.full((3, 6), -1.6)
+    learner.update(batch, 0)
+    learner.update(batch.exclude(*ESTIMATES), 18)
+    assert seen == pytest.approx([0.4 - 0.2 * k / 12 for k in range(12)], abs=1e-4)
+
+
 def test_it_is_a_torchrl_loss_with_its_keys():
     network, batch, loss = acted(with_two_states(stream(2, 5, seed=8)))
     batch = loss.value_estimator(batch)
@@ -149,6 +212,7 @@ def test_the_defaults_are_the_papers():
     c = PPOConfig()
     assert (c.num_envs, c.num_steps, c.epochs, c.minibatches, c.gamma, c.lam) == (16, 128, 4, 16, 0.99, 0.95)
     assert (c.clip, c.entropy_coeff, c.critic_coeff, c.max_grad_norm) == (0.2, 0.01, 0.5, 0.5)
+    assert c.entropy_end == 1.0
     assert learning_rate_at(c, 0, 10**7) == 1e-4 and learning_rate_at(c, 10**7, 10**7) == 1e-10
     assert learning_rate_at(c, 5 * 10**6, 10**7) == pytest.approx((1e-4 + 1e-10) / 2)
     assert epsilon_at(c, 0, 10**7) is None and c.steps_before == 0

@@ -1,7 +1,8 @@
-"""Actor and critic, the feed-forward network, heads: published sizes, separate towers, what an output means."""
+"""Actor and critic, the feed-forward network, heads: published sizes, one tower or two, what an output means."""
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
 from arcade_torch.models import make_network
@@ -61,8 +62,8 @@ def test_the_papers_towers_have_the_published_layers():
     assert count(make_actor_critic("paper", "feedforward")) == 2 * 704_901 - 4 * 257
 
 
-def test_the_towers_share_no_weight_and_begin_differently():
-    network = make_actor_critic("small", "gru")
+def test_two_towers_share_no_weight_and_begin_differently():
+    network = make_actor_critic("small", "gru", towers=2)
     mine, theirs = network.actor.state_dict(), network.critic.state_dict()
     names = [name for name in mine if mine[name].shape == theirs[name].shape and "weight" in name]
     assert names and all(not torch.equal(mine[name], theirs[name]) for name in names)
@@ -70,7 +71,7 @@ def test_the_towers_share_no_weight_and_begin_differently():
 
 @pytest.mark.parametrize("memory", ["gru", "lru", "mlp", "feedforward"])
 def test_each_tower_alone_gives_its_half_of_the_output(memory):
-    network = make_actor_critic("small", memory)
+    network = make_actor_critic("small", memory, towers=2)
     pixels, last_action, is_init = inputs(3, 6)
     state = network.initial_state(3)
     with torch.no_grad():
@@ -85,6 +86,27 @@ def test_each_tower_alone_gives_its_half_of_the_output(memory):
             torch.testing.assert_close(after[name][key], expected[key])
 
 
+@pytest.mark.parametrize("memory", ["gru", "mlp"])
+def test_one_tower_gives_both_and_the_critic_reads_what_the_actor_left(memory):
+    network = make_actor_critic("small", memory)
+    pixels, last_action, is_init = inputs(3, 6)
+    state = network.initial_state(3)
+    assert count(network) == count(make_network("small", memory, num_outputs=6))
+    with torch.no_grad():
+        out, _ = run(network, pixels, last_action, is_init, state)
+        flags = is_init[:, :1].clone()
+        step = TensorDict({"pixels": pixels[:, 0], "last_action": last_action[:, 0], "is_init": flags}, [3])
+        whole = network(step.copy())
+        acted = network.actor(step.copy())
+        alone = network.estimator(step.copy())
+        assert "state_value" not in acted and set(network.critic.in_keys) <= set(acted.keys())
+        valued = network.critic(acted)
+    for found in (whole, valued):
+        torch.testing.assert_close(found["logits"], out[:, 0, :5])
+        torch.testing.assert_close(found["state_value"], out[:, 0, 5:])
+    torch.testing.assert_close(alone["state_value"], out[:, 0, 5:])
+
+
 def test_an_output_is_read_by_name():
     network = make_actor_critic("small", "mlp")
     out = torch.randn(2, 3, 6)
@@ -95,7 +117,7 @@ def test_an_output_is_read_by_name():
 
 
 def test_calibration_reaches_both_towers():
-    network = make_actor_critic("small", "mlp")
+    network = make_actor_critic("small", "mlp", towers=2)
     network.calibrate(inputs(4, 3, 128)[0])
     assert torch.equal(network.actor.encoder.mean, network.critic.encoder.mean) and network.actor.encoder.mean.any()
 
@@ -105,5 +127,7 @@ def test_wrong_names_get_one_clear_line():
         make_actor_critic("smal")
     with pytest.raises(TypeError, match=r"width.*allowed are encoder"):
         make_actor_critic("small", "gru", width=3)
+    with pytest.raises(ValueError, match=r"towers must be 2 .* got 3"):
+        make_actor_critic("small", "gru", towers=3)
     with pytest.raises(ValueError, match="actor_critic"):
         make_head("none", 4, 5)

@@ -119,7 +119,7 @@ def test_plain_tensors_a_step_and_a_sequence_give_the_same_and_the_primer_has_th
 
 
 def test_actor_and_critic_write_their_outputs_and_states_and_the_critic_works_alone():
-    network = make_actor_critic("small", "gru")
+    network = make_actor_critic("small", "gru", towers=2)
     data = batch(network).exclude("next")
     step = network(data[:, 0])
     assert step["logits"].shape == (N, 5) and step["state_value"].shape == (N, 1)
@@ -135,7 +135,7 @@ def test_actor_and_critic_write_their_outputs_and_states_and_the_critic_works_al
         )
         torch.testing.assert_close(torch.cat([whole["logits"], whole["state_value"]], -1), out)
         torch.testing.assert_close(network.critic(data.copy())["state_value"], whole["state_value"])
-    critic = make_actor_critic("small", "gru", store="step").critic
+    critic = make_actor_critic("small", "gru", store="step", towers=2).critic
     with set_recurrent_mode(True):
         assert GAE(gamma=0.9, lmbda=0.8, value_network=critic)(batch(critic))["advantage"].isfinite().all()
 

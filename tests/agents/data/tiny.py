@@ -16,5 +16,5 @@ class TinyEncoder(SmallEncoder):
         self.linear = nn.Conv2d(2, 8, 6)  # recorded as nn.Linear(72, 8), which is the same weights in another shape
 
 
-NETWORK = {"preset": "small", "obs_size": 128, "encoder": TinyEncoder, "hidden_size": 8}
+NETWORK = {"preset": "small", "obs_size": 128, "encoder": TinyEncoder, "hidden_size": 8, "towers": 2}
 """Options of every recorded network beside its memory."""
