@@ -28,7 +28,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "eval_every": 40_000,
         "checkpoint_every": 20_000,
         "pqn": _SMALL | _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6},
-        "ppo": _SMALL | {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5},
+        "ppo": _SMALL | {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
+        | {"entropy_coeff": 0.05, "entropy_end": 0.05},
         "dqn": _SMALL | _SMALL_Q | {"epochs": 1, "learning_rate": 1e-3, "learning_rate_end": 5e-5} | _SMALL_REPLAY,
     },
 }
