@@ -4,7 +4,7 @@ Public names are resolved on first use, so that importing the package costs litt
 
 Example:
     >>> from arcade_torch.agents import preset
-    >>> preset("small", env="CartPoleEasy").pqn.num_envs
+    >>> preset("small", env="CartPoleEasy").ppo.num_envs
     64
 """
 

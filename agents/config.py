@@ -1,21 +1,12 @@
 """What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here imports torch."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
-RENAMED = {
-    "learning_rate_share": "lr_decay_fraction",
-    "epsilon_share": "exploration_fraction",
-    "entropy_weight": "entropy_coeff",
-    "value_weight": "critic_coeff",
-    "context": "overlap",
-}
-"""Fields of version 0.1 and their names since 0.2; the old ones go in 0.3."""
 
 
 class Range(NamedTuple):
@@ -368,18 +359,12 @@ def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
-    """Values for the fields of a dataclass, by today's names; unknown ones are refused."""
+    """Values for the fields of a dataclass; unknown names are refused."""
     require(isinstance(values, Mapping), prefix[:-1] or "a config", values, "a table of fields")
-    known, found = [item.name for item in dataclasses.fields(cls)], {}
-    for name, value in values.items():
-        new = name if name in known else RENAMED.get(name)
-        if new not in known:
-            raise ValueError(f"unknown field {prefix + str(name)!r}; fields: {', '.join(sorted(known))}")
-        if new != name:
-            said = f"{prefix}{name} is called {new} since 0.2; 0.3 drops the old name"
-            warnings.warn(said, FutureWarning, stacklevel=3)
-        found[new] = value
-    return found
+    known = [item.name for item in dataclasses.fields(cls)]
+    if unknown := [name for name in values if name not in known]:
+        raise ValueError(f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}")
+    return dict(values)
 
 
 def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

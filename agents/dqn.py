@@ -59,7 +59,6 @@ class DQN(Learner):
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
         """Store one window and learn from sequences drawn from the replay, once it holds enough; see `PQN.update`."""
-        self.check_rewards(batch)
         config = self.config
         if config.targets == "stored":
             batch = batch.copy().set("stored_target", self._present_targets(batch))

@@ -94,14 +94,13 @@ def evaluate(
     """
     require(episodes >= 1, "episodes", episodes, "a whole number >= 1")
     require(observability in (None, "full", "partial"), "observability", observability, "'full' or 'partial'")
-    start = held_out_seed(seed)
     if env is None:
         env = make_eval_env(agent.config, episodes, observability)
     before = env.observability
     try:
         if observability is not None:
             env.set_observability(observability)
-        env.set_seed(start)
+        env.set_seed(held_out_seed(seed))
         return _play(agent, env)
     finally:
         env.set_observability(before)

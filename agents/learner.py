@@ -112,11 +112,6 @@ class Learner:
         means = {name: sum(column) / len(table) for name, column in zip(names, zip(*table, strict=True), strict=True)}
         return means | {"lr": self.learning_rate}
 
-    def check_rewards(self, batch: TensorDictBase) -> None:
-        """Refuse rewards that are not finite, before anything is learned from them, by a NonFiniteError."""
-        if not bool(batch.get(("next", "reward")).isfinite().all()):
-            raise NonFiniteError("a reward is not finite")
-
     def state_dict(self) -> dict[str, Any]:
         """Everything but the trained weights and the generator that the coming updates depend on."""
         return {"optimizer": self.optimizer.state_dict(), "grad_steps": self.grad_steps}

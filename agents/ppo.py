@@ -227,12 +227,6 @@ class Choice(Categorical):
         logits = self.logits.expand(*sample_shape, *self.logits.shape)
         return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The most likely outcome, int64 [*batch]."""
-        mode: Tensor = self.logits.argmax(-1)
-        return mode
-
 
 def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> ProbabilisticActor:
     """A policy that samples from the softmax of ``logits``.
@@ -283,7 +277,6 @@ class PPO(Learner):
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
         """Learn from one window, with ``action_log_prob``; see `PQN.update`."""
-        self.check_rewards(batch)
         config = self.config
         data = self.loss.value_estimator(batch)
         for _ in range(config.epochs):

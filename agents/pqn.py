@@ -321,9 +321,8 @@ class PQN(Learner):
             Means over the gradient steps, by column of ``metrics.csv``.
 
         Raises:
-            NonFiniteError: a reward, the loss, the gradient or a weight is not finite.
+            NonFiniteError: the loss, the gradient or a weight is not finite.
         """
-        self.check_rewards(batch)
         data = self.loss.prepare(batch)
         for _ in range(self.config.epochs):
             for minibatch in self.minibatches(data):

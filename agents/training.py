@@ -35,7 +35,6 @@ Progress = Callable[[Mapping[str, Any]], None]
 LEARNERS: dict[str, Callable[..., PQN | PPO | DQN]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}
 COMPILE_BACKEND = "inductor"
 """Of ``torch.compile``; tests take one that needs no C++ compiler."""
-_CALIBRATION_FRAMES = 3200
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ class Trainer:
         numbers = self.config.learner
         steps = max(0, numbers.warmup_steps - numbers.steps_before)  # the first window fills the overlap too
         windows = -(-steps // numbers.num_steps)
-        stride = max(1, numbers.frames_per_update * windows // _CALIBRATION_FRAMES)
+        stride = max(1, numbers.frames_per_update * windows // 3200)  # frames are plenty
         seen = []
         for _ in range(windows):
             pixels = self.collector.collect(random=True).get("pixels")[:, numbers.steps_before :]
@@ -132,6 +131,8 @@ class Trainer:
         new = slice(numbers.steps_before, None)
         last = self.stats.update(*(batch["next", key][:, new].squeeze(-1) for key in ("episode_reward", "done")))
         try:
+            if not bool(batch["next", "reward"].isfinite().all()):
+                raise NonFiniteError("a reward is not finite")
             metrics = self.learner.update(batch, self.frames)
         except NonFiniteError as error:
             raise NonFiniteError(f"update {self.updates + 1} (after {self.frames} frames): {error}") from error

@@ -6,7 +6,7 @@ The MDP twin shows the faces of all cards, the POMDP twin those that are up: the
 
 Importing this file registers the game, and every tool knows it; run as a script it is ``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy --observability partial
+    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy --total-frames 1e5
     python examples/own_game.py --preset small --observability partial
 """
 

@@ -7,7 +7,7 @@ knows no such flag. Here the chunk is cut wherever some row of the batch begins,
 Importing this file registers the model, and every tool knows it; run as a script it first checks the laws that a
 memory has to keep and then is ``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_memory.py --memory lstm --preset small --env SignpostEasy
+    arcade-torch train --import examples/own_memory.py --memory lstm --preset small --total-frames 1e5
     python examples/own_memory.py --preset small --env SignpostEasy --observability partial
 """
 

@@ -57,17 +57,12 @@ def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     if not isinstance(values, dict) or values.get("status", "finished") != "finished" or not set(needed) <= set(values):
         return False
     returns, lengths = values.get("returns", []), values.get("lengths", [])
-    if not all(isinstance(part, list) and all(map(_is_number, part)) for part in (returns, lengths)):
+    if not (isinstance(returns, list) and isinstance(lengths, list)) or values.get("mean", returns or None) is None:
         return False
-    if not all(isinstance(length, int) for length in lengths) or not _is_number(values.get("mean", 0 if returns else None)):
-        return False
-    optional = ("std", "ci", "n", "frames", "seconds", "train_max_ewm")
-    return all(values.get(name) is None or _is_number(values[name]) for name in optional)
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is a number that can be squared; NaN is one."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and not abs(value) > 1e15
+    others = [values.get(name) for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm")]
+    numbers = [*returns, *lengths, *(value for value in others if value is not None)]
+    sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)  # what can be squared; NaN is one
+    return sound and all(type(n) is int for n in lengths)
 
 
 class CsvLog:

@@ -24,7 +24,8 @@ scratch = TemporaryDirectory()  # the runs go here; name a folder to keep them
 # %%
 agents = {}
 for name, memory in {"LRU": "lru", "no memory": "mlp"}.items():
-    config = preset("small", env="CartPoleEasy", observability="full", memory=memory, total_frames=FRAMES, eval_every=0)
+    what = {"env": "CartPoleEasy", "memory": memory, "total_frames": FRAMES, "eval_every": 0}
+    config = preset("small", algorithm="pqn", **what)
     result = train(config, Path(scratch.name) / memory)
     agents[name] = load(result.run_dir)
     print(f"{name:10} return {result.evaluation.mean:5.2f} in greedy episodes")

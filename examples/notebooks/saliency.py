@@ -27,7 +27,8 @@ scratch = TemporaryDirectory()  # the runs go here; name a folder to keep them
 AGENTS = {"LRU, POMDP": ("lru", "partial"), "no memory, POMDP": ("mlp", "partial"), "LRU, MDP": ("lru", "full")}
 agents = {}
 for name, (memory, twin) in AGENTS.items():
-    config = preset("small", env="SignpostEasy", observability=twin, memory=memory, total_frames=FRAMES, eval_every=0)
+    what = {"env": "SignpostEasy", "observability": twin, "memory": memory, "total_frames": FRAMES, "eval_every": 0}
+    config = preset("small", algorithm="pqn", **what)
     result = train(config, Path(scratch.name) / f"{memory}-{twin}")
     agents[name] = load(result.run_dir)
     print(f"{name:18} return {result.evaluation.mean:5.2f} in greedy episodes")

@@ -47,9 +47,17 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
 
-def test_the_small_preset_takes_3104_gradient_steps_in_200k_frames():
-    c = preset("small")
-    assert c.num_updates * c.pqn.epochs * c.pqn.minibatches == 3104
+@pytest.mark.parametrize(("algorithm", "steps"), [("pqn", 3104), ("ppo", 1552)])
+def test_gradient_steps_of_the_small_preset_in_200k_frames(algorithm, steps):
+    c = preset("small", algorithm=algorithm, total_frames=200_000)
+    assert c.num_updates * c.learner.grad_steps_per_update == steps
+
+
+def test_the_small_preset_is_the_recipe_and_every_learner_has_numbers_in_it():
+    assert (preset("small").algorithm, preset("small").memory) == ("ppo", "lru")
+    assert preset("small", algorithm="pqn", pqn={"lam": 0.5}).pqn.lam == 0.5
+    with pytest.raises(ValueError, match="the algorithm is 'ppo'"):
+        preset("small", pqn={"lam": 0.5})
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -59,7 +67,7 @@ def test_every_preset_survives_json(name):
 
 
 def test_a_preset_can_be_changed_down_to_its_learner():
-    c = preset("small", env="SkittlesEasy", total_frames=5e4, pqn={"lam": 0.5})
+    c = preset("small", algorithm="pqn", env="SkittlesEasy", total_frames=5e4, pqn={"lam": 0.5})
     assert (c.env, c.total_frames, c.pqn.lam, c.pqn.num_envs) == ("SkittlesEasy", 50_000, 0.5, 64)
     assert c.eval_every == 10_000
 
@@ -81,8 +89,8 @@ def test_a_preset_can_be_changed_down_to_its_learner():
         ({"env": 3}, "env must be a string; got 3"),
         ({"obs_size": "big"}, "obs_size must be a whole number; got 'big'"),
         ({"colour": 1}, "unknown field 'colour'"),
-        ({"pqn": {"lambda": 1}}, r"unknown field 'pqn\.lambda'"),
-        ({"pqn": {"gamma": "high"}}, r"pqn\.gamma must be a number"),
+        ({"ppo": {"lambda": 1}}, r"unknown field 'ppo\.lambda'"),
+        ({"ppo": {"gamma": "high"}}, r"ppo\.gamma must be a number"),
         ({"network_options": 3}, "network_options"),
     ],
 )
@@ -98,7 +106,7 @@ def test_an_unknown_preset_lists_the_known_ones():
 
 
 def test_differing_fields_are_named_but_for_those_that_do_not_matter():
-    one = preset("small")
+    one = preset("small", algorithm="pqn")
     other = dataclasses.replace(one, seed=1, threads=7, pqn=dataclasses.replace(one.pqn, lam=0.5))
     assert differing_fields(one, other) == ["pqn.lam (0.8 != 0.5)", "seed (0 != 1)"]
     assert differing_fields(one, dataclasses.replace(one, checkpoint_every=1)) == []
@@ -123,6 +131,7 @@ BAD = [
     ("pqn", "bootstrap", "first"),
     ("ppo", "clip", 0.0),
     ("ppo", "entropy_coeff", -0.1),
+    ("ppo", "entropy_end", 1.5),
     ("ppo", "critic_coeff", -0.1),
     ("dqn", "batch_sequences", 0),
     ("dqn", "learning_starts", 0),
@@ -167,23 +176,6 @@ def test_every_preset_has_numbers_for_every_algorithm():
         for algorithm in GROUPS:
             config = preset(name, algorithm=algorithm)
             assert config.learner is getattr(config, algorithm) and config.num_updates >= 1
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "old", "new"),
-    [
-        ("pqn", "learning_rate_share", "lr_decay_fraction"),
-        ("dqn", "epsilon_share", "exploration_fraction"),
-        ("ppo", "entropy_weight", "entropy_coeff"),
-        ("ppo", "value_weight", "critic_coeff"),
-    ],
-)
-def test_names_of_version_01_are_taken_with_a_warning(algorithm, old, new):
-    with pytest.warns(FutureWarning, match=rf"{algorithm}\.{old} is called {new} since 0\.2; 0\.3 drops the old name"):
-        c = preset("small", algorithm=algorithm, **{algorithm: {old: 0.25}})
-    assert getattr(c.learner, new) == 0.25 and TrainConfig.from_dict(c.to_dict()) == c
-    with pytest.warns(FutureWarning, match="context is called overlap"):
-        assert preset("small", pqn={"context": 3}).pqn.overlap == 3
 
 
 @pytest.mark.parametrize("algorithm", GROUPS)

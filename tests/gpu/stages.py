@@ -102,7 +102,8 @@ def studies(games: Sequence[str], device: str) -> dict[str, dict[str, str]]:
         return {"tiny": {"games": '["CartPoleEasy"]', "preset": '"smoke"', "total_frames": "128", **common}}
     listed = ", ".join(f'"{game}"' for game in games)
     paper = {"games": '["CartPoleEasy"]', "preset": '"paper"', **common}
-    return {"small": {"games": f"[{listed}]", "preset": '"small"', **common}, "paper": paper}
+    small = {"games": f"[{listed}]", "preset": '"small"', "algorithms": '["ppo"]', **common}
+    return {"small": small, "paper": paper}
 
 
 # -- running ----------------------------------------------------------------------------------------------------------

@@ -172,10 +172,10 @@ def test_the_hint_after_an_interruption_keeps_every_option(
 
 
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
-    words = ["--preset", "small", "--total-frames", "2e4", "--eval-every", "40_000", "--pqn.lam", "0.5"]
+    words = ["--preset", "small", "--total-frames", "2e4", "--eval-every", "40_000", "--ppo.lam", "0.5"]
     config = parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").settings
-    assert (config.total_frames, config.eval_every, config.pqn.lam) == (20_000, 40_000, 0.5)
-    assert config.pqn.num_envs == 64  # of the preset
+    assert (config.total_frames, config.eval_every, config.ppo.lam) == (20_000, 40_000, 0.5)
+    assert config.ppo.num_envs == 64  # of the preset
     assert (dict(config.env_options), config.network_options["skip"]) == ({"noise": 0.5}, "residual")
 
 
