@@ -62,8 +62,8 @@ class Bars:
             left = [f"{timedelta(seconds=task.time_remaining)} left"] if task.time_remaining else []
             parts = [f"{task.speed:,.0f} {self.unit}/s", *left, text]
         task.fields["text"] = said = ", ".join(filter(None, parts))
-        of = f" of {total:,} {self.unit}".rstrip() + f" ({task.percentage:.0f} %)" if total else ""
-        self._line = f"{name}: {done:,}{of}" + (f", {said}" if said else "")
+        of, share = (f" of {total:,}", f"({task.percentage:.0f} %)") if total else ("", "")
+        self._line = " ".join(filter(None, [f"{name}: {done:,}{of}", self.unit, share])) + (f", {said}" if said else "")
         if not self.terminal and time.monotonic() >= self._next_line_s:
             self.note(self._line)
             self._next_line_s, self._line = time.monotonic() + LINE_EVERY_S, ""

@@ -384,7 +384,7 @@ def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
     with shown("toy", {}, set(), stream) as note:
         note("hello")
-    assert stream.getvalue() == "toy: hello\ntoy: 0, 0/0 runs\n"
+    assert stream.getvalue() == "toy: hello\ntoy: 0 frames, 0/0 runs\n"
 
 
 def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:

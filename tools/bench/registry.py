@@ -62,30 +62,18 @@ class Kind(NamedTuple):
 
 
 MORE_IS_BETTER = ("frames/s", "share")
+_TIMES = {"forward_ms": "ms", "both_ms": "ms"}
 TABLES: dict[str, Kind] = {
-    "envs": Kind(
-        "Environments: frames per second, every frame consumed",
-        ("game", "obs_size", "num_envs", "measure"),
-        {"frames_per_s": "frames/s"},
-    ),
-    "train": Kind(
-        "Training with PQN: frames per second",
-        ("network", "memory", "form", "num_envs", "num_steps"),
-        dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s"),
-    ),
-    "models": Kind(
-        "Memory models over whole sequences",
-        ("model", "form", "layers", "steps"),
-        {"forward_ms": "ms", "both_ms": "ms"},
-    ),
-    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": "ms", "both_ms": "ms"}),
+    "envs": Kind("Environments: frames per second, every frame consumed",
+                 ("game", "obs_size", "num_envs", "measure"), {"frames_per_s": "frames/s"}),
+    "train": Kind("Training with PQN: frames per second", ("network", "memory", "form", "num_envs", "num_steps"),
+                  dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s")),
+    "models": Kind("Memory models over whole sequences", ("model", "form", "layers", "steps"), _TIMES),
+    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), _TIMES),
     "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms"}),
-    "recall": Kind(
-        "Delayed recall: right answers, and processor time until they were right",
-        ("model", "delay", "hidden_size", "seed"),
-        {"accuracy": "share", "seconds": "s"},
-    ),
-}
+    "recall": Kind("Delayed recall: right answers, and processor time until they were right",
+                   ("model", "delay", "hidden_size", "seed"), {"accuracy": "share", "seconds": "s"}),
+}  # fmt: skip
 """What a file may hold; whoever adds a benchmark adds its tables here."""
 
 Log = Callable[[str], None]

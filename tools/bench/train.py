@@ -16,12 +16,7 @@ from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
 
-FORMS: dict[str, dict[str, bool]] = {
-    "eager": {},
-    "amp": {"amp": True},
-    "compiled": {"compile": True},
-    "graphs": {"cuda_graphs": True},
-}
+FORMS = {"eager": {}, "amp": {"amp": True}, "compiled": {"compile": True}, "graphs": {"cuda_graphs": True}}
 """Ways to run a network, by the settings of a run that ask for them."""
 
 

@@ -78,7 +78,9 @@ class BenchAll(Command):
         if self.out.suffix != ".json":
             raise ValueError(f"--out must end in .json, got {self.out}")
         sizes = registry.SIZES[self.size]
-        options = {name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches}
+        options: dict[str, Any] = {
+            name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches
+        }
         results = registry.measure(options, self.size, _log)
         print(write_json(self.out, results))
         print(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))

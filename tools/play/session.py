@@ -75,6 +75,9 @@ class Session:
         (1, (128, 128, 3))
     """
 
+    end: Literal["terminated", "truncated"] | None
+    _mixed: bool
+
     def __init__(
         self,
         game: CompiledGame,
@@ -167,7 +170,7 @@ class Session:
         self._batch.reset(np.ones(1, bool), seed_keys(seed, 1))
         self._actions: list[int] = []
         self._reward, self._mixed = 0.0, False
-        self.end: Literal["terminated", "truncated"] | None = None
+        self.end = None
 
     def _all_played(self) -> bool:
         return 0 < self._episodes <= self.finished
