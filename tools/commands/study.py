@@ -38,7 +38,7 @@ class Resumable(Command):
             return 1
         print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
         for name, reason in result.errors.items():
-            print(f"failed: {name}: {reason} (log: {result.root / 'logs' / f'{name}.log'})")
+            print(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
             write_page(result.root)
         return 1 if result.errors else 0

@@ -45,6 +45,11 @@ class Job(NamedTuple):
     folder: Path
     log: Path
 
+    @property
+    def words(self) -> list[str]:
+        """Options of ``arcade-torch train`` that do it."""
+        return ["--config", str(self.config), "--out", str(self.folder), "--resume"]
+
     def train(self) -> None:
         """Carry it out in this process; a run that was begun goes on.
 
@@ -142,10 +147,9 @@ class Processes:
     def _start(self, job: Job, core: int, pin: bool) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") if pin else {}
-        files = ["--config", str(job.config), "--out", str(job.folder)]
         with job.log.open("ab") as log:
             process = subprocess.Popen(
-                [*self.program, "train", *files, "--resume", "--wait", f"{GRACE_S:g}"],
+                [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

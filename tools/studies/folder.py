@@ -21,7 +21,9 @@ from typing import Any
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.machine import versions
+from arcade_torch.tools.options import command_line
 from arcade_torch.tools.runs import Run, read_record
+from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
@@ -36,13 +38,14 @@ class StudyFolder:
 
     root: Path
 
+    def job(self, spec: RunSpec) -> Job:
+        """Where the config, the folder and the log of a run stand."""
+        config, log = self.root / "configs" / f"{spec.name}.json", self.root / "logs" / f"{spec.name}.log"
+        return Job(spec.name, config, self.root / "runs" / spec.name, log)
+
     def run(self, spec: RunSpec) -> Run:
         """The folder of one run, as it is now."""
-        return Run(self.root / "runs" / spec.name)
-
-    def log(self, spec: RunSpec) -> Path:
-        """File with what the run printed."""
-        return self.root / "logs" / f"{spec.name}.log"
+        return Run(self.job(spec).folder)
 
     @property
     def analysis(self) -> Path:
@@ -91,7 +94,8 @@ class StudyFolder:
                 raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
         elif self.root.exists() and not all(entry.name.startswith(".study.json.") for entry in self.root.iterdir()):
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
-        commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
+        jobs = [self.job(run) for run in study.runs()]
+        commands = {job.name: command_line(["train", *job.words]) for job in jobs}
         here = versions()
         first, also = old.get("versions", here), old.get("also")  # what the first runs were made with stays on record
         also = list(also) if isinstance(also, list) else []

@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arcade_torch.tools.options import command_line
 from arcade_torch.tools.runs import flatten
 
 if TYPE_CHECKING:
@@ -162,11 +161,6 @@ class Study:
             changes["network_options"] |= zip(("layers", "hidden_size"), map(int, run.size.split("x")), strict=True)
         cell = {"env": run.game, "observability": run.observability, "memory": run.memory, "seed": run.seed}
         return preset(self.preset, algorithm=run.algorithm, **cell, **changes)
-
-    def command(self, run: RunSpec, out: Path) -> str:
-        """The line for a shell that trains one run of this study in its folder ``out``."""
-        config = out.parent.parent / "configs" / f"{run.name}.json"
-        return command_line(["train", "--config", str(config), "--out", str(out), "--resume"])
 
 
 def study_preset(name: str) -> Study:

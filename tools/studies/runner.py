@@ -37,7 +37,7 @@ class StudyResult:
     rows: list[dict[str, Any]]
     """of ``results.csv``"""
     errors: dict[str, str]
-    """run name -> one line, for runs that failed in this invocation"""
+    """run name -> one line with the reason and the log, for runs that failed in this invocation"""
 
     @property
     def finished(self) -> int:
@@ -83,11 +83,10 @@ def study(
     try:
         folder.claim(what, command)
         folder.write_results(what)
-        jobs = []
-        for run in (run for run in plan if folder.run(run).final is None):
-            file = write_json(folder.root / "configs" / f"{run.name}.json", plan[run].to_dict())
-            jobs.append(Job(run.name, file, folder.run(run).path, folder.log(run)))
-        errors = _carry_out(what, folder, {run.name: run for run in plan}, jobs, engine, stream) if jobs else {}
+        jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
+        for run, job in jobs.items():
+            write_json(job.config, plan[run].to_dict())
+        errors = _carry_out(what, folder, list(plan), list(jobs.values()), engine, stream) if jobs else {}
         return StudyResult(folder.root, folder.write_results(what), errors)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -128,20 +127,23 @@ def planned(what: Study, shard: str = "") -> "dict[RunSpec, TrainConfig]":
 
 
 def _carry_out(
-    what: Study, folder: StudyFolder, runs: Mapping[str, RunSpec], jobs: list[Job], engine: Engine, stream: Any
+    what: Study, folder: StudyFolder, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
 ) -> dict[str, str]:
-    ended, errors = set(runs) - {job.name for job in jobs}, dict[str, str]()
-    folders = {name: folder.run(run) for name, run in runs.items()}
-    bars = shown(what.name, folders, ended, stream)
+    runs, errors = {run.name: run for run in plan}, dict[str, str]()
+    ended = set(runs) - {job.name for job in jobs}
+    bars = shown(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
     with bars as note, contextlib.closing(engine.run(jobs)) as results:  # type: ignore[type-var]
         if ended:
             note(f"{len(ended)} of {len(runs)} runs are finished already")
-        for result in results:
-            run, error = runs[result.name], ""
-            ended.add(result.name)
-            if folder.run(run).final is None:  # a process killed after its last word has done its work
-                error = errors[result.name] = result.error or "ended without a final evaluation"
-                note(f"{result.name} failed: {error} (log: {folder.log(run)})")
+        for name, error in results:
+            run = runs[name]
+            ended.add(name)
+            if folder.run(run).final is not None:  # a process killed after its last word has done its work
+                error = ""
+            else:
+                error = error or "ended without a final evaluation"
+                errors[name] = f"{error} (log: {folder.job(run).log})"
+                note(f"{name} failed: {errors[name]}")
             folder.note_failure(run, error)
             folder.write_results(what)
             if error and ("No space left" in error or shutil.disk_usage(folder.root).free < LEAST_FREE_BYTES):
