@@ -140,14 +140,14 @@ def test_every_command_is_one_that_the_parser_takes(words: tuple[str, ...], monk
     assert all(Path(path).is_file() for path in imports)
     command, options = cli.split_command(rest)
     try:
-        cli.read_command(command, options)
+        cli.command_class(command).parse(options, f"arcade-torch {command}")
     except SystemExit as stop:
         assert "--help" in options and not stop.code
 
 
 def test_the_parser_refuses_what_does_not_exist() -> None:
     with pytest.raises(ValueError, match="--stepps"):
-        cli.read_command("list", ["--stepps", "3"])
+        cli.command_class("list").parse(["--stepps", "3"], "arcade-torch list")
 
 
 def test_every_command_in_a_sentence_exists() -> None:

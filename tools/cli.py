@@ -17,7 +17,7 @@ from typing import Any
 from arcade_torch.tools.bench.registry import BENCHES
 from arcade_torch.tools.errors import WORK_FAILED, MissingPackage, is_told, one_line
 from arcade_torch.tools.figures.registry import FIGURES
-from arcade_torch.tools.options import load_extensions, parse, take_imports
+from arcade_torch.tools.options import load_extensions, take_imports
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
@@ -97,17 +97,9 @@ def _say(text: str) -> None:
 
 
 def command_class(name: str) -> Any:
-    """The dataclass of a command; where options decide more than tyro reads, `read_command` asks its module."""
+    """The dataclass of a command; `parse` reads its options and `run` does the work."""
     module = import_module(f"arcade_torch.tools.commands.{COMMANDS[name][0]}")
     return module.COMMANDS.get(name) or next(iter(module.COMMANDS.values()))
-
-
-def read_command(name: str, options: Sequence[str]) -> Any:
-    """A command with its options, ready to ``run``; a ``ValueError`` says in one line what cannot be read."""
-    kind, prog = command_class(name), f"arcade-torch {name}"
-    command = kind.parse(options, prog) if hasattr(kind, "parse") else parse(kind, options, prog)
-    command.argv = tuple(options)
-    return command
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -133,7 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         else:
             name, options = split_command(words)
             load_extensions(imports)
-            command = read_command(name, options)
+            command = command_class(name).parse(options, f"arcade-torch {name}")
+            command.argv = tuple(options)
             return int(command.run() or EXIT_OK)
     except SystemExit as stop:
         if not stop.code:

@@ -203,10 +203,8 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def open_run(path: Path) -> Run | None:
     """A run from its folder, None if it has not finished; refuses damaged settings by the name of the file."""
     run, file = Run(path), path / "config.json"
-    if not {"env", "memory"} <= set(run.config):
-        raise ValueError(f"{file} does not describe a run: it has no env or no memory")
-    if type(run.config.get("seed", 0)) is not int:
-        raise ValueError(f"{file} is damaged: its seed is {run.config['seed']!r}")
+    if not {"env", "memory"} <= set(run.config) or type(run.config.get("seed", 0)) is not int:
+        raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
     except ValueError as error:

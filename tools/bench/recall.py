@@ -187,17 +187,12 @@ def accuracy(reader: Reader, rng: np.random.Generator, delay: int, answers: int)
 
 def markdown(rows: Sequence[Recall]) -> str:
     """The rows as a Markdown table: a line a model, a column a delay."""
-    delays = sorted({row.delay for row in rows})
-    found = {(row.model, row.delay): row for row in rows}
-    lines = []
+    lines, delays = [], sorted({row.delay for row in rows})
     for model, one in {row.model: row for row in rows}.items():
-        cells = [_cell(found.get((model, delay))) for delay in delays]
-        lines.append([f"`{model}`", *cells, f"{one.parameters:,}", f"{one.state_numbers:,}"])
+        cells = dict.fromkeys(delays, "")
+        for row in (row for row in rows if row.model == model):
+            effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
+            solved = "" if row.accuracy >= SOLVED else "not solved: "
+            cells[row.delay] = f"{100 * row.accuracy:.1f} % ({solved}{effort})"
+        lines.append([f"`{model}`", *cells.values(), f"{one.parameters:,}", f"{one.state_numbers:,}"])
     return markdown_table(["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines)
-
-
-def _cell(row: Recall | None) -> str:
-    if row is None:
-        return ""
-    effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
-    return f"{100 * row.accuracy:.1f} %" + (f" ({effort})" if row.accuracy >= SOLVED else f" (not solved: {effort})")
