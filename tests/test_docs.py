@@ -10,7 +10,8 @@ from typing import NamedTuple
 import pytest
 
 from arcade_torch.models import registry
-from arcade_torch.tools import cli, extensions
+from arcade_torch.tools import cli
+from arcade_torch.tools.options import take_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "results").glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -135,18 +136,18 @@ def command_lines() -> list[tuple[str, ...]]:
 @pytest.mark.parametrize("words", command_lines(), ids=" ".join)
 def test_every_command_is_one_that_the_parser_takes(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    imports, rest = extensions.take_imports(list(words))
+    imports, rest = take_imports(list(words))
     assert all(Path(path).is_file() for path in imports)
     command, options = cli.split_command(rest)
     try:
-        cli.read_command(command, options)
+        cli.command_class(command).parse(options, f"arcade-torch {command}")
     except SystemExit as stop:
         assert "--help" in options and not stop.code
 
 
 def test_the_parser_refuses_what_does_not_exist() -> None:
     with pytest.raises(ValueError, match="--stepps"):
-        cli.read_command("list", ["--stepps", "3"])
+        cli.command_class("list").parse(["--stepps", "3"], "arcade-torch list")
 
 
 def test_every_command_in_a_sentence_exists() -> None:

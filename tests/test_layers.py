@@ -14,7 +14,7 @@ LAYERS = (*LINKED, "bridge")
 OTHERS = ("tests", "examples", "docs")
 
 # What each layer may know of the package, and which of the declared libraries it may see.
-TOOLS_EXTRAS = ("tyro", "rich", "tqdm", "matplotlib", "jinja2", "pygame", "tensorboard", "wandb", "ray")
+TOOLS_EXTRAS = ("tyro", "rich", "matplotlib", "jinja2", "pygame", "tensorboard", "wandb", "ray")
 MAY_IMPORT = {
     "envs_jax": {"envs_jax"},
     "bridge": {"bridge", "envs_jax"},

@@ -15,7 +15,7 @@ from arcade_torch.envs_jax import BatchedGame, Game, check_game, env_keys, make,
 from arcade_torch.envs_jax.game import Rules
 from arcade_torch.envs_jax.oracles import make_oracle, oracle_return
 from arcade_torch.tools import cli
-from arcade_torch.tools.contact_sheet import scene
+from arcade_torch.tools.play.recording import scene
 from tests.own_registry import own_registry  # noqa: F401
 
 FILE = Path(__file__).resolve().parents[1] / "examples/own_game.py"

@@ -11,7 +11,7 @@ import torch
 from arcade_torch.models import check_memory, make_memory, registry
 from arcade_torch.models.memory import replay
 from arcade_torch.tools import cli
-from arcade_torch.tools.extensions import VARIABLE
+from arcade_torch.tools.options import VARIABLE
 
 FILE = Path(__file__).resolve().parents[1] / "examples/own_memory.py"
 

@@ -18,7 +18,7 @@ import pytest
 from arcade_torch.envs_jax import probe_ids, registered_ids
 from arcade_torch.envs_jax.registry import option_names
 from arcade_torch.models import make_memory, memory_names
-from arcade_torch.tools.contact_sheet import strip
+from arcade_torch.tools.play.recording import strip
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

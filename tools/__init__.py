@@ -8,17 +8,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _PUBLIC = {
-    "gap_and_bias": "arcade_torch.tools.analysis.gap_bias",
-    "saliency": "arcade_torch.tools.analysis.pixel_saliency",
-    "recall_density": "arcade_torch.tools.analysis.recall_density",
-    "contamination": "arcade_torch.tools.analysis.contamination",
-    "shuffled_beginning": "arcade_torch.tools.analysis.contamination",
-    "Policy": "arcade_torch.tools.analysis.policy",
-    "saliency_figure": "arcade_torch.tools.figures.saliency",
-    "greedy_window": "arcade_torch.tools.analysis.windows",
-    "study": "arcade_torch.tools.studies.runner",
-    "Study": "arcade_torch.tools.studies.grid",
-    "report": "arcade_torch.tools.reports.build",
+    "Policy": "analysis.policy",
+    "Study": "studies.grid",
+    "contamination": "analysis.contamination",
+    "gap_and_bias": "analysis.gap_bias",
+    "greedy_window": "analysis.windows",
+    "recall_density": "analysis.recall_density",
+    "report": "reports.build",
+    "saliency": "analysis.pixel_saliency",
+    "saliency_figure": "figures.saliency",
+    "shuffled_beginning": "analysis.contamination",
+    "study": "studies.runner",
 }
 
 if TYPE_CHECKING:
@@ -34,18 +34,9 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy",
-    "Study",
-    "contamination",
-    "gap_and_bias",
-    "greedy_window",
-    "recall_density",
-    "report",
-    "saliency",
-    "saliency_figure",
-    "shuffled_beginning",
-    "study",
-]
+    "Policy", "Study", "contamination", "gap_and_bias", "greedy_window", "recall_density", "report", "saliency",
+    "saliency_figure", "shuffled_beginning", "study",
+]  # fmt: skip
 
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names
@@ -53,10 +44,8 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
-            raise AttributeError(f"module 'arcade_torch.tools' has no attribute {name!r}; names: {', '.join(__all__)}")
-        value = getattr(import_module(_PUBLIC[name]), name)
-        globals()[name] = value
-        return value
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; names: {', '.join(__all__)}")
+        return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
 
 
 def __dir__() -> list[str]:

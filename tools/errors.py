@@ -1,8 +1,29 @@
-"""Which errors are bad input, told in one line, and which are faults of ours, shown with their traceback."""
+"""Which errors are bad input, told in one line, and which are faults of ours; optional packages, imported when used."""
 
 import opcode
+from importlib import import_module
+from typing import Any
 
-from arcade_torch.tools.optional import MissingPackage
+EXTRA_OF = {
+    **dict.fromkeys(("tyro", "rich", "matplotlib", "jinja2", "PIL"), "tools"),
+    **{"pygame": "play", "imageio_ffmpeg": "video", "wandb": "loggers", "tensorboard": "loggers", "ray": "ray"},
+}
+"""Import name -> the extra of arcade-torch that brings it."""
+
+
+class MissingPackage(ImportError):
+    """An optional package is not installed; the message says how to get it.
+
+    Example:
+        >>> str(MissingPackage("jinja2"))
+        "the package jinja2 is missing: pip install 'arcade-torch[tools]'"
+    """
+
+    def __init__(self, name: str) -> None:
+        top = name.partition(".")[0]
+        wanted = f"'arcade-torch[{EXTRA_OF[top]}]'" if top in EXTRA_OF else top
+        super().__init__(f"the package {top} is missing: pip install {wanted}")
+
 
 BAD_INPUT = (
     *(ValueError, TypeError, MissingPackage, FileNotFoundError, FileExistsError),
@@ -12,6 +33,20 @@ BAD_INPUT = (
 
 WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
 """Own error types that do not mean bad input; told in one line too."""
+
+
+def need(name: str) -> Any:
+    """Import and return an optional module.
+
+    Raises:
+        MissingPackage: it is not installed; names the extra that brings it.
+    """
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and error.name.partition(".")[0] != name.partition(".")[0]:
+            raise
+        raise MissingPackage(name) from error
 
 
 def is_told(error: BaseException) -> bool:

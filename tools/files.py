@@ -1,18 +1,81 @@
-"""Pages, tables and arrays as files of studies, analyses and figures; see also `arcade_torch.agents.runs.files`."""
+"""Tables: on the terminal, in Markdown, in files; arrays in files. See also `arcade_torch.agents.runs.files`."""
 
 import csv
 import hashlib
 import io
 import json
 import os
+import sys
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from arcade_torch.agents.runs.files import read_csv, write_atomic
+from arcade_torch.agents.runs.files import read_csv as read_csv
+from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.tools.errors import need
 
-__all__ = ["cached_arrays", "csv_text", "read_csv", "write_between", "write_csv", "write_npz"]
+NARROWEST = 80
+"""Columns of a terminal in which every table can be read."""
+Row = TypeVar("Row", bound=NamedTuple)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        title: above it.
+        columns: headers.
+        rows: cells; written with ``str``.
+        caption: below it.
+        left: how many columns are aligned left and name the row; the others are numbers.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    caption: str = ""
+    left: int = 1
+
+    def show(self) -> None:
+        """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
+        lines = [list(map(str, line)) for line in (self.columns, *self.rows)]
+        widths = [
+            max(len(part) for cell in cells for part in cell.split("\n")) + 3 for cells in zip(*lines, strict=True)
+        ]
+        console = need("rich.console").Console
+        terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
+        width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
+        parts = [list(range(self.left))]
+        for i in range(self.left, len(self.columns)):
+            if len(parts[-1]) > self.left and sum(widths[j] for j in (*parts[-1], i)) + 1 > width:
+                parts.append(list(range(self.left)))
+            parts[-1].append(i)
+        for part in parts:
+            title, caption = self.title if part is parts[0] else "", self.caption if part is parts[-1] else ""
+            table = need("rich.table").Table(title=title or None, caption=caption or None)
+            table.title_justify = table.caption_justify = "left"
+            for i in part:
+                table.add_column(lines[0][i], justify="left" if i < self.left else "right", overflow="fold")
+            for line in lines[1:]:
+                table.add_row(*(line[i] for i in part))
+            console(highlight=False, markup=False, width=width).print(table)
+
+
+def format_value(value: Any) -> str:
+    """A cell: numbers with four digits or in whole thousands."""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return str(value)
+
+
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int | None = None) -> str:
+    """A Markdown table; columns after the first ``left`` are aligned right."""
+    left = len(columns) if left is None else left
+    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (columns, *rows)]
+    return "\n".join([lines[0], "|---" * left + "|---:" * (len(columns) - left) + "|", *lines[1:]])
 
 
 def write_between(page: Path, begin: str, end: str, text: str) -> Path:
@@ -38,6 +101,36 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return buffer.getvalue()
+
+
+def read_rows(path: Path, kind: type[Row]) -> list[Row]:
+    """Rows of a CSV file as named tuples of a kind; a ``ValueError`` if it is no table of them."""
+    try:
+        return [kind(*(of(row[name]) for name, of in kind.__annotations__.items())) for row in read_csv(path)]
+    except (KeyError, ValueError) as error:
+        wanted = ", ".join(kind._fields)
+        raise ValueError(f"{path} is no table with columns {wanted} ({error}); choose another --out") from None
+
+
+def measured_rows(
+    path: Path | None, kind: type[Row], keys: Iterable[tuple[Any, ...]], measure: Callable[..., Row]
+) -> Iterator[Row]:
+    """Rows by their first cells, one after another: those that a file holds, the others measured and added to it.
+
+    Args:
+        path: CSV file; None keeps nothing.
+        kind: of the rows, a named tuple.
+        keys: first cells of the rows that are wanted.
+        measure: called with such cells, returns the row.
+    """
+    known = read_rows(path, kind) if path is not None and path.exists() else []
+    for key in keys:
+        row = next((row for row in known if row[: len(key)] == key), None)
+        if row is None:
+            known.append(row := measure(*key))
+            if path is not None:
+                write_csv(path, [each._asdict() for each in known], kind._fields)
+        yield row
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:

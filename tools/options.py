@@ -1,14 +1,24 @@
-"""Options of a command, read into its dataclass by tyro; whole numbers, and NAME=VALUE."""
+"""Words of the command line: options read into dataclasses by tyro, and ``--import`` of a user's games and models."""
 
+import hashlib
+import importlib.util
 import json
+import os
 import re
+import shlex
+import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
+from importlib.machinery import SourceFileLoader
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
-from arcade_torch.tools.optional import need
+from arcade_torch.tools.errors import need, one_line
 
+FLAG = "--import"
+VARIABLE = "ARCADE_TORCH_IMPORT"
+"""Environment variable that hands what was imported on to worker processes; entries separated like those of PATH."""
 _FRAME = re.compile(r"\x1b\[[0-9;]*m|^ *[│╭╰|+] ?| ?[│╮╯|+] *$", re.MULTILINE)
 _RULE = re.compile(r"^ *[─-](?: |[─-]{3}).*$", re.MULTILINE)
 _TITLES = ("Unrecognized options", "Value error", "Required options", "Invalid choice", "Parsing error")
@@ -27,33 +37,12 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
         ValueError: an option is unknown, missing or malformed; one line.
         SystemExit: help was asked for.
     """
-    tyro = need("tyro")
-    captured, extra = StringIO(), {} if default is None else {"default": default}
-    try:
-        with redirect_stderr(captured):
-            config = (tyro.conf.FlagCreatePairsOff,)
-            return tyro.cli(kind, args=list(words), prog=prog, config=config, registry=_registry(), **extra)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise ValueError(flatten_parser_message(captured.getvalue(), prog)) from None
-
-
-def flatten_parser_message(text: str, prog: str) -> str:
-    """Turn the framed message that the option parser wrote to stderr into one line."""
-    parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", text))]
-    said = [part for part in parts if part and part not in _TITLES] or ["the options could not be read"]
-    near = [part.split()[3] for part in said if part.startswith("Perhaps you meant: ")]
-    return said[0].rstrip(".") + "".join(f"; perhaps you meant {name}" for name in near) + f" (see {prog} --help)"
-
-
-def _registry() -> Any:
-    """Lets options that count take 2e7 and 40_000."""
-    constructors = need("tyro.constructors")
-    registry = constructors.ConstructorRegistry()
+    tyro, constructors = need("tyro"), need("tyro.constructors")
+    registry, captured = constructors.ConstructorRegistry(), StringIO()
 
     @registry.primitive_rule  # type: ignore[untyped-decorator]
     def whole(info: Any) -> Any:
+        """Let options that count take 2e7 and 40_000."""
         spec = constructors.PrimitiveConstructorSpec(
             nargs=1,
             metavar="INT",
@@ -63,7 +52,25 @@ def _registry() -> Any:
         )
         return spec if info.type is int else None
 
-    return registry
+    how: dict[str, Any] = {"config": (tyro.conf.FlagCreatePairsOff,), "registry": registry}
+    try:
+        with redirect_stderr(captured):
+            return tyro.cli(kind, args=list(words), prog=prog, **how, **({"default": default} if default else {}))
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    # The framed message that tyro wrote, in one line.
+    parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", captured.getvalue()))]
+    said = [part for part in parts if part and part not in _TITLES] or ["the options could not be read"]
+    near = [f"; perhaps you meant {part.split()[3]}" for part in said if part.startswith("Perhaps you meant: ")]
+    raise ValueError(f"{said[0].rstrip('.')}{''.join(near)} (see {prog} --help)")
+
+
+def at_least(options: Any, **least: float) -> None:
+    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``."""
+    for name, bound in least.items():
+        if not getattr(options, name) >= bound:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least {bound}, got {getattr(options, name)}")
 
 
 def whole_number(text: str) -> int:
@@ -95,3 +102,73 @@ def name_and_value(text: str) -> tuple[str, Any]:
         return name, json.loads(value.lower() if value in ("True", "False") else value)
     except (ValueError, RecursionError):  # no JSON, or numbers and nesting that Python does not read
         return name, value
+
+
+def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the remaining words.
+
+    Example:
+        >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
+        (['my_games'], ['train', '--env', 'PairsEasy'])
+    """
+    found, rest, pending = list[str](), list[str](), iter(words)
+    for word in pending:
+        flag, equals, value = word.partition("=")
+        if flag != FLAG:
+            rest.append(word)
+            continue
+        name = value if equals else next(pending, "")
+        if not name or "\0" in name:
+            raise ValueError(f"{FLAG} needs a file (games.py) or a module (package.games) that registers something")
+        found.append(str(Path(name).resolve()) if _is_file(name) else name)
+    return found, rest
+
+
+def load_extensions(names: Sequence[str] = ()) -> None:
+    """Import files and modules that register games or memory models, once a process, and all that a parent process did.
+
+    Raises:
+        FileNotFoundError: there is no such file or module.
+        ValueError: it could not be imported; says why in one line.
+    """
+    if wanted := list(dict.fromkeys([*imported(), *names])):
+        for name in wanted:
+            _load(name)
+        os.environ[VARIABLE] = os.pathsep.join(wanted)
+
+
+def imported() -> list[str]:
+    """What is imported in this process and its workers."""
+    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+
+
+def command_line(words: Sequence[str]) -> str:
+    """A line for a shell that runs ``arcade-torch`` with these words and the same imports."""
+    return shlex.join(["arcade-torch", *words, *(part for name in imported() for part in (FLAG, name))])
+
+
+def _is_file(name: str) -> bool:
+    return name.endswith(".py") or os.sep in name
+
+
+def _load(name: str) -> None:
+    if _is_file(name) and not Path(name).is_file():
+        raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
+    # A file gets a name of its own, so that two files of one name do not meet.
+    module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}" if _is_file(name) else name
+    try:
+        if not _is_file(name):
+            importlib.import_module(module)
+        elif module not in sys.modules:
+            spec: Any = importlib.util.spec_from_file_location(module, name, loader=SourceFileLoader(module, name))
+            sys.modules[module] = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(sys.modules[module])
+    except Exception as error:
+        sys.modules.pop(module, None)
+        if not isinstance(error, ModuleNotFoundError):
+            why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
+        elif error.name and (name == error.name or name.startswith(f"{error.name}.")):
+            raise FileNotFoundError(f"{FLAG} {name}: there is no module of that name; a file needs its .py") from error
+        else:
+            why = f"it imports {error.name}, which is not installed"
+        raise ValueError(f"{FLAG} {name}: {why}") from error

@@ -3,15 +3,13 @@
 import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from arcade_torch.agents.runs.files import read_csv, read_json, write_json
-from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.tables import markdown_table
+from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.tools.files import markdown_table, measured_rows
 
 PLAYERS = ("random", "state", "frames")
 """Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
@@ -20,8 +18,7 @@ EPISODES = 256
 """Of each player, for the reference lines of a report."""
 
 
-@dataclass(frozen=True)
-class Baseline:
+class Baseline(NamedTuple):
     """What one player earned in one game: mean undiscounted return, half its 95 % interval (normal approximation), mean
     length of an episode, and the seconds it took, compilation included.
     """
@@ -78,25 +75,14 @@ def references(
         except ValueError:
             if player == "random":
                 raise
-    write_json(file, {"how": how, "players": [asdict(row) for row in found.values()]})
+    write_json(file, {"how": how, "players": [row._asdict() for row in found.values()]})
     return found
 
 
 def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
     """Every player in every game, one row after another; rows that ``out`` holds already are not measured again."""
-    columns = [field.name for field in fields(Baseline)]
-    known = dict[tuple[str, str], Baseline]()
-    for row in read_csv(out) if out.exists() else []:
-        try:
-            numbers = map(float, (row[name] for name in columns[3:]))
-            known[row["id"], row["player"]] = Baseline(row["id"], row["player"], int(row["episodes"]), *numbers)
-        except (KeyError, ValueError) as error:
-            raise ValueError(f"{out} is no table of baselines ({error}); choose another --out") from None
-    for key in ((id, player) for id in ids for player in PLAYERS):
-        if key not in known:
-            known[key] = measure(*key, episodes, seconds)
-            write_csv(out, map(asdict, known.values()), columns)
-        yield known[key]
+    keys = ((id, player) for id in ids for player in PLAYERS)
+    return measured_rows(out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds))
 
 
 def markdown(rows: Iterable[Baseline]) -> str:

@@ -16,6 +16,7 @@ from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
 _SIZE = ("layers", "hidden_size")
+_VERSION = re.compile(r"-v\d+$")
 _NOT_SETTINGS = {
     *("env", "observability", "memory", "seed", "algorithm", "network", "network_options", "rules", "obs_size"),
     *("device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"),
@@ -96,8 +97,8 @@ def is_baseline(agent: str, baseline: str) -> bool:
 def find_baseline(agents: Sequence[str], baseline: str) -> str | None:
     """The memory-free agent that others are measured against: the one of that very name, else that of PQN, else any."""
     free = [agent for agent in agents if is_baseline(agent, baseline)]
-    lowered = [(name.lower() != baseline.lower(), not name.lower().startswith("pqn-")) for name in free]
-    return free[lowered.index(min(lowered))] if free else None
+    order = {name: (name.lower() != baseline.lower(), not name.lower().startswith("pqn-")) for name in free}
+    return min(free, key=order.__getitem__, default=None)
 
 
 @dataclass(frozen=True)
@@ -202,10 +203,8 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def open_run(path: Path) -> Run | None:
     """A run from its folder, None if it has not finished; refuses damaged settings by the name of the file."""
     run, file = Run(path), path / "config.json"
-    if not {"env", "memory"} <= set(run.config):
-        raise ValueError(f"{file} does not describe a run: it has no env or no memory")
-    if type(run.config.get("seed", 0)) is not int:
-        raise ValueError(f"{file} is damaged: its seed is {run.config['seed']!r}")
+    if not {"env", "memory"} <= set(run.config) or type(run.config.get("seed", 0)) is not int:
+        raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
     except ValueError as error:
@@ -282,9 +281,9 @@ def _folders(path: Path) -> list[Path]:
 
 def _check_comparable(found: Runs) -> None:
     """Refuse several versions or rules of a game, a run that stands there twice, and seeds that are none."""
-    games = sorted({run.game for run in found.runs if re.search(r"-v\d+$", run.game)})
+    games = sorted({run.game for run in found.runs if _VERSION.search(run.game)})
     for old, new in pairwise(games):
-        if old.rpartition("-v")[0] == new.rpartition("-v")[0]:
+        if _VERSION.sub("", old) == _VERSION.sub("", new):
             raise ValueError(f"runs of {old} and {new} cannot be compared: give one version of a game")
     for key in ("rules", "obs_size"):
         values = sorted({str(run.config[key]) for run in found.runs if key in run.config})
@@ -323,48 +322,49 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         metric: one of `METRICS`.
 
     Returns:
-        One score a run, in the order found. Unfinished runs are left out.
+        One score a run: those that were given, those of runs, those of tables. Unfinished runs are left out.
 
     Raises:
-        FileNotFoundError: a path does not exist or holds no run.
-        ValueError: the metric is unknown, a table lacks a column, or a run appears twice.
+        FileNotFoundError: a path does not exist.
+        ValueError: the metric is unknown, a folder holds no finished run, runs may not be compared, a table lacks a
+            column, or a run appears twice.
     """
     _known(metric)
-    found: list[tuple[AgentKey, Score]] = []  # whose agents have no names yet
-    for part in [runs] if isinstance(runs, str | Path) else list(runs):
-        found += [(AgentKey("", part.agent), part)] if isinstance(part, Score) else _read(Path(part), metric)
+    parts = [runs] if isinstance(runs, str | Path) else list(runs)
+    paths = [Path(part) for part in parts if not isinstance(part, Score)]
+    tables = {path: table for path in paths if (table := table_of(path))}
+    found = [(AgentKey("", part.agent), part) for part in parts if isinstance(part, Score)]  # agents without names yet
+    if folders := [path for path in paths if path not in tables]:
+        opened = find_runs(folders)
+        found += zip((run.key for run in opened.runs), opened.scores(metric), strict=True)
+    for table in tables.values():
+        found += _read_table(table, metric)
     names, newest = agent_names(key for key, _ in found), dict[str, str]()
-    for game in {score.game for _, score in found if re.search(r"-v\d+$", score.game)}:
-        bare = game.rpartition("-v")[0]  # stands for the newest version that is there
+    for game in {score.game for _, score in found if _VERSION.search(score.game)}:
+        bare = _VERSION.sub("", game)  # stands for the newest version that is there
         newest[bare] = max(newest.get(bare, game), game, key=lambda name: int(name.rpartition("-v")[2]))
     scores = [replace(score, agent=names[key], game=newest.get(score.game, score.game)) for key, score in found]
-    seen: set[tuple[str, str, str, int, str]] = set()
+    seen: set[Score] = set()
     for score in scores:
-        for name in (score.agent, score.game):
-            if name.splitlines() != [name]:
-                raise ValueError(f"names of agents and games are one line, not {name!r}")
-        cell = (score.agent, score.game, score.observability, score.seed, score.player)
+        if any(name.splitlines() != [name] for name in (score.agent, score.game)):
+            raise ValueError(f"names of agents and games are one line, not {score.agent!r} and {score.game!r}")
+        cell = replace(score, value=0.0)
         if cell in seen:
             raise ValueError(f"two scores for {score.agent} on {score.game} ({score.observability}), seed {score.seed}")
         seen.add(cell)
     return scores
 
 
+def table_of(path: Path) -> Path | None:
+    """The table of scores that a path is: a file, or the ``results.csv`` of a study that has lost its runs."""
+    bare = (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
+    return path if path.is_file() else path / "results.csv" if bare else None
+
+
 def _known(metric: str) -> str:
     if metric not in METRICS:
         raise ValueError(f"unknown metric {metric!r}: allowed are {', '.join(METRICS)}")
     return metric
-
-
-def _read(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
-    table = next((file for file in (path, path / "results.csv") if file.is_file()), None)
-    if table is not None:
-        return _read_table(table, metric)
-    if not (path / "config.json").is_file():
-        why = "holds neither a study (results.csv) nor a run (config.json)" if path.exists() else "does not exist"
-        raise FileNotFoundError(f"{path} {why}")
-    run = open_run(path)
-    return [] if run is None else [(run.key, Score("", run.game, run.twin, run.seed, run.value(metric)))]
 
 
 def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
@@ -389,8 +389,5 @@ def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
             made = Score("", game, twin, int(seed), float(score), row.get("player") or "")
         except ValueError:
             raise ValueError(f"{path}: seed {seed!r} or score {score!r} is not a number") from None
-        run = path.parent / "runs" / (row.get("run") or "")
-        by_settings = row.get("run") and path.name == "results.csv" and (run / "config.json").is_file()
-        key = AgentKey.of(Run(run).config) if by_settings else AgentKey(row.get("algorithm") or "", agent)
-        found.append((key, made))
+        found.append((AgentKey(row.get("algorithm") or "", agent), made))
     return found

@@ -62,7 +62,7 @@ def _use(study: Study) -> None:
     assert Study.from_dict(json.loads(json.dumps(study.to_dict()))).fixed().keys() == study.fixed().keys()
     for run in study.runs()[:4]:
         assert os.sep not in run.name and run.name not in ("", ".", "..")
-        study.command(run, Path("runs") / run.name)
+        StudyFolder(Path("out")).job(run)
 
 
 @fuzz(9_000)

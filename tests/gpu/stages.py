@@ -44,7 +44,7 @@ STUDY_COLUMNS = ("run", "status", "frames", "seconds", "eval_mean", "train_max_e
 MACHINE = """
 import sys
 from pathlib import Path
-from arcade_torch.tools.bench.harness import machine
+from arcade_torch.tools.machine import machine
 from arcade_torch.tools.files import write_csv
 row = machine()
 write_csv(Path(sys.argv[1]), [row], list(row))

@@ -56,7 +56,7 @@ def test_every_command_for_a_card_is_one_that_the_parser_takes(tmp_path: Path) -
     for stage in found:
         if "arcade_torch.tools" in stage.argv:
             command, options = cli.split_command(stage.argv[2:])
-            cli.read_command(command, options)
+            cli.command_class(command).parse(options, f"arcade-torch {command}")
     runs = Study.load(tmp_path / "study-small.toml")
     assert len(runs.runs()) == 20 and {runs.config(run).device for run in runs.runs()} == {"cuda"}
     paper = Study.load(tmp_path / "study-paper.toml")

@@ -18,8 +18,9 @@ import numpy as np
 from arcade_torch.envs_jax import BatchedGame, env_keys, make
 from arcade_torch.envs_jax.registry import GAMES
 from arcade_torch.tools.bench.envs import read_all
-from arcade_torch.tools.bench.harness import Measure, Measured, interleaved, machine
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.bench.harness import Measure, Measured, interleaved
+from arcade_torch.tools.files import Table
+from arcade_torch.tools.machine import machine
 from tests.parity.reference import PACKAGE, missing, published, resets, without_picture
 
 ENVS, SIZE = 128, 128

@@ -16,7 +16,7 @@ from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
-from arcade_torch.tools.versions import versions
+from arcade_torch.tools.machine import versions
 from tests.parity.faults import FAULTS, Fault, take_all
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/differences.md"

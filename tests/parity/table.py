@@ -5,7 +5,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.versions import versions
+from arcade_torch.tools.machine import versions
 from tests.parity.reference import PACKAGE
 from tests.parity.translations import TASKS
 from tests.parity.walk import OTHER_ENVS, RANDOM_ENVS, STEPS, Tally

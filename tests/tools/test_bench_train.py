@@ -40,9 +40,9 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
     ("words", "said"),
     [
         (["--out", "x.txt"], "must end in .csv or .json"),
-        (["--grad-steps", "0"], "--grad-steps must be 1 or more, got 0"),
+        (["--grad-steps", "0"], "--grad-steps must be at least 1, got 0"),
         (["--networks", "tiny"], "unknown preset 'tiny'"),
-        (["--threads", "-1"], "--threads must be 0 or more"),
+        (["--threads", "-1"], "--threads must be at least 0"),
         (["--forms", "amp+fast"], "a form is eager, amp, compiled, graphs, or several of them joined by '+'; got"),
         (["--forms", "graphs"], "cuda_graphs must be false on device 'cpu'; it needs a CUDA device"),
     ],

@@ -12,9 +12,9 @@ import pytest
 
 from arcade_torch.agents import preset
 from arcade_torch.tools import cli
-from arcade_torch.tools.commands.train import parse
-from arcade_torch.tools.optional import MissingPackage, need
-from arcade_torch.tools.progress import clock
+from arcade_torch.tools.commands.train import Train
+from arcade_torch.tools.errors import MissingPackage, need
+from arcade_torch.tools.options import whole_number
 from tests.own_registry import own_registry  # noqa: F401
 from tests.tools.fabricated import small_study, write_study
 
@@ -124,7 +124,7 @@ def test_a_missing_option_parser_is_named_too() -> None:
     assert result.stderr == "arcade-torch: the package tyro is missing: pip install 'arcade-torch[tools]'\n"
 
 
-@pytest.mark.parametrize("fault", [lambda: 1 // 0, lambda: clock("x"), lambda: int("x"), lambda: {}["x"]])
+@pytest.mark.parametrize("fault", [lambda: 1 // 0, lambda: whole_number(None), lambda: int("x"), lambda: {}["x"]])
 def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
     fault: Callable[[], Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,14 +173,14 @@ def test_the_hint_after_an_interruption_keeps_every_option(
 
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
     words = ["--preset", "small", "--total-frames", "2e4", "--eval-every", "40_000", "--ppo.lam", "0.5"]
-    config = parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").settings
+    config = Train.parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").settings
     assert (config.total_frames, config.eval_every, config.ppo.lam) == (20_000, 40_000, 0.5)
     assert config.ppo.num_envs == 64  # of the preset
     assert (dict(config.env_options), config.network_options["skip"]) == ({"noise": 0.5}, "residual")
 
 
 def test_a_folder_may_be_called_like_a_number() -> None:
-    parsed = parse(["--preset", "smoke", "--out", "1e3", "--seed", "1e3"], "train")
+    parsed = Train.parse(["--preset", "smoke", "--out", "1e3", "--seed", "1e3"], "train")
     assert (parsed.out, parsed.settings.seed) == (Path("1e3"), 1000)
 
 
@@ -189,8 +189,8 @@ def test_a_run_can_start_from_the_config_of_another_and_change_it(tmp_path: Path
     config = preset("smoke", env="SignpostEasy", pqn={"lam": 0.5})
     for content in (config.to_dict(), {"config": config.to_dict(), "versions": {}}):
         file.write_text(json.dumps(content))
-        assert parse(["--config", str(file)], "train").settings == config
-    changed = parse(["--config", str(file), "--seed", "3", "--pqn.gamma", "0.5"], "train").settings
+        assert Train.parse(["--config", str(file)], "train").settings == config
+    changed = Train.parse(["--config", str(file), "--seed", "3", "--pqn.gamma", "0.5"], "train").settings
     assert changed == preset("smoke", env="SignpostEasy", seed=3, pqn={"lam": 0.5, "gamma": 0.5})
 
 

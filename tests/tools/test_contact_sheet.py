@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.tools import cli
-from arcade_torch.tools.contact_sheet import GAP, PAPER, scene, strip
+from arcade_torch.tools.play.recording import GAP, PAPER, scene, strip
 
 
 def test_a_strip_is_made_of_scenes_with_a_gap_between_them() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.agents.runs.files import read_csv
-from arcade_torch.tools import cli, keep_memory, players
+from arcade_torch.tools import cli, machine, players
 from arcade_torch.tools.bench.envs import read_all
 from arcade_torch.tools.figures.throughput import NEEDED
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -139,7 +139,7 @@ def test_the_benchmark_leaves_the_c_library_as_a_user_has_it_and_says_so(
     words: list[str], kept: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calls: list[bool] = []
-    monkeypatch.setattr(keep_memory, "keep_freed_memory", lambda: calls.append(True))
+    monkeypatch.setattr(machine, "keep_freed_memory", lambda: calls.append(True))
     few = ["--games", "SignpostEasy", "--batches", "1", "--seconds", "0.001", "--repeats", "1"]
     assert cli.main(["bench", "envs", *few, *words]) == 0
     assert f"keep_memory {kept}" in capsys.readouterr().out and bool(calls) is bool(words)

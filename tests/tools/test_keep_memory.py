@@ -5,12 +5,12 @@ import sys
 
 import pytest
 
-from arcade_torch.tools import keep_memory
+from arcade_torch.tools import machine
 
 COUNT_FAULTS = """
 import resource, sys
 import torch
-from arcade_torch.tools.keep_memory import keep_freed_memory
+from arcade_torch.tools.machine import keep_freed_memory
 
 if sys.argv[1] == "keep":
     assert keep_freed_memory()
@@ -28,12 +28,12 @@ def faults(word: str) -> int:
     return int(done.stdout)
 
 
-@pytest.mark.skipif(keep_memory.platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
+@pytest.mark.skipif(machine.platform.libc_ver()[0] != "glibc", reason="a setting of glibc")
 def test_a_large_tensor_that_was_freed_costs_no_page_faults_again() -> None:
     assert faults("keep") < 200  # without it, one a page or one a huge page: the machine decides
 
 
 def test_elsewhere_than_on_glibc_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keep_memory.platform, "libc_ver", lambda: ("", ""))
-    monkeypatch.setattr(keep_memory.ctypes, "CDLL", None)
-    assert keep_memory.keep_freed_memory() is False
+    monkeypatch.setattr(machine.platform, "libc_ver", lambda: ("", ""))
+    monkeypatch.setattr(machine.ctypes, "CDLL", None)
+    assert machine.keep_freed_memory() is False

@@ -18,7 +18,7 @@ from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES
 from arcade_torch.tools import cli
 from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.play import terminal, window
+from arcade_torch.tools.play import screens
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay, score_row
 from arcade_torch.tools.play.session import KEYS, Attempt, Session
 from arcade_torch.tools.runs import read_scores
@@ -221,9 +221,9 @@ def pygame(monkeypatch: pytest.MonkeyPatch) -> object:
 def test_a_window_plays_what_is_pressed_and_shows_it(pygame: object, monkeypatch: pytest.MonkeyPatch) -> None:
     player, found = session(seed=3)
     shown = []
-    original = window.Window.show
+    original = screens.Window.show
 
-    def show(self: window.Window, frame: np.ndarray, title: str) -> None:
+    def show(self: screens.Window, frame: np.ndarray, title: str) -> None:
         original(self, frame, title)
         surface = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
         shown.append((surface, pygame.display.get_caption()[0]))
@@ -231,9 +231,9 @@ def test_a_window_plays_what_is_pressed_and_shows_it(pygame: object, monkeypatch
     keys = ["K_SPACE", "K_RIGHT", "K_q", "K_p", "K_r", "K_UP", "K_DOWN", "K_LEFT"]
     events = [[pygame.event.Event(pygame.KEYDOWN, key=getattr(pygame, key))] for key in keys]
     events.append([pygame.event.Event(pygame.QUIT)])
-    monkeypatch.setattr(window.Window, "show", show)
+    monkeypatch.setattr(screens.Window, "show", show)
     monkeypatch.setattr(pygame.event, "get", lambda types: events.pop(0))
-    window.play_in_window(player, scale=3, key_repeat_ms=50)
+    screens.play_in_window(player, scale=3, key_repeat_ms=50)
     assert player.closed and pygame.display.get_surface() is None
     assert [a.actions for a in found] == ["43", "012"]
     twin, _ = session(seed=3)
@@ -248,8 +248,8 @@ def test_a_window_plays_what_is_pressed_and_shows_it(pygame: object, monkeypatch
 
 
 def test_every_key_of_the_window_and_of_the_terminal_is_one_of_the_session(pygame: object) -> None:
-    assert set(window._KEYS.values()) == set(KEYS) == set(terminal._KEYS.values())
-    assert all(hasattr(pygame, constant) for constant in window._KEYS)
+    assert set(screens.WINDOW_KEYS.values()) == set(KEYS) == set(screens.TERMINAL_KEYS.values())
+    assert all(hasattr(pygame, constant) for constant in screens.WINDOW_KEYS)
 
 
 def test_without_display_or_pygame_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,15 +257,15 @@ def test_without_display_or_pygame_there_is_a_reason(monkeypatch: pytest.MonkeyP
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert "pip install 'arcade-torch[play]'" in str(window.why_no_window())
+    assert "pip install 'arcade-torch[play]'" in str(screens.why_no_window())
 
 
 def test_without_a_display_there_is_a_reason(pygame: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert window.why_no_window() is None
+    assert screens.why_no_window() is None
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    assert window.why_no_window() == "there is no display"
+    assert screens.why_no_window() == "there is no display"
 
 
 # -- terminal -----------------------------------------------------------------------------------------------------
@@ -284,7 +284,7 @@ def test_without_a_display_there_is_a_reason(pygame: object, monkeypatch: pytest
     ],
 )
 def test_terminal_sequences_are_keys(data: bytes, keys: list[str]) -> None:
-    assert terminal.decode_keys(data) == keys
+    assert screens.decode_keys(data) == keys
 
 
 def painted(lines: list[str]) -> np.ndarray:
@@ -306,22 +306,23 @@ def painted(lines: list[str]) -> np.ndarray:
 
 def test_half_blocks_draw_every_pixel() -> None:
     player, _ = session()
-    assert (painted(terminal.half_blocks(player.frame)) == player.frame).all()
+    assert (painted(screens.half_blocks(player.frame, 128, 128)) == player.frame).all()
 
 
 @pytest.mark.parametrize(("height", "width"), [(128, 128), (44, 80), (300, 300), (2, 7), (1, 1)])
 def test_a_frame_shrinks_to_the_terminal_and_keeps_its_mean(height: int, width: int) -> None:
     frame = np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8)
-    small = terminal.shrink(frame, height, width)
-    assert small.shape[0] == small.shape[1] == min(height, width, 128)
+    side = min(height, width, 128)
+    small = painted(screens.half_blocks(frame, height, width))[:side]  # an odd last row has a black one below it
+    assert small.shape == (side, side, 3)
     assert small.mean() == pytest.approx(frame.mean(), abs=1.5)
     flat = np.full_like(frame, 77)
-    assert (terminal.shrink(flat, height, width) == 77).all()
+    assert (painted(screens.half_blocks(flat, height, width))[:side] == 77).all()
 
 
 def test_the_screen_fits_the_terminal() -> None:
     player, _ = session(both=True)
-    lines = terminal.screen(player, 80, 24).split("\r\n")
+    lines = screens.screen(player, 80, 24).split("\r\n")
     plain = [re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", line) for line in lines]
     assert len(plain) <= 24 and max(map(len, plain)) <= 80
     assert player.caption[:80] in plain
@@ -382,7 +383,7 @@ def test_a_terminal_plays_and_is_left_as_it_was(tmp_path: Path) -> None:
         (["play"], "Missing from arcade-torch play"),
         (["play", "MineSweperEasy"], "did you mean 'MineSweeperEasy'"),
         (["play", GAME, "--scale", "0"], "--scale must be at least 1, got 0"),
-        (["play", GAME, "--key-repeat", "-1"], "--key-repeat must be 0 or more"),
+        (["play", GAME, "--key-repeat", "-1"], "--key-repeat must be at least 0"),
         (["play", GAME, "--episodes", "-1"], "episodes is -1"),
         (["play", GAME, "--obs-size", "64"], "64"),
         (["play", GAME, "--seed", "-1"], "seed is -1, allowed: 0 to 4294967295"),
@@ -418,7 +419,7 @@ def test_the_command_opens_a_window_and_goes_on_with_seeds_that_the_player_has_n
         met.append((player.seed, scale, key_repeat_ms, player.game.obs_size))
         press(player, "0q")
 
-    monkeypatch.setattr(window, "play_in_window", play)
+    monkeypatch.setattr(screens, "play_in_window", play)
     words = ["play", GAME, "--scale", "3", "--key-repeat", "80", "--obs-size", "128"]
     words += ["--scores", str(tmp_path / "h.csv"), "--player"]
     for player in ("ann", "ann", "bob"):

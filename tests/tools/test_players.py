@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.tools import cli, players
-from arcade_torch.tools.contact_sheet import scene, sheet
+from arcade_torch.tools.play.recording import scene, sheet
 
 
 def test_a_row_holds_mean_interval_and_length() -> None:
@@ -59,7 +59,7 @@ def test_a_file_of_something_else_is_refused_and_kept(tmp_path: Path, capsys: py
     out = tmp_path / "b.csv"
     out.write_text("a,b\n1,2\n")
     assert cli.main(["list", "baselines", "SignpostEasy", "--out", str(out)]) == cli.EXIT_BAD_INPUT
-    assert "is no table of baselines" in capsys.readouterr().err
+    assert "is no table with columns id, player" in capsys.readouterr().err
     assert out.read_text() == "a,b\n1,2\n"
 
 

@@ -1,8 +1,11 @@
 """The line that says how a run stands."""
 
+import time
 from io import StringIO
 
-from arcade_torch.tools.progress import TrainBar, standing
+import pytest
+
+from arcade_torch.tools.progress import Bars, standing
 
 ROW = {
     "frames": 4_000,
@@ -17,17 +20,32 @@ ROW = {
 }
 
 
-def test_a_line_shows_speed_time_left_returns_loss_exploration_and_step_size() -> None:
+def test_a_line_shows_speed_and_time_left_and_the_last_line_how_far_it_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, stream = [100.0], StringIO()
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("rich.console.monotonic", lambda: now[0])
+    with Bars(stream, "frames") as bars:
+        for done in (9_000, 10_000, 11_000, 12_000):  # what there was at the start is no speed
+            bars.update("run", done, 16_000, "return 0.250")
+            now[0] += 10
+    assert stream.getvalue().splitlines() == [
+        "run: 11,000 of 16,000 frames (69 %), 100 frames/s, 0:00:50 left, return 0.250",
+        "run: 12,000 of 16,000 frames (75 %), 100 frames/s, 0:00:40 left, return 0.250",
+    ]
+
+
+def test_what_is_no_work_of_frames_prints_a_line_now_and_then_only() -> None:
     stream = StringIO()
-    with TrainBar("run", stream) as bar:
-        bar.speed.update(-4.0, 0)  # so that there is a speed at the first row
-        bar.show(ROW)
-    line = stream.getvalue()
-    assert line.startswith("4,000 of 16,000 frames, ") and " frames/s, " in line and " left; return 0.250, " in line
-    assert line.endswith("of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05\n")
+    with Bars(stream) as bars:
+        bars.update("players", 1, 3)
+    with Bars(stream, first_line_s=0) as bars:
+        bars.update("players", 2, 3)
+        bars.update("film", 7, 0, "frame 7")
+    assert stream.getvalue() == "players: 2 of 3 (67 %)\n"
 
 
 def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appears_when_there_is_one() -> None:
     row = {**ROW, "epsilon": None, "entropy": 1.5, "eval_return": -0.125}
+    assert standing(ROW) == "return 0.250, of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05"
     assert "greedy -0.125, loss 0.0123, entropy 1.50, lr" in standing(row)
     assert standing({"frames": 1, "total_frames": 2, "lr": 1e-3}) == "lr 1.0e-03"

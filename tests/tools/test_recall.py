@@ -10,6 +10,7 @@ from arcade_torch.models import MemoryBlock, memory_names
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import recall
 from arcade_torch.tools.bench.recall import ASK, SOLVED, UNLABELLED, Recall, train, windows
+from arcade_torch.tools.files import read_rows
 
 
 @pytest.mark.parametrize("mixed", [False, True])
@@ -79,14 +80,14 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     assert cli.main(words) == cli.EXIT_OK
     assert torch.get_num_threads() == threads and "measuring gdn, delay 2" in capsys.readouterr().err
     text = page.read_text()
-    assert recall.markdown(recall.read_recall(out)) in text
+    assert recall.markdown(read_rows(out, Recall)) in text
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
     assert "| `gdn` | " in text and "| delay 1 | delay 2 |" in text
     monkeypatch.setattr(recall, "train", None)
     assert cli.main(words) == cli.EXIT_OK and page.read_text() == text
     out.write_text("a,b\n1,2\n")
     assert cli.main(words) == cli.EXIT_BAD_INPUT
-    assert "is no table of delayed recall" in capsys.readouterr().err
+    assert "is no table with columns model, delay, hidden_size" in capsys.readouterr().err
     assert cli.main(["bench", "recall", "--seconds", "0"]) == cli.EXIT_BAD_INPUT
 
 
@@ -96,7 +97,7 @@ def test_a_row_reads_the_same_after_it_was_saved(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(recall.time, "process_time", lambda: next(passed))
     options = recall.Options(memories=("gdn",), delays=(1,), hidden_size=8, seconds=0.2, out=out)
     ((_, row),) = recall.run(options, print)
-    assert [found._asdict() for found in recall.read_recall(out)] == [row] and row["seconds"] == 0.25
+    assert [found._asdict() for found in read_rows(out, Recall)] == [row] and row["seconds"] == 0.25
 
 
 def test_the_table_says_what_was_not_solved() -> None:

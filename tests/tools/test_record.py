@@ -123,6 +123,13 @@ def test_a_gif_holds_the_true_frames(tmp_path: Path, both: bool) -> None:
     assert sum(durations) == 50 * len(frames)
 
 
+def test_a_gif_keeps_a_frame_of_256_colours(tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).choice(2**24, 256, replace=False)[:, None] >> np.array([16, 8, 0]) & 255
+    frame = colours[np.random.default_rng(1).permutation(4096) % 256].reshape(64, 64, 3).astype(np.uint8)
+    kept, _ = pictures(write_gif(tmp_path / "x.gif", [frame], 10.0))
+    assert (kept[0] == frame).all()
+
+
 def test_frames_of_many_colours_are_written_too(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3)).astype(np.uint8)
     kept, _ = pictures(write_gif(tmp_path / "x.gif", noise, 10.0))

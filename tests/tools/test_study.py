@@ -13,11 +13,12 @@ from pathlib import Path
 import pytest
 
 from arcade_torch.agents.runs.files import read_csv
-from arcade_torch.tools.progress import Speed
-from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, available_cores
+from arcade_torch.tools.machine import available_cores
+from arcade_torch.tools.progress import Bars
+from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
-from arcade_torch.tools.studies.runner import DiskFullError, Display, make_engine, planned, study
+from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, show_progress, shown, study
 from tests.tools.fabricated import small_study, write_run, write_study
 
 
@@ -364,14 +365,7 @@ def test_engines_are_made_by_name() -> None:
     with pytest.raises(ValueError, match="workers"):
         make_engine("processes", -1)
     with pytest.raises(ValueError, match="--address is for --engine ray"):
-        make_engine("processes", address="auto")
-
-
-def test_speed_is_that_of_the_last_seconds() -> None:
-    speed = Speed()
-    assert speed.update(0, 0) == 0
-    assert speed.update(5, 500) == 100
-    assert speed.update(50, 9500) == pytest.approx(200)
+        make_engine("processes", ray=RayOptions(address="auto"))
 
 
 def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
@@ -380,15 +374,17 @@ def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -
     runs = what.runs()
     write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
     write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
-    display = Display("toy", {run.name: folder.run(run) for run in runs}, {runs[0].name}, io.StringIO())
-    assert display.show() == "1/4 runs, 3,072 of 8,192 frames (38 %)"
+    stream = io.StringIO()
+    with Bars(stream, "frames") as bars:
+        show_progress(bars, "toy", {run.name: folder.run(run) for run in runs}, {runs[0].name})
+    assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 1/4 runs\n"
 
 
 def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
-    with Display("toy", {}, set(), stream) as display:
-        display.note("hello")
-    assert stream.getvalue() == "toy: hello\ntoy: 0/0 runs, 0 of 0 frames (0 %)\n"
+    with shown("toy", {}, set(), stream) as note:
+        note("hello")
+    assert stream.getvalue() == "toy: hello\ntoy: 0 frames, 0/0 runs\n"
 
 
 def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
@@ -400,8 +396,8 @@ def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
     folder = write_study(tmp_path / "s", small_study(seeds=1)).run(run)
     write_run(folder.path, run, 0.5, frames=2048, status="running")
     stream = Terminal()
-    with Display("toy", {run.name: folder}, set(), stream) as display:
-        display.show()
+    with shown("toy", {run.name: folder}, set(), stream):
+        pass
     assert "toy" in stream.getvalue() and "50%" in stream.getvalue()
 
 

@@ -48,13 +48,6 @@ class Options(BenchOptions):
     """Turns; medians are shown."""
 
 
-SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {"games": ("SignpostEasy",), "batches": (2,), "seconds": 0.01, "repeats": 1},
-    "quick": {"batches": (16, 128), "seconds": 0.2, "repeats": 3},
-    "full": {"sizes": (128, 256)},
-}
-
-
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
@@ -75,12 +68,9 @@ def measure_game(game: str, size: int, count: int, seconds: float, repeats: int)
     drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {"step": 0.0}
     for name, result in found.items():
         row: dict[str, Any] = {"game": game, "obs_size": size, "num_envs": count, "measure": name}
-        row |= {
-            "frames": result.units,
-            "frames_per_s": result.rate,
-            "frames_per_s_with_check": median(result.rates_with_check),
-        }
-        row |= {"gb_per_s": drawn[name], **{f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}}
+        row |= {"frames": result.units, "frames_per_s": result.rate}
+        row |= {"frames_per_s_with_check": median(result.rates_with_check), "gb_per_s": drawn[name]}
+        row |= {f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}
         yield row | {"checksum": result.checksum}
 
 

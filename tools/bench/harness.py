@@ -1,29 +1,13 @@
-"""What all benchmarks share: measures in turns with every result consumed, the machine, kinds of operation.
+"""What all benchmarks share: measures in turns with every result consumed, and kinds of operation.
 
 Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is torch's, which waits for
 the device.
 """
 
-import os
-import platform
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many threads inside, and as many as before afterwards."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True)
@@ -84,24 +68,6 @@ def interleaved(
             into.rates.append(units / working)
             into.rates_with_check.append(units / (working + checking))
     return found
-
-
-def machine() -> dict[str, Any]:
-    """Device, cores and versions that a result was measured with."""
-    import jax
-    import torch
-
-    from arcade_torch.tools.versions import versions
-
-    device = jax.devices()[0]
-    return {
-        "jax_device": f"{device.platform} ({device.device_kind})",
-        "torch_device": "cuda" if torch.cuda.is_available() else "cpu",
-        "processor": platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "torch_threads": torch.get_num_threads(),
-        **versions(),
-    }
 
 
 KINDS = {

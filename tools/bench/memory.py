@@ -1,8 +1,9 @@
 """Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency; costs."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple, TypeVar
 from unittest.mock import patch
 
@@ -13,8 +14,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from arcade_torch.models import fast_weights, linear_scan, lru, make_memory, matrix_scan_loop, memory_names, mingru
 from arcade_torch.models.scan import back_end
 from arcade_torch.models.scan_triton import runs_triton
-from arcade_torch.tools.bench.harness import Measure, interleaved, torch_threads
+from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
+from arcade_torch.tools.machine import torch_threads
 
 TORCH_GRU = "torch.nn.GRU"
 """It knows no starts and ignores them."""
@@ -92,16 +94,6 @@ class Options(BenchOptions):
     """Turns."""
 
 
-SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {
-        **{"memories": ("gru",), "steps": (8,), "layers": (1,), "size": 8, "batch": 2},
-        **{"frames": 4, "seconds": 0.01, "repeats": 1},
-    },
-    "quick": {"steps": (132,), "layers": (1,), "seconds": 0.2, "repeats": 2},
-    "full": {},
-}
-
-
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the tables ``models``, ``scans`` and ``saliency``."""
     batch, size = options.batch, options.size
@@ -109,44 +101,40 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
         raise ValueError("steps, layers, size, batch, frames and threads must be at least 1")
     if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
         raise ValueError(f"device must be cpu, or cuda where torch finds a card, got {options.device!r}")
-    how = (torch.device(options.device), options.seconds, options.repeats)
+    device, how = torch.device(options.device), (options.seconds, options.repeats)
     with torch_threads(options.threads):
-        for steps in options.steps:
-            for layers in options.layers:
-                log(f"memory models, T = {steps}, layers: {layers}")
-                compared = forms(options.memories or memory_names(), layers, size, how[0])
-                yield from (("models", row) for row in bench_models(compared, layers, (batch, steps, size), *how))
+        for steps, layers in product(options.steps, options.layers):
+            log(f"memory models, T = {steps}, layers: {layers}")
+            compared = forms(options.memories or memory_names(), layers, size, device)
+            inputs = torch.randn(batch, steps, size, device=device), torch.rand(batch, steps, device=device) < RESETS
+            for (model, form), found in time_passes(compared, _learn, inputs, *how).items():
+                yield "models", {"model": model, "form": form, "layers": layers, "steps": steps} | found
         for steps in options.steps:
             log(f"scans, T = {steps}")
-            yield from (("scans", row) for row in bench_scans(batch, steps, size, *how))
+            yield from (("scans", row) for row in bench_scans(batch, steps, size, device, *how))
         log("saliency")
-        yield from (("saliency", row) for row in bench_saliency(options.frames, *how))
-
-
-class Stack(nn.Module):
-    """Cells one above the other and nothing between, from their initial states: what ``torch.nn.GRU`` does too."""
-
-    def __init__(self, name: str, layers: int, size: int) -> None:
-        super().__init__()
-        self.cells = nn.ModuleList(make_memory(name, size, size) for _ in range(layers))
-
-    def forward(self, x: Tensor, is_init: Tensor) -> Tensor:
-        """[B, T, H] to [B, T, H]."""
-        for cell in self.cells:
-            x, _ = cell(x, cell.initial_state(len(x)), is_init)  # type: ignore[operator]
-        return x
+        yield from (("saliency", row) for row in bench_saliency(options.frames, device, *how))
 
 
 def forms(
     names: Sequence[str], layers: int, size: int, device: torch.device | str = "cpu"
 ) -> dict[tuple[str, str], Run]:
-    """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T]) to y."""
+    """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T]) to y.
+
+    A model is a number of cells one above the other and nothing between, as in ``torch.nn.GRU``.
+    """
+
+    def run(cells: Iterable[Any], x: Tensor, is_init: Tensor) -> Tensor:
+        for cell in cells:
+            x, _ = cell(x, cell.initial_state(len(x)), is_init)
+        return x
+
     found: dict[tuple[str, str], Run] = {}
     for name in names:
-        stack = Stack(name, layers, size).to(device)
+        stack = partial(run, [make_memory(name, size, size).to(device) for _ in range(layers)])
         found[name, "scan" if name in LOOPS else "own"] = stack
         if name in LOOPS:
-            found[name, "loop"] = patch.object(*LOOPS[name])(stack.forward)
+            found[name, "loop"] = patch.object(*LOOPS[name])(stack)
     gru = nn.GRU(size, size, num_layers=layers, batch_first=True).to(device)
     found[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
     return found
@@ -185,20 +173,6 @@ def _learn(y: Tensor) -> None:
     y.square().mean().backward()
 
 
-def bench_models(
-    compared: dict[tuple[str, str], Run],
-    layers: int,
-    shape: tuple[int, int, int],
-    device: torch.device,
-    seconds: float,
-    repeats: int,
-) -> Iterator[dict[str, Any]]:
-    """Models over whole sequences [B, T, H] in turns, one row each."""
-    inputs = (torch.randn(shape, device=device), torch.rand(shape[:2], device=device) < RESETS)
-    for (model, form), found in time_passes(compared, _learn, inputs, seconds, repeats).items():
-        yield {"model": model, "form": form, "layers": layers, "steps": shape[1]} | found
-
-
 def scan_forms(device: torch.device) -> tuple[str, ...]:
     """Ways to solve h_t = a_t h_{t-1} + b_t: the back ends for the device, and a loop under autograd."""
     if device.type != "cuda":
@@ -215,10 +189,8 @@ def bench_scans(
     batch: int, steps: int, size: int, device: torch.device, seconds: float, repeats: int
 ) -> Iterator[dict[str, Any]]:
     """Every form in turns, one row each, real and complex, from zeros, starts folded in as a_t = 0; then a copy."""
-    for numbers, dtype, exact in (
-        ("real", torch.float32, torch.float64),
-        ("complex", torch.complex64, torch.complex128),
-    ):
+    doubles = {torch.float32: torch.float64, torch.complex64: torch.complex128}
+    for numbers, (dtype, exact) in zip(("real", "complex"), doubles.items(), strict=True):
         a, b = (torch.randn(batch, steps, size, dtype=dtype, device=device) for _ in "ab")
         a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, steps, size, device=device)
         a[torch.rand(batch, steps, device=device) < RESETS] = 0
@@ -230,11 +202,8 @@ def bench_scans(
             yield {"form": name, "steps": steps, "numbers": numbers} | times[name] | {"error": error}
         one, both = (tensors * b.numel() // 2 for tensors in (FORWARD_TENSORS, FORWARD_TENSORS + BACKWARD_TENSORS))
         source, target = (torch.zeros(both, dtype=dtype, device=device) for _ in "st")  # a copy reads and writes
-        copies = {
-            "forward_ms": _repeated(partial(target[:one].copy_, source[:one]), device),
-            "both_ms": _repeated(partial(target.copy_, source), device),
-        }
-        found = interleaved(copies, seconds, repeats)
+        copies = {"forward_ms": partial(target[:one].copy_, source[:one]), "both_ms": partial(target.copy_, source)}
+        found = interleaved({name: _repeated(copy, device) for name, copy in copies.items()}, seconds, repeats)
         least = {name: measured.best_ms for name, measured in found.items()}
         yield {"form": COPY, "steps": steps, "numbers": numbers} | least | {"error": 0.0}
 
@@ -279,10 +248,8 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
     x, is_init = like.new_zeros(1, 1, input_size), torch.zeros(1, 1, dtype=torch.bool, device=like.device)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         memory(x, state, is_init)
-    numbers, size_in_bytes = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
-    return MemoryCost(
-        sum(p.numel() for p in memory.parameters()), numbers, size_in_bytes, counter.get_total_flops() // 2
-    )
+    state_size = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
+    return MemoryCost(sum(p.numel() for p in memory.parameters()), *state_size, counter.get_total_flops() // 2)
 
 
 def time_memories(

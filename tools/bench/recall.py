@@ -20,12 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.models import MemoryBlock, memory_names
-from arcade_torch.tools.bench.harness import torch_threads
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.files import write_between, write_csv
-from arcade_torch.tools.tables import markdown_table
+from arcade_torch.tools.files import markdown_table, measured_rows, write_between
+from arcade_torch.tools.machine import torch_threads
 
 SYMBOLS, DISTRACTORS = 4, 4
 ASK = SYMBOLS + DISTRACTORS
@@ -68,13 +66,6 @@ class Options(BenchOptions):
     """Markdown page that gets the table between its marks."""
 
 
-SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {"memories": ("gru",), "delays": (2,), "seconds": 0.5},
-    "quick": {"memories": ("lru", "mingru", "gru"), "delays": (8,), "seconds": 10.0},
-    "full": {},
-}
-
-
 class Recall(NamedTuple):
     """What one model reached at one delay: a row of the table."""
 
@@ -97,19 +88,17 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
             "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
             f"{options.seconds}, {options.hidden_size} and {options.delays}"
         )
-    rows = read_recall(options.out) if options.out is not None and options.out.exists() else []
-    known = {row[:4]: row for row in rows}
-    asked = []
+    sizes, asked = (options.hidden_size, options.seed), []
+
+    def measure(memory: str, delay: int, hidden_size: int, seed: int) -> Recall:
+        log(f"{memory}, delay {delay}")
+        return train(memory, delay, hidden_size, options.seconds, seed)
+
+    keys = ((*key, *sizes) for key in product(options.memories or memory_names(), options.delays))
     with torch_threads(1):
-        for memory, delay in product(options.memories or memory_names(), options.delays):
-            key = (memory, delay, options.hidden_size, options.seed)
-            if key not in known:
-                log(f"{memory}, delay {delay}")
-                known[key] = train(memory, delay, options.hidden_size, options.seconds, options.seed)
-                if options.out is not None:
-                    write_csv(options.out, [row._asdict() for row in known.values()], Recall._fields)
-            asked.append(known[key])
-            yield "recall", known[key]._asdict()
+        for row in measured_rows(options.out, Recall, keys, measure):
+            asked.append(row)
+            yield "recall", row._asdict()
     if options.page is not None:
         write_between(options.page, BEGIN, END, markdown(asked))
 
@@ -196,28 +185,14 @@ def accuracy(reader: Reader, rng: np.random.Generator, delay: int, answers: int)
     return right / asked, asked
 
 
-def read_recall(path: Path) -> list[Recall]:
-    """The rows of a file that an earlier run has written."""
-    kinds = Recall.__annotations__
-    try:
-        return [Recall(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in read_csv(path)]
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} is no table of delayed recall ({error}); choose another --out") from None
-
-
 def markdown(rows: Sequence[Recall]) -> str:
     """The rows as a Markdown table: a line a model, a column a delay."""
-    delays = sorted({row.delay for row in rows})
-    found = {(row.model, row.delay): row for row in rows}
-    lines = []
+    lines, delays = [], sorted({row.delay for row in rows})
     for model, one in {row.model: row for row in rows}.items():
-        cells = [_cell(found.get((model, delay))) for delay in delays]
-        lines.append([f"`{model}`", *cells, f"{one.parameters:,}", f"{one.state_numbers:,}"])
+        cells = dict.fromkeys(delays, "")
+        for row in (row for row in rows if row.model == model):
+            effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
+            solved = "" if row.accuracy >= SOLVED else "not solved: "
+            cells[row.delay] = f"{100 * row.accuracy:.1f} % ({solved}{effort})"
+        lines.append([f"`{model}`", *cells.values(), f"{one.parameters:,}", f"{one.state_numbers:,}"])
     return markdown_table(["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines)
-
-
-def _cell(row: Recall | None) -> str:
-    if row is None:
-        return ""
-    effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
-    return f"{100 * row.accuracy:.1f} %" + (f" ({effort})" if row.accuracy >= SOLVED else f" (not solved: {effort})")

@@ -21,8 +21,25 @@ BENCHES = {
     "memory": "time of the memory models, of the scans behind them, and of saliency",
     "recall": "delayed recall: which model remembers one symbol for how long",
 }
-"""Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`), ``SIZES`` and
-``run(options, log)``, which yields ``(table, row)``."""
+"""Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`) and ``run(options, log)``, which
+yields ``(table, row)``."""
+SIZES: dict[str, dict[str, dict[str, Any]]] = {
+    "tiny": {
+        "envs": {"games": ("SignpostEasy",), "batches": (2,), "seconds": 0.01, "repeats": 1},
+        "train": {"networks": ("small",), "memories": ("mlp",), "grad_steps": 1, "repeats": 1},
+        "memory": {"memories": ("gru",), "steps": (8,), "layers": (1,), "size": 8, "batch": 2, "frames": 4,
+                   "seconds": 0.01, "repeats": 1},
+        "recall": {"memories": ("gru",), "delays": (2,), "seconds": 0.5},
+    },
+    "quick": {
+        "envs": {"batches": (16, 128), "seconds": 0.2, "repeats": 3},
+        "train": {"networks": ("small",), "grad_steps": 2},
+        "memory": {"steps": (132,), "layers": (1,), "seconds": 0.2, "repeats": 2},
+        "recall": {"memories": ("lru", "mingru", "gru"), "delays": (8,), "seconds": 10.0},
+    },
+    "full": {"envs": {"sizes": (128, 256)}},
+}  # fmt: skip
+"""Size of ``bench all`` -> the options of each benchmark that differ from its own."""
 
 
 @dataclass
@@ -45,44 +62,31 @@ class Kind(NamedTuple):
 
 
 MORE_IS_BETTER = ("frames/s", "share")
+_TIMES = {"forward_ms": "ms", "both_ms": "ms"}
 TABLES: dict[str, Kind] = {
-    "envs": Kind(
-        "Environments: frames per second, every frame consumed",
-        ("game", "obs_size", "num_envs", "measure"),
-        {"frames_per_s": "frames/s"},
-    ),
-    "train": Kind(
-        "Training with PQN: frames per second",
-        ("network", "memory", "form", "num_envs", "num_steps"),
-        dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s"),
-    ),
-    "models": Kind(
-        "Memory models over whole sequences",
-        ("model", "form", "layers", "steps"),
-        {"forward_ms": "ms", "both_ms": "ms"},
-    ),
-    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), {"forward_ms": "ms", "both_ms": "ms"}),
+    "envs": Kind("Environments: frames per second, every frame consumed",
+                 ("game", "obs_size", "num_envs", "measure"), {"frames_per_s": "frames/s"}),
+    "train": Kind("Training with PQN: frames per second", ("network", "memory", "form", "num_envs", "num_steps"),
+                  dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s")),
+    "models": Kind("Memory models over whole sequences", ("model", "form", "layers", "steps"), _TIMES),
+    "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), _TIMES),
     "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms"}),
-    "recall": Kind(
-        "Delayed recall: right answers, and processor time until they were right",
-        ("model", "delay", "hidden_size", "seed"),
-        {"accuracy": "share", "seconds": "s"},
-    ),
-}
+    "recall": Kind("Delayed recall: right answers, and processor time until they were right",
+                   ("model", "delay", "hidden_size", "seed"), {"accuracy": "share", "seconds": "s"}),
+}  # fmt: skip
 """What a file may hold; whoever adds a benchmark adds its tables here."""
 
 Log = Callable[[str], None]
 
 
 def module_of(name: str) -> Any:
-    """The module of a benchmark: ``Options``, ``SIZES``, ``run``."""
+    """The module of a benchmark: ``Options``, ``run``."""
     return import_module(f"arcade_torch.tools.bench.{name}")
 
 
 def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[str, Any]:
     """Run benchmarks one after another, those that keep freed memory last; the content of a file, four digits."""
-    from arcade_torch.tools.bench.harness import machine
-    from arcade_torch.tools.keep_memory import keep_freed_memory
+    from arcade_torch.tools.machine import keep_freed_memory, machine
 
     tables: dict[str, Any] = {}
     kept = [name for name, options in benches.items() if options.keep_memory]
@@ -156,7 +160,7 @@ def compare(old: Mapping[str, Any], new: Mapping[str, Any], tolerance: float) ->
 
 def page(results: Mapping[str, Any]) -> str:
     """All tables as one Markdown page."""
-    from arcade_torch.tools.tables import format_value, markdown_table
+    from arcade_torch.tools.files import format_value, markdown_table
 
     machine = ", ".join(f"{name} {value}" for name, value in results["machine"].items() if value)
     lines = ["# Benchmarks", "", f"`make bench`, size {results['size']}. {machine}.", ""]

@@ -11,15 +11,12 @@ import torch
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.training import Trainer
-from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown, torch_threads
+from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown
 from arcade_torch.tools.bench.registry import BenchOptions
+from arcade_torch.tools.machine import torch_threads
+from arcade_torch.tools.options import at_least
 
-FORMS: dict[str, dict[str, bool]] = {
-    "eager": {},
-    "amp": {"amp": True},
-    "compiled": {"compile": True},
-    "graphs": {"cuda_graphs": True},
-}
+FORMS = {"eager": {}, "amp": {"amp": True}, "compiled": {"compile": True}, "graphs": {"cuda_graphs": True}}
 """Ways to run a network, by the settings of a run that ask for them."""
 
 
@@ -53,18 +50,9 @@ class Options(BenchOptions):
     """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
 
 
-SIZES: dict[str, dict[str, Any]] = {
-    "tiny": {"networks": ("small",), "memories": ("mlp",), "grad_steps": 1, "repeats": 1},
-    "quick": {"networks": ("small",), "grad_steps": 2},
-    "full": {},
-}
-
-
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``train``."""
-    for name, least in (("grad_steps", 1), ("repeats", 1), ("threads", 0)):
-        if getattr(options, name) < least:
-            raise ValueError(f"--{name.replace('_', '-')} must be {least} or more, got {getattr(options, name)}")
+    at_least(options, grad_steps=1, repeats=1, threads=0)
     plans = list(itertools.product(options.networks, options.memories, options.forms))
     configs = [_config(network, memory, form, options) for network, memory, form in plans]
     with torch_threads(options.threads or torch.get_num_threads()):

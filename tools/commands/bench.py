@@ -10,17 +10,25 @@ import tyro
 
 from arcade_torch.agents.runs.files import write_atomic, write_json
 from arcade_torch.tools.bench import registry
-from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.commands import Command
+from arcade_torch.tools.files import Table, format_value, write_csv
 from arcade_torch.tools.options import parse as parse_options
-from arcade_torch.tools.tables import Table, format_value
 
 
 @dataclass
-class Bench:
+class Bench(Command):
     """One benchmark and its options."""
 
     name: str
     options: Any
+
+    @classmethod
+    def parse(cls, words: Sequence[str], prog: str) -> "Bench":
+        """Read the options of one benchmark; what comes before the first flag are the memory models."""
+        name = prog.split()[-1]
+        if words and not words[0].startswith("-") and name in ("memory", "recall"):
+            words = ["--memories", *words]
+        return cls(name, parse_options(registry.module_of(name).Options, words, prog))
 
     def run(self) -> int:
         """Measure, print, save."""
@@ -48,7 +56,7 @@ class Bench:
 
 
 @dataclass
-class BenchAll:
+class BenchAll(Command):
     """Every benchmark into one file with machine, versions and commit, and a page of its tables.
 
     arcade-torch bench compare says what became of an older file.
@@ -69,8 +77,10 @@ class BenchAll:
         """Measure and save."""
         if self.out.suffix != ".json":
             raise ValueError(f"--out must end in .json, got {self.out}")
-        modules: dict[str, Any] = {name: registry.module_of(name) for name in self.benches}
-        options = {name: module.Options(**module.SIZES[self.size], out=None) for name, module in modules.items()}
+        sizes = registry.SIZES[self.size]
+        options: dict[str, Any] = {
+            name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches
+        }
         results = registry.measure(options, self.size, _log)
         print(write_json(self.out, results))
         print(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))
@@ -78,7 +88,7 @@ class BenchAll:
 
 
 @dataclass
-class BenchCompare:
+class BenchCompare(Command):
     """What became better or worse between two JSON files of bench, number by number; exit code 1 if something is worse.
 
     Example: arcade-torch bench compare results/bench.json runs/bench.json --tolerance 0.2
@@ -96,11 +106,11 @@ class BenchCompare:
         if not 0 < self.tolerance < 1:
             raise ValueError(f"--tolerance must lie between 0 and 1, got {self.tolerance}")
         old, new = registry.read_results(self.old), registry.read_results(self.new)
-        pairs = {
-            name: (old["machine"].get(name), new["machine"].get(name))
-            for name in ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
-        }
-        if differs := [f"{name} {was} and {now}" for name, (was, now) in pairs.items() if was != now]:
+        was, now = old["machine"], new["machine"]
+        about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
+        if differs := [
+            f"{name} {was.get(name)} and {now.get(name)}" for name in about if was.get(name) != now.get(name)
+        ]:
             print(f"not the same machine: {', '.join(differs)}")
         changes = registry.compare(old, new, self.tolerance)
         for verdict in ("worse", "missing", "better", "new"):
@@ -108,19 +118,6 @@ class BenchCompare:
                 print(f"{verdict}: {line}")
         print(", ".join(f"{len(lines)} {verdict}" for verdict, lines in changes.items()))
         return 1 if changes["worse"] else 0
-
-
-COMMANDS: dict[str, Any] = {"bench": Bench, "bench all": BenchAll, "bench compare": BenchCompare}
-
-
-def parse(words: Sequence[str], prog: str) -> Any:
-    """Read the options of one benchmark; what comes before the first flag are the memory models."""
-    name = prog.split()[-1]
-    if f"bench {name}" in COMMANDS:
-        return parse_options(COMMANDS[f"bench {name}"], words, prog)
-    if words and not words[0].startswith("-") and name in ("memory", "recall"):
-        words = ["--memories", *words]
-    return Bench(name, parse_options(registry.module_of(name).Options, words, prog))
 
 
 def _log(text: str) -> None:
@@ -137,3 +134,6 @@ def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
         rows = [{**row, **results["machine"]} for row in table["rows"]]
         paths.append(write_csv(path, rows, list(rows[0])))
     return paths
+
+
+COMMANDS: dict[str, Any] = {"bench": Bench, "bench all": BenchAll, "bench compare": BenchCompare}

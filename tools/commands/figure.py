@@ -11,24 +11,38 @@ from typing import Any
 
 import tyro
 
+from arcade_torch.tools.commands import Command
 from arcade_torch.tools.figures import registry
-from arcade_torch.tools.figures.registry import FIGURES, Options
 from arcade_torch.tools.options import parse as parse_options
 
 
 @dataclass
-class Figure:
+class Figure(Command):
     """A figure that was asked for."""
 
     name: str
-    options: Options
-    argv: tuple[str, ...] = ()
+    options: registry.Options
+
+    @classmethod
+    def parse(cls, words: Sequence[str], prog: str) -> "Figure":
+        """Read the options of one figure; runs are named with or without ``--runs``."""
+        _, group, name = prog.split()
+        entry = registry.FIGURES[name]
+        words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
+        registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
+        entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
+        options: Any = parse_options(entry.options, words, prog)
+        if group == "analyze" and options.out is None and options.runs and options.runs[0].is_dir():
+            first = options.runs[0]
+            run = first.parent.parent if (first / "meta.json").is_file() else first  # of a checkpoint
+            options = replace(options, out=run / "analysis")
+        return cls(name, options)
 
     def run(self) -> int:
         """Measure, draw, save, print."""
+        from arcade_torch.tools.errors import need
         from arcade_torch.tools.files import csv_text
-        from arcade_torch.tools.keep_memory import keep_freed_memory
-        from arcade_torch.tools.optional import need
+        from arcade_torch.tools.machine import keep_freed_memory
         from arcade_torch.tools.progress import Bars
 
         keep_freed_memory()
@@ -47,23 +61,3 @@ class Figure:
 
 
 COMMANDS = {"figure": Figure}
-
-
-def parse(words: Sequence[str], prog: str) -> Figure:
-    """Read the options of one figure; runs are named with or without ``--runs``."""
-    _, group, name = prog.split()
-    entry = FIGURES[name]
-    words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
-    registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
-    entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
-    options: Any = parse_options(entry.options, words, prog)
-    if options.out is None and group == "analyze":
-        options = replace(options, out=_analysis_folder(options.runs))
-    return Figure(name, options)
-
-
-def _analysis_folder(runs: Sequence[Path]) -> Path | None:
-    """Where figures about a run folder, a checkpoint or a study go by default; None for other files."""
-    if not runs or not runs[0].is_dir():
-        return None
-    return (runs[0].parent.parent if (runs[0] / "meta.json").is_file() else runs[0]) / "analysis"

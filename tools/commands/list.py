@@ -7,13 +7,16 @@ from typing import Literal
 
 import tyro
 
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.commands import Command
+from arcade_torch.tools.files import Table
+from arcade_torch.tools.options import at_least
 
 PAPER_SIZE = 512
+BASELINES = Path("baselines.csv")
 
 
 @dataclass
-class List:
+class List(Command):
     """Show the games, the memory models and what they cost, what players earn in the games, or a picture of the games.
 
     list baselines lets the random player and both scripted players play; it keeps a CSV file that it goes on with after
@@ -43,17 +46,15 @@ class List:
 
     def run(self) -> int:
         """Print the tables, or draw."""
-        parts = {"baselines": self._baselines, "sheet": self._sheet, "envs": _environments, "memories": self._memories}
-        for name in ("envs", "memories") if self.what == "all" else (self.what,):
-            parts[name]()
+        for what in ("envs", "memories") if self.what == "all" else (self.what,):
+            getattr(self, f"_{what}")()
         return 0
 
     def resume_hint(self) -> str:
         """What to type after an interruption."""
-        return f"finished rows are in {self._table()}; the same command goes on with the others"
-
-    def _table(self) -> Path:
-        return self.out or Path("baselines.csv")
+        if self.what != "baselines":
+            return super().resume_hint()
+        return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
 
     def _baselines(self) -> None:
         from arcade_torch.envs_jax import registered_ids, resolve_id
@@ -61,12 +62,11 @@ class List:
         from arcade_torch.tools.files import write_between
         from arcade_torch.tools.progress import Bars
 
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, got {self.episodes}")
+        at_least(self, episodes=1)
         ids = [resolve_id(name) for name in self.games] or registered_ids()
         rows, total = [], len(ids) * len(players.PLAYERS)
         with Bars() as bars:
-            for row in players.measure_all(ids, self.episodes, self.seconds, self._table()):
+            for row in players.measure_all(ids, self.episodes, self.seconds, self.out or BASELINES):
                 rows.append(row)
                 bars.update("players", len(rows), total, f"{row.id} {row.player} {row.mean:.3f}")
         table = players.markdown(rows)
@@ -76,55 +76,49 @@ class List:
 
     def _sheet(self) -> None:
         from arcade_torch.envs_jax import registered_ids, resolve_id
-        from arcade_torch.tools.contact_sheet import sheet, strip, write_png
+        from arcade_torch.tools.play.recording import sheet, strip, write_png
 
         ids = [resolve_id(name) for name in self.games]
         if self.steps and len(ids) != 1:
             raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
         ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
         picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
-        print(write_png(picture, self.out or Path("games.png")).resolve())
+        print(write_png(self.out or Path("games.png"), picture).resolve())
+
+    def _envs(self) -> None:
+        from arcade_torch.envs_jax import make, registered_ids
+
+        games = [make(env_id) for env_id in registered_ids()]
+        rows = [(game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games]
+        Table("environments", ("id", "time limit", "return"), rows).show()
+        print("each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, 3]; 5 actions")
 
     def _memories(self) -> None:
         from arcade_torch.models import make_memory, memory_names
         from arcade_torch.models.presets import PRESETS
+        from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
-        rows = []
-        for name in memory_names():
+        names, rows = memory_names(), []
+        for name in names:
             kind = type(make_memory(name, 1, 1))
             says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
             rows.append((name, says.strip().partition("\n")[0]))
         Table("memory models", ("name", "what it is"), rows, left=2).show()
+        columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
+        columns += ["acting us", "learning us", "to the LRU's"] if self.measure else []
         for of, size in (("the paper's network", PAPER_SIZE), ("the small network", PRESETS["small"].hidden_size)):
-            _costs(f"one cell of {of}, {size} wide", size, self.measure)
+            times = time_memories(names, size) if self.measure else {}
+            costs = []
+            for name in names:
+                cost = [f"{number:,}" for number in memory_cost(make_memory(name, size, size), size)]
+                if self.measure:
+                    acting, learning = times[name]
+                    cost += [f"{acting:.1f}", f"{learning:.1f}", f"{learning / times['lru'][1]:.2f}"]
+                costs.append([name, *cost])
+            Table(f"one cell of {of}, {size} wide", columns, costs).show()
         print("multiply-adds: in matrix products, one step of one env, acting")
         if self.measure:
             print("us: microseconds for one step of one env; acting: 16 envs; learning: both passes, 16 x 132 steps")
 
 
 COMMANDS = {"list": List}
-
-
-def _environments() -> None:
-    from arcade_torch.envs_jax import make, registered_ids
-
-    games = [make(env_id) for env_id in registered_ids()]
-    rows = [(game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games]
-    Table("environments", ("id", "time limit", "return"), rows).show()
-    print("each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, 3]; 5 actions")
-
-
-def _costs(title: str, size: int, measure: bool) -> None:
-    """One line a memory model at one width."""
-    from arcade_torch.models import make_memory, memory_names
-    from arcade_torch.tools.bench.memory import memory_cost, time_memories
-
-    columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
-    names = memory_names()
-    rows = [[name, *(f"{number:,}" for number in memory_cost(make_memory(name, size, size), size))] for name in names]
-    if measure:
-        times = time_memories(names, size)
-        columns += ["acting us", "learning us", "to the LRU's"]
-        for row, (acting, learning) in zip(rows, times.values(), strict=True):
-            row += [f"{acting:.1f}", f"{learning:.1f}", f"{learning / times['lru'][1]:.2f}"]
-    Table(title, columns, rows).show()

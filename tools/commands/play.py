@@ -1,14 +1,32 @@
 """``arcade-torch play`` and ``arcade-torch record``."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
+from arcade_torch.tools.commands import Command
+from arcade_torch.tools.options import at_least, name_and_value
 
-@dataclass
-class Play:
+
+@dataclass(kw_only=True)
+class Shown(Command):
+    """What both commands are told about the game and its picture."""
+
+    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
+    """Environment id."""
+    both: bool = False
+    """Show both twins, the MDP on the left."""
+    scale: int = 2
+    """Width of a frame's pixel in the picture."""
+    env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE, an option of the game; may be given several times."""
+
+
+@dataclass(kw_only=True)
+class Play(Shown):
     """Play a game by hand, in a window or (without pygame or a display, or with --terminal) in the terminal.
 
     Arrows and space are the five actions; one key, one step. P changes between MDP and POMDP, also in mid-episode. R
@@ -17,26 +35,18 @@ class Play:
     Example: arcade-torch play MineSweeperEasy --partial --episodes 3 --scores human.csv
     """
 
-    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
-    """Environment id."""
     seed: int | None = None
     """Of the first episode, each further one has the next; 0 by default, with --scores the first the file lacks."""
     partial: bool = False
     """Begin with the POMDP twin."""
-    both: bool = False
-    """Show both twins, the MDP on the left."""
     episodes: int = 0
     """Stop after so many finished episodes; 0 for never."""
     obs_size: Literal[128, 256] = 256
     """Side of the frame in pixels."""
-    scale: int = 2
-    """Width of a frame's pixel on the screen."""
     key_repeat: int = 0
     """A held key repeats every so many milliseconds; 0 for not at all."""
     rules: Literal["default", "reference"] = "default"
     """Rules of the game."""
-    env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=VALUE, an option of the game; may be given several times."""
     terminal: bool = False
     """Play in the terminal."""
     scores: Path | None = None
@@ -47,14 +57,10 @@ class Play:
     def run(self) -> int:
         """Play."""
         from arcade_torch.compiled import compiled_game
-        from arcade_torch.tools.options import name_and_value
-        from arcade_torch.tools.play import scores, terminal, window
+        from arcade_torch.tools.play import scores, screens
         from arcade_torch.tools.play.session import LEGEND, Session
 
-        if self.scale < 1:
-            raise ValueError(f"--scale must be at least 1, got {self.scale}")
-        if self.key_repeat < 0:
-            raise ValueError(f"--key-repeat must be 0 or more milliseconds, got {self.key_repeat}")
+        at_least(self, scale=1, key_repeat=0)
         if self.scores is not None and self.scores.suffix != ".csv":
             raise ValueError(f"--scores must end in .csv, got {self.scores}")
         options = dict(map(name_and_value, self.env_option))
@@ -66,27 +72,26 @@ class Play:
 
         def keep(attempt: Any) -> None:
             """Write a score, and remember to say it when the screen is the terminal's again."""
-            how = f"return {attempt.total:+.3f} in {attempt.steps} steps, {attempt.end}"
-            said.append(f"seed {attempt.seed} ({attempt.observability}): {how}")
+            said.append(f"seed {attempt.seed} ({attempt.observability}): {attempt}")
             if self.scores is not None:
                 scores.append_score(self.scores, scores.score_row(attempt, game, options, self.player))
 
         views = {"partial": self.partial, "both": self.both}
         session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
-        reason = None if self.terminal else window.why_no_window()
+        reason = None if self.terminal else screens.why_no_window()
         if reason is not None:
             print(f"playing in the terminal: {reason}")
         if self.terminal or reason is not None:
-            terminal.play_in_terminal(session)
+            screens.play_in_terminal(session)
         else:
             print(LEGEND)
-            window.play_in_window(session, self.scale, self.key_repeat)
+            screens.play_in_window(session, self.scale, self.key_repeat)
         print("\n".join(said) or "no episode was played")
         return 0
 
 
-@dataclass
-class Record:
+@dataclass(kw_only=True)
+class Record(Shown):
     """Record episodes of a player as a GIF or, with the extra video, as an MP4.
 
     Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP twin), or the run folder
@@ -95,16 +100,12 @@ class Record:
     Example: arcade-torch record MineSweeperEasy --player frames-oracle --both --out sweep.gif
     """
 
-    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
-    """Environment id."""
     out: Path
     """File, .gif or .mp4; replaced if it exists."""
     player: str = "random"
     """random, state-oracle, frames-oracle, or a run folder."""
     observability: Literal["full", "partial"] | None = None
     """Twin that is shown, and that an agent sees; by default its own, partial for the frames-oracle, otherwise full."""
-    both: bool = False
-    """Show both twins, the MDP on the left."""
     seed: int = 0
     """Of the first episode, each further one has the next."""
     episodes: int = 1
@@ -113,35 +114,34 @@ class Record:
     """The recording stops when an episode gets longer."""
     fps: float = 10.0
     """Frames a second."""
-    scale: int = 2
-    """Width of a frame's pixel in the picture."""
     obs_size: Literal[128, 256] | None = None
     """Side of the frame; the agent's, else 128."""
     rules: Literal["default", "reference"] | None = None
     """Rules of the game; the agent's, else default."""
-    env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """NAME=VALUE, an option of the game; may be given several times."""
 
     def run(self) -> int:
         """Record."""
         from arcade_torch.compiled import compiled_game
         from arcade_torch.envs_jax import resolve_id
-        from arcade_torch.tools.optional import need
-        from arcade_torch.tools.options import name_and_value
         from arcade_torch.tools.play import recording
         from arcade_torch.tools.play.session import Session
+        from arcade_torch.tools.progress import Bars
 
         write = recording.writer_for(self.out)
-        for name in ("episodes", "max_steps", "scale"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        at_least(self, episodes=1, max_steps=1, scale=1)
         fastest = recording.FASTEST_FPS[self.out.suffix]
         if not 0 < self.fps <= fastest:
             raise ValueError(f"--fps must be above 0 and at most {fastest} for {self.out.suffix}, got {self.fps}")
         game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
-        agent = None if self.player in recording.SCRIPTED else self._agent()
         obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
-        if agent is not None:
+        agent: Any = None
+        if self.player not in recording.SCRIPTED:
+            from arcade_torch.agents import load
+
+            if not Path(self.player).is_dir():
+                allowed = ", ".join(recording.SCRIPTED)
+                raise ValueError(f"--player is {self.player!r}, allowed: {allowed}, or a run folder")
+            agent = load(self.player)
             config = agent.config
             if self.obs_size not in (None, config.obs_size):
                 raise ValueError(f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}")
@@ -152,35 +152,26 @@ class Record:
                 print(f"note: this agent was trained on {config.env}")
         if self.observability is not None:
             partial = self.observability == "partial"
-        game = compiled_game(game_id, obs_size, rules, options)
-        views = {"partial": partial, "both": self.both}
-        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=_say, **views)
+
+        def say(attempt: Any) -> None:
+            print(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
+
+        game, views = compiled_game(game_id, obs_size, rules, options), {"partial": partial, "both": self.both}
+        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=say, **views)
         player = (
-            recording.scripted(self.player, session.game, self.seed)
-            if agent is None
-            else recording.trained(agent, partial)
+            recording.trained(agent, partial) if agent else recording.scripted(self.player, session.game, self.seed)
         )
         how = {"max_steps": self.max_steps, "hold": max(1, round(self.fps)), "scale": self.scale}
-        frames = recording.recorded_frames(session, player, **how)
-        bar = need("tqdm").tqdm(frames, desc=str(self.out), unit=" frames", disable=None, leave=False)
-        write(self.out, bar, self.fps)
+        with Bars() as bars:
+
+            def counted() -> Iterator[Any]:
+                for count, frame in enumerate(recording.recorded_frames(session, player, **how), start=1):
+                    bars.update(str(self.out), count, 0, f"frame {count}")
+                    yield frame
+
+            write(self.out, counted(), self.fps)
         print(f"recording: {self.out}")
         return 0
-
-    def _agent(self) -> Any:
-        """The agent in a run folder."""
-        from arcade_torch.agents import load
-        from arcade_torch.tools.play.recording import SCRIPTED
-
-        if not Path(self.player).is_dir():
-            raise ValueError(f"--player is {self.player!r}, allowed: {', '.join(SCRIPTED)}, or a run folder")
-        return load(self.player)
-
-
-def _say(attempt: Any) -> None:
-    """Report an episode."""
-    end = "cut at --max-steps" if attempt.end == "abandoned" else attempt.end
-    print(f"seed {attempt.seed}: return {attempt.total:+.3f} in {attempt.steps} steps, {end}")
 
 
 COMMANDS = {"play": Play, "record": Record}

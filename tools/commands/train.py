@@ -1,8 +1,7 @@
-"""``arcade-torch train``."""
+"""``arcade-torch train`` and ``arcade-torch evaluate``."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,15 +9,14 @@ import tyro
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
-from arcade_torch.agents.runs.files import read_json
-from arcade_torch.tools.extensions import command_line
-from arcade_torch.tools.options import name_and_value
+from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.tools.commands import Command
+from arcade_torch.tools.options import command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
-from arcade_torch.tools.progress import TrainBar
 
 
 @dataclass
-class Train:
+class Train(Command):
     """Train one agent into a run folder: settings, logs, checkpoints, final evaluation.
 
     Options start from a preset (paper, reference, small, smoke) or from a JSON file; the resolved settings are kept in
@@ -37,34 +35,59 @@ class Train:
     network_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the network; may be given several times."""
     out: Path | None = None
-    """Run folder; runs/ENV-OBSERVABILITY-MEMORY-ALGORITHM-SEED by default."""
+    """Run folder; runs/ENV__OBSERVABILITY__MEMORY__ALGORITHM__seedN by default, as in a study."""
     resume: bool = False
     """Go on with the run in that folder."""
     wait: float = 0.0
     """Seconds to wait until another process that trains in that folder has stopped."""
     videos: Literal["none", "gif", "mp4"] = "none"
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
-    argv: tyro.conf.Suppress[tuple[str, ...]] = ()
+
+    @classmethod
+    def parse(cls, argv: Sequence[str], prog: str) -> Any:
+        """Read the options; what is not given comes from the config file or the preset."""
+        given = _flags(argv)
+        if "preset" in given and "config" in given:
+            raise ValueError("give --preset or --config to start from, not both")
+        if "config" in given:
+            parsed = parse_options(cls, argv, prog, cls(_read_config(Path(given["config"]))))
+            settings = parsed.settings
+        else:
+            # A preset's numbers depend on these two, and the help shows them.
+            decisive: dict[str, Any] = {name: given[name] for name in ("env", "algorithm") if given.get(name)}
+            parsed = parse_options(cls, argv, prog, cls(preset(given.get("preset", "paper"), **decisive)))
+            names = {name.partition(".")[0].removeprefix("no_") for name in given}
+            own = {name: getattr(parsed.settings, name) for name in names & {f.name for f in fields(TrainConfig)}}
+            settings = preset(parsed.preset, **own)
+        options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
+        more = {key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()}
+        return replace(parsed, settings=replace(settings, **more))
 
     def run(self) -> int:
         """Train."""
         from arcade_torch.agents import train
         from arcade_torch.agents.runs.folder import wait_until_free
-        from arcade_torch.tools.keep_memory import keep_freed_memory
+        from arcade_torch.tools.machine import keep_freed_memory
+        from arcade_torch.tools.progress import Bars, standing
         from arcade_torch.tools.studies.engines import watch_parent
+        from arcade_torch.tools.studies.grid import RunSpec
 
         watch_parent()
         keep_freed_memory()
         run, film = self.settings, None
-        name = f"{run.env}-{run.observability}-{run.memory}-{run.algorithm}-seed{run.seed}"
-        folder = self.out or Path("runs") / name
+        spec = RunSpec(run.env, run.observability, run.memory, run.algorithm, run.seed)
+        folder = self.out or Path("runs") / spec.name
         if self.videos != "none":
             from arcade_torch.tools.play.recording import EvaluationVideos
 
             film = EvaluationVideos(folder / "videos", f".{self.videos}")
         wait_until_free(folder, self.wait)
-        with TrainBar(str(folder)) as bar:
-            result = train(run, folder, self.resume, bar.show, film)
+        with Bars(unit="frames", first_line_s=0.0) as bars:
+
+            def show(row: Any) -> None:
+                bars.update(str(folder), int(row["frames"]), int(row["total_frames"]), standing(row))
+
+            result = train(run, folder, self.resume, show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
         print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
@@ -72,29 +95,43 @@ class Train:
         return 0
 
     def resume_hint(self) -> str:
-        """What to type after an interruption."""
+        """The command that goes on."""
         argv = [word for word in self.argv if word != "--resume"]
         return f"go on with: {command_line(['train', *argv, '--resume'])}"
 
 
-COMMANDS = {"train": Train}
+@dataclass
+class Evaluate(Command):
+    """Play greedy episodes with a trained agent on held-out seeds and print the mean return.
 
+    Example: arcade-torch evaluate runs/one --episodes 256 --observability full
+    """
 
-def parse(argv: Sequence[str], prog: str) -> Train:
-    """Read the options; what is not given comes from the config file or the preset."""
-    name, file = _peek(argv, "--preset"), _peek(argv, "--config")
-    if name is not None and file is not None:
-        raise ValueError("give --preset or --config to start from, not both")
-    # A preset's numbers depend on these two, and the help shows them.
-    decisive = {key: value for key in ("env", "algorithm") if (value := _peek(argv, f"--{key}"))}
-    base = preset(name or "paper", **decisive) if file is None else _read_config(Path(file))
-    parsed: Train = parse_options(Train, argv, prog, Train(base))
-    settings = parsed.settings if file else preset(parsed.preset, **_given(parsed.settings, argv))
-    options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
-    more: dict[str, Any] = {
-        key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()
-    }
-    return dataclasses.replace(parsed, settings=dataclasses.replace(settings, **more))
+    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]
+    """Run folder or checkpoint."""
+    episodes: int = 128
+    """Number of episodes, each in an environment of its own."""
+    observability: Literal["full", "partial"] | None = None
+    """Another twin than the agent was trained on."""
+    json: Path | None = None
+    """File for the numbers; not overwritten."""
+
+    def run(self) -> int:
+        """Evaluate and print."""
+        from arcade_torch.agents import evaluate, load
+
+        if self.json is not None and self.json.exists():
+            raise FileExistsError(f"{self.json} exists: choose another file")
+        agent = load(self.run_folder)
+        result = evaluate(agent, self.observability, self.episodes)
+        config, twin = agent.config, self.observability or agent.config.observability
+        which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
+        mean = f"mean return {result.mean:.3f} +- {result.ci:.3f} (95 %) over {len(result.returns)} episodes"
+        print(f"{which}, {agent.frames:,} frames of training: {mean}")
+        if self.json is not None:
+            found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
+            write_json(self.json, found | {"mean": result.mean, "half_width_95": result.ci})
+        return 0
 
 
 def _read_config(file: Path) -> TrainConfig:
@@ -107,21 +144,14 @@ def _read_config(file: Path) -> TrainConfig:
         raise ValueError(f"{file} holds no config: {error}") from error
 
 
-def _given(settings: TrainConfig, argv: Sequence[str]) -> dict[str, Any]:
-    """The fields that were given, be it with the value of the preset; those of a learner as a dictionary."""
-    found: dict[str, Any] = {}
-    for word in argv:
-        group, _, name = word.partition("=")[0].removeprefix("--").replace("-", "_").rpartition(".")
-        name = name.removeprefix("no_")
-        owner: Any = getattr(settings, group, None) if group else settings
-        if word.startswith("--") and name in {item.name for item in dataclasses.fields(owner)}:
-            (found.setdefault(group, {}) if group else found)[name] = getattr(owner, name)
+def _flags(argv: Sequence[str]) -> dict[str, str]:
+    """Names and values of options before they are read: of ``--total-frames 5`` or ``--total-frames=5``."""
+    found = {}
+    for word, following in zip(argv, [*argv[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name.startswith("--"):
+            found[name[2:].replace("-", "_")] = value if equals else following
     return found
 
 
-def _peek(argv: Sequence[str], flag: str) -> str | None:
-    """The value of an option, before options are read."""
-    for word, following in zip(argv, [*argv[1:], None], strict=True):
-        if word == flag or word.startswith(flag + "="):
-            return following if word == flag else word.partition("=")[2]
-    return None
+COMMANDS = {"train": Train, "evaluate": Evaluate}

@@ -13,7 +13,7 @@ from arcade_torch.tools.analysis.contamination import LAST, Contamination, Examp
 from arcade_torch.tools.analysis.windows import episode_window
 from arcade_torch.tools.figures import style
 from arcade_torch.tools.figures.registry import ContaminationOptions, Made, Picture, Progress
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.files import Table
 
 MEASURES = {
     "flip": "share of changed decisions",

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,8 @@ from arcade_torch.tools.analysis.gap_bias import DIFFICULTIES, AgentRow, GapBias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
-from arcade_torch.tools.files import read_csv
-from arcade_torch.tools.runs import Score, agent_names, find_runs, is_baseline, read_scores
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.files import Table, read_csv
+from arcade_torch.tools.runs import Score, agent_names, find_runs, is_baseline, read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),
@@ -189,7 +187,7 @@ def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
     """Scores of tables, and of the finished runs below folders."""
     if not options.runs:
         raise ValueError("name at least one study folder, run folder or CSV file")
-    tables = [path for path in options.runs if path.is_file() or _is_bare(path)]
+    tables = [path for path in options.runs if table_of(path)]
     if len(tables) == len(options.runs):
         return read_scores(tables, options.metric), []
     found = find_runs([path for path in options.runs if path not in tables])
@@ -197,11 +195,6 @@ def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
     if not tables:
         return found.scores(options.metric), notes
     return read_scores([*tables, *(run.path for run in found.runs)], options.metric), notes
-
-
-def _is_bare(path: Path) -> bool:
-    """Whether a study's folder has lost its runs but not its table."""
-    return (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
 
 
 def _printed(table: GapBias, what: str) -> Table:

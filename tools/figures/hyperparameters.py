@@ -8,8 +8,8 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress
 from arcade_torch.tools.figures.style import panels
+from arcade_torch.tools.files import markdown_table
 from arcade_torch.tools.runs import find_runs, flatten
-from arcade_torch.tools.tables import markdown_table
 
 NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
 """Fields that tell runs apart, or decide nothing."""

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from arcade_torch.tools.tables import Table
+from arcade_torch.tools.files import Table
 
 Progress = Callable[[str, int, int], None]
 PICTURES, NUMBERS = (".pdf", ".png", ".svg"), (".csv",)

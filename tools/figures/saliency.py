@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures.registry import Made, Picture, Progress, SaliencyOptions
 from arcade_torch.tools.figures.style import TWIN_NAMES, rows_of
-from arcade_torch.tools.optional import need
+from arcade_torch.tools.files import Table
 from arcade_torch.tools.runs import find_runs
-from arcade_torch.tools.tables import Table
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
-from arcade_torch.tools.optional import need
 
 AGENT_COLOURS = {
     "mlp": "#6b6b6b",

@@ -1,12 +1,12 @@
-"""Record episodes of random, scripted and trained players as GIF or MP4."""
+"""Players at a session, and pictures of what they play: films as GIF or MP4, single moments as PNG."""
 
 import io
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +14,20 @@ import numpy as np
 
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.compiled import compiled_game
-from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.envs_jax import ACTION_NAMES, make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
 from arcade_torch.gym.window import enlarge
-from arcade_torch.tools.optional import need
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.play.session import NEXT, QUIT, Frame, Session
 
 SCRIPTED = ("random", "state-oracle", "frames-oracle")
 FASTEST_FPS = {".gif": 50, ".mp4": 240}  # a GIF shows a frame for 2 hundredths of a second or more
 # Quality of x264: 0 is lossless, 23 its default. Most players want this pixel format.
 _ENCODING = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
-_PALETTE_SIZE = 256
 FILM_FPS, FILM_SEED = 10, 2**31
 """Of films of a training. The seed is far from those of training and always the same, so that films compare."""
+GAP, PAPER = 8, 255
+"""Between pictures on a sheet or a strip, in pixels, and its colour."""
 
 Chooser = Callable[[Session], int]
 """Somebody who plays: looks at a session and names an action, 0 to 4."""
@@ -93,22 +94,18 @@ def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
 
 def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel."""
-    pictures, buffer = map(_picture, frames), io.BytesIO()
+    image, buffer = need("PIL.Image"), io.BytesIO()
+    pictures = (image.fromarray(frame).quantize(256) for frame in frames)
     duration_ms = 10 * max(1, round(100 / fps))
     next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0)
     return write_atomic(path, buffer.getvalue())
 
 
-def _picture(frame: Frame) -> Any:
-    """A frame as a Pillow image, by palette where its colours fit into one."""
-    image = need("PIL.Image")
-    packed = frame.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-    colours, index = np.unique(packed, return_inverse=True)
-    if len(colours) > _PALETTE_SIZE:
-        return image.fromarray(frame).quantize(_PALETTE_SIZE)
-    picture = image.fromarray(index.reshape(packed.shape).astype(np.uint8))
-    picture.putpalette(np.stack([colours >> 16, colours >> 8 & 255, colours & 255], -1).astype(np.uint8).tobytes())
-    return picture
+def write_png(path: Path, picture: Frame) -> Path:
+    """Write a picture without loss."""
+    buffer = io.BytesIO()
+    need("PIL.Image").fromarray(picture).save(buffer, format="PNG", optimize=True)
+    return write_atomic(path, buffer.getvalue())
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
@@ -128,6 +125,54 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
             complaint = log.read_text(errors="replace").strip()
             raise ValueError(f"ffmpeg could not write {path}: {complaint or process.returncode}")
         return write_atomic(path, film.read_bytes())
+
+
+def _moments(id: str, obs_size: int, seed: int, steps: int) -> Iterator[list[Frame]]:
+    """Both twins of each state of an episode of the scripted player, from the first to that after `steps`, or to the
+    last before the end; of a random one where there is no player that sees the state.
+    """
+    session = Session(compiled_game(id, obs_size, "default", {}), seed=seed)
+    choose = scripted("state-oracle" if "state" in session.game.oracles else "random", session.game, seed)
+    while session.end is None and session.steps <= steps:
+        yield [session.view(partial)[0] for partial in (False, True)]
+        session.press(ACTION_NAMES[choose(session)])
+
+
+def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]:
+    """Both twins of one moment in the middle of a game, played by the scripted player that sees the state."""
+    *_, last = _moments(id, obs_size, seed, min(steps, make(id, obs_size=obs_size).max_steps // 4))
+    return last
+
+
+def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Frame:
+    """Some moments of one episode side by side, the MDP twin above the POMDP twin."""
+    if not steps or steps[0] < 0 or any(a >= b for a, b in pairwise(steps)):
+        raise ValueError(f"steps must be whole numbers that rise from 0 or more, got {list(steps)}")
+    side = obs_size + GAP
+    canvas, count = np.full((2 * side - GAP, len(steps) * side - GAP, 3), PAPER, np.uint8), 0
+    for count, twins in enumerate(_moments(id, obs_size, seed, steps[-1]), start=1):
+        if count - 1 in steps:
+            for row, frame in enumerate(twins):
+                _paste(canvas, frame, row * side, steps.index(count - 1) * side)
+    if count <= steps[-1]:
+        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {count} steps: stay below")
+    return canvas
+
+
+def sheet(ids: Sequence[str], columns: int = 2) -> Frame:
+    """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
+    height, width = 256 + GAP, 2 * (256 + GAP) + 2 * (128 + GAP)
+    canvas = np.full((-(-len(ids) // columns) * height, columns * width, 3), PAPER, np.uint8)
+    for place, id in enumerate(ids):
+        left = place % columns * width
+        for frame in [frame for size in (256, 128) for frame in scene(id, size)]:
+            _paste(canvas, frame, place // columns * height, left)
+            left += len(frame) + GAP
+    return canvas
+
+
+def _paste(canvas: Frame, frame: Frame, top: int, left: int) -> None:
+    canvas[top : top + len(frame), left : left + len(frame)] = frame
 
 
 class EvaluationVideos:

@@ -14,7 +14,8 @@ from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.play.session import Attempt, Session
+from arcade_torch.tools.options import name_and_value
+from arcade_torch.tools.play.session import QUIT, Attempt, Session
 
 COLUMNS = (
     *("model", "env", "difficulty", "observability", "return", "steps", "end", "attempt"),
@@ -67,13 +68,7 @@ def next_seed(rows: list[dict[str, str]], game_id: str, player: str) -> int:
 
 
 def replay(row: Mapping[str, Any]) -> Attempt:
-    """Play a line of the table again.
-
-    Args:
-        row: the line, as it was written or as it was read.
-
-    Returns:
-        The episode, from the game's own rules.
+    """Play a line of the table, as it was written or as it was read, again by the game's own rules.
 
     Raises:
         ValueError: the actions go on after the end, or the line is damaged.
@@ -83,19 +78,15 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     for name in ("seed", "obs_size"):
         if not _WHOLE.fullmatch(str(row[name])):
             raise ValueError(f"{name} is {row[name]!r}, expected a whole number")
-    try:
-        options = json.loads(row["options"])
-    except (ValueError, RecursionError):
-        options = None
+    _, options = name_and_value(f"options={row['options']}")
     if not isinstance(options, dict):
         raise ValueError(f"options are {row['options']!r}, expected a JSON object")
     found: list[Attempt] = []
     game = compiled_game(row["game"], int(row["obs_size"]), row["rules"], options)
-    partial = row["observability"] == "partial"
-    session = Session(game, seed=int(row["seed"]), partial=partial, on_attempt=found.append)
+    session = Session(game, seed=int(row["seed"]), partial=row["observability"] == "partial", on_attempt=found.append)
     for number, action in enumerate(row["actions"]):
         if session.end is not None:
             raise ValueError(f"{len(row['actions'])} actions, but the episode ends after {number}")
         session.press(ACTION_NAMES[int(action)])
-    session.press("quit")
+    session.press(QUIT)
     return found[0]

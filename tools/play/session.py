@@ -47,6 +47,9 @@ class Attempt:
         """Number of actions."""
         return len(self.actions)
 
+    def __str__(self) -> str:
+        return f"return {self.total:+.3f} in {self.steps} steps, {self.end}"
+
 
 class Session:
     """One player at one game.
@@ -71,6 +74,9 @@ class Session:
         >>> session.steps, session.frame.shape
         (1, (128, 128, 3))
     """
+
+    end: Literal["terminated", "truncated"] | None
+    _mixed: bool
 
     def __init__(
         self,
@@ -140,7 +146,14 @@ class Session:
                 self._mixed |= self.end is None
         elif key in ACTION_NAMES:
             if self.end is None:
-                self._step(ACTION_NAMES.index(key))
+                action = ACTION_NAMES.index(key)
+                stepped = self._batch.step(np.array([action], np.int32))
+                self._actions.append(action)
+                self._reward = float(stepped.reward[0])
+                if stepped.terminated[0] or stepped.truncated[0]:
+                    self.end = "terminated" if stepped.terminated[0] else "truncated"
+                    self.finished += 1
+                    self._report(self.end)
         elif key == QUIT or (self.end is not None and self._all_played()):
             self._abandon()
             self.closed = True
@@ -157,20 +170,10 @@ class Session:
         self._batch.reset(np.ones(1, bool), seed_keys(seed, 1))
         self._actions: list[int] = []
         self._reward, self._mixed = 0.0, False
-        self.end: Literal["terminated", "truncated"] | None = None
+        self.end = None
 
     def _all_played(self) -> bool:
         return 0 < self._episodes <= self.finished
-
-    def _step(self, action: int) -> None:
-        """Take an action."""
-        stepped = self._batch.step(np.array([action], np.int32))
-        self._actions.append(action)
-        self._reward = float(stepped.reward[0])
-        if stepped.terminated[0] or stepped.truncated[0]:
-            self.end = "terminated" if stepped.terminated[0] else "truncated"
-            self.finished += 1
-            self._report(self.end)
 
     def _abandon(self) -> None:
         """Report the running episode, if there is anything to report."""

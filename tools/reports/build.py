@@ -10,10 +10,10 @@ import numpy as np
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import over_seeds
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
-from arcade_torch.tools.extensions import command_line
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.optional import need
+from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings, panels
 from arcade_torch.tools.reports.panels import Finals, Progress, select_cells

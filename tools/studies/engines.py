@@ -18,14 +18,14 @@ import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from arcade_torch.agents.runs.files import read_json, write_atomic
-from arcade_torch.tools.errors import one_line, reason
-from arcade_torch.tools.extensions import VARIABLE, load_extensions
-from arcade_torch.tools.optional import need
+from arcade_torch.tools.errors import need, one_line, reason
+from arcade_torch.tools.machine import available_cores
+from arcade_torch.tools.options import VARIABLE, load_extensions
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
@@ -45,6 +45,11 @@ class Job(NamedTuple):
     folder: Path
     log: Path
 
+    @property
+    def words(self) -> list[str]:
+        """Options of ``arcade-torch train`` that do it."""
+        return ["--config", str(self.config), "--out", str(self.folder), "--resume"]
+
     def train(self) -> None:
         """Carry it out in this process; a run that was begun goes on.
 
@@ -53,12 +58,21 @@ class Job(NamedTuple):
         """
         from arcade_torch.agents import TrainConfig, train
         from arcade_torch.agents.runs.folder import wait_until_free
-        from arcade_torch.tools.keep_memory import keep_freed_memory
+        from arcade_torch.tools.machine import keep_freed_memory
 
+        load_extensions()  # of the process that made the job
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
         if train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status == "interrupted":
             raise KeyboardInterrupt
+
+    def attempt(self) -> tuple[str, str]:
+        """Carry it out; returns why it failed in one line, and the traceback, both empty for success."""
+        try:
+            self.train()
+        except Exception as error:
+            return reason(error), traceback.format_exc()
+        return "", ""
 
     def add_to_log(self, text: str) -> None:
         """Add text to the log; its folder is made."""
@@ -88,29 +102,19 @@ class Inline:
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs in order; an exception of one becomes its result, and its traceback goes into the log."""
         for job in jobs:
-            try:
-                job.train()
-            except Exception as error:
-                job.add_to_log(traceback.format_exc())
-                yield JobResult(job.name, reason(error))
-            else:
-                yield JobResult(job.name)
+            error, trace = job.attempt()
+            if trace:
+                job.add_to_log(trace)
+            yield JobResult(job.name, error)
 
 
 @dataclass
 class Processes:
-    """Local worker processes, one a job, each on a core of its own.
+    """Local worker processes, one a job, each on a core of its own."""
 
-    Attributes:
-        workers: how many at once; one a core by default.
-        program: start of the command line that takes a job's words.
-        poll_s: seconds between two looks at the workers.
-        grace_s: seconds an interrupted worker has for its checkpoint.
-    """
-
-    workers: int = 0
-    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")
-    poll_s: float = 0.1
+    workers: int = 0  # how many at once; one a core by default
+    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")  # start of a worker's command line
+    poll_s: float = 0.1  # between two looks at the workers
     grace_s: float = GRACE_S
 
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
@@ -143,10 +147,9 @@ class Processes:
     def _start(self, job: Job, core: int, pin: bool) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") if pin else {}
-        files = ["--config", str(job.config), "--out", str(job.folder)]
         with job.log.open("ab") as log:
             process = subprocess.Popen(
-                [*self.program, "train", *files, "--resume", "--wait", f"{GRACE_S:g}"],
+                [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -159,23 +162,17 @@ class Processes:
         return process
 
 
-def available_cores() -> list[int]:
-    """Numbers of the processor cores this process may use, at least one."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
-
-
 def watch_parent(every_s: float = 2.0) -> None:
     """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing happens."""
-    parent = os.environ.get(PARENT_VARIABLE, "")
-    if not parent.isdigit() or int(parent) == os.getpid():
-        return
+    parent = os.environ.get(PARENT_VARIABLE)
 
     def look() -> None:
-        while os.getppid() == int(parent):
+        while str(os.getppid()) == parent:
             time.sleep(every_s)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    threading.Thread(target=look, daemon=True, name="watch-parent").start()
+    if parent is not None:
+        threading.Thread(target=look, daemon=True, name="watch-parent").start()
 
 
 def _error(code: int, log: Path) -> str:
@@ -194,37 +191,39 @@ class ClusterLostError(RuntimeError):
 
 
 @dataclass
-class Ray:
+class RayOptions:
+    """How a Ray cluster is used."""
+
+    address: str = ""
+    """Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this machine."""
+    cpus_per_run: float = 1.0
+    """Ray: cores that a run keeps busy."""
+    gpus_per_run: float = 0.0
+    """Ray: GPUs, or the part of one, that a run keeps busy."""
+    retries: int = 2
+    """Ray: further attempts at a run whose process or machine was lost."""
+
+
+@dataclass
+class Ray(RayOptions):
     """Carries out runs as tasks of a Ray cluster: one of its own on this machine, or an existing one.
 
     Ray places the runs, and starts one again whose worker or machine was lost; it goes on from its last checkpoint.
     Where a machine sees the study's folder, the run is written there. Where it does not, the run is carried out on the
-    disk of that machine and its small files travel back.
+    disk of that machine and its small files travel back. A cluster of its own can be reached from this machine alone
+    and ends with the study.
 
-    Attributes:
-        workers: runs at once; 0 for as many as the cluster has room for.
-        address: of a cluster, ``auto`` or ``HOST:PORT``; empty starts one on this machine that only this machine can
-            reach and that ends with the study.
-        cpus_per_run: cores a run keeps busy.
-        gpus_per_run: GPUs, or the part of one, a run keeps busy.
-        retries: further attempts at a run whose worker or machine was lost.
-        module: the ray package, imported when needed.
+    Raises:
+        ValueError: a number is out of range.
+        MissingPackage: ray is not installed.
     """
 
     workers: int = 0
-    address: str = ""
-    cpus_per_run: float = 1
-    gpus_per_run: float = 0
-    retries: int = 2
-    module: Any = field(default=None, repr=False)
+    """Runs at once; 0 for as many as the cluster has room for."""
+    module: Any = None
+    """The ray package, imported if it is not given."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ValueError: one is out of range.
-            MissingPackage: ray is not installed.
-        """
         if self.cpus_per_run <= 0:
             raise ValueError(f"cpus-per-run must be above 0, got {self.cpus_per_run}")
         if self.gpus_per_run < 0 or self.retries < 0:
@@ -308,12 +307,7 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]  # another attempt finds it again
         here = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
         job = job._replace(folder=here / "run", config=write_atomic(here / "config.json", config))
-    error = trace = ""
-    try:
-        load_extensions()
-        job.train()
-    except Exception as caught:
-        error, trace = reason(caught), traceback.format_exc()
+    error, trace = job.attempt()
     if not shared:
         for path in (path for path in job.folder.rglob("*") if path.is_file()):
             name = path.relative_to(job.folder)

@@ -13,15 +13,18 @@
     report.html
 """
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.machine import versions
+from arcade_torch.tools.options import command_line
 from arcade_torch.tools.runs import Run, read_record
+from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
-from arcade_torch.tools.versions import versions
 
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
 _SCORES = ("eval_mean", "eval_std", "eval_n", "train_max_ewm")
@@ -35,13 +38,14 @@ class StudyFolder:
 
     root: Path
 
+    def job(self, spec: RunSpec) -> Job:
+        """Where the config, the folder and the log of a run stand."""
+        config, log = self.root / "configs" / f"{spec.name}.json", self.root / "logs" / f"{spec.name}.log"
+        return Job(spec.name, config, self.root / "runs" / spec.name, log)
+
     def run(self, spec: RunSpec) -> Run:
         """The folder of one run, as it is now."""
-        return Run(self.root / "runs" / spec.name)
-
-    def log(self, spec: RunSpec) -> Path:
-        """File with what the run printed."""
-        return self.root / "logs" / f"{spec.name}.log"
+        return Run(self.job(spec).folder)
 
     @property
     def analysis(self) -> Path:
@@ -61,12 +65,7 @@ class StudyFolder:
         return read_record(self.root / "study.json")
 
     def load(self) -> Study:
-        """The study that was run here.
-
-        Raises:
-            FileNotFoundError: this is no study's folder.
-            ValueError: ``study.json`` is damaged.
-        """
+        """The study that was run here; a ``FileNotFoundError`` or ``ValueError`` if there is none to read."""
         file = self.root / "study.json"
         if not file.exists():
             raise FileNotFoundError(f"{self.root} is not the folder of a study: it has no study.json")
@@ -80,38 +79,30 @@ class StudyFolder:
         """Write ``study.json``, or go on where the same study stands already.
 
         The grid may grow between two invocations; what decides a run's result may not change. A ``study.json`` that is
-        not even JSON is written anew: the run folders know what they hold and refuse other settings themselves.
-
-        Raises:
-            FileExistsError: the folder holds other files, or a study with other settings.
+        not even JSON is written anew: the run folders know what they hold and refuse other settings themselves. A
+        folder with other files, or a study with other settings, is refused by a ``FileExistsError``.
         """
         old: dict[str, Any] = {}
         if (self.root / "study.json").exists():
-            try:
+            with contextlib.suppress(ValueError):
                 old = self.record()
-            except ValueError:
-                old = {}
-            if old:
-                self._check_same(self.load(), study)
+            before = self.load() if old else study
+            was, now, names = before.fixed(), study.fixed(), {run.name for run in study.runs()}
+            what = [f"study {before.name!r} with {k} = {was[k]!r}, not {now[k]!r}" for k in now if was[k] != now[k]]
+            what += [f"run {run.name}, which this study lacks" for run in before.runs() if run.name not in names]
+            if what:
+                raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
         elif self.root.exists() and not all(entry.name.startswith(".study.json.") for entry in self.root.iterdir()):
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
-        commands = {run.name: study.command(run, self.run(run).path) for run in study.runs()}
-        # What the first runs were made with stays on record.
-        now = versions()
-        first, also = old.get("versions", now), list(old["also"]) if isinstance(old.get("also"), list) else []
-        also += [] if now in (first, *also) else [now]
+        jobs = [self.job(run) for run in study.runs()]
+        commands = {job.name: command_line(["train", *job.words]) for job in jobs}
+        here = versions()
+        first, also = old.get("versions", here), old.get("also")  # what the first runs were made with stays on record
+        also = list(also) if isinstance(also, list) else []
+        also += [] if here in (first, *also) else [here]
         made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
         if made != old:
             write_json(self.root / "study.json", made)
-
-    def _check_same(self, before: Study, study: Study) -> None:
-        new, names = study.fixed(), {run.name for run in study.runs()}
-        what = [
-            f"study {before.name!r} with {k} = {v!r}, not {new[k]!r}" for k, v in before.fixed().items() if v != new[k]
-        ]
-        what += [f"run {run.name}, which this study lacks" for run in before.runs() if run.name not in names]
-        if what:
-            raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
 
     def write_results(self, study: Study) -> list[dict[str, Any]]:
         """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined."""
@@ -130,9 +121,7 @@ class StudyFolder:
             row |= {name: final[name] for name in ("frames", "seconds", "train_max_ewm") if name in final}
             row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
         else:
-            try:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
                 error = str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
-            except (OSError, ValueError, KeyError, TypeError):
-                error = ""
         begun = "unfinished" if run.path.exists() else "waiting"
         return row | {"error": error, "status": "finished" if final else "failed" if error else begun}

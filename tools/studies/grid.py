@@ -8,13 +8,11 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arcade_torch.tools.extensions import command_line
 from arcade_torch.tools.runs import flatten
 
 if TYPE_CHECKING:
     from arcade_torch.agents.config import TrainConfig
 
-OBSERVABILITIES = ("full", "partial")
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
 """``seeds = N`` beyond this is a slip."""
@@ -72,13 +70,17 @@ class Study:
         baseline: the memory-free agent, against which Bias is measured.
         sizes: of the memory block, ``LAYERSxWIDTH`` such as ``2x512``; the memory-free agent keeps the preset's.
         question: what the study asks, a sentence for its report.
+
+    Raises:
+        ValueError: an axis is empty or repeats itself, or a value is not allowed.
+        TypeError: a value is of the wrong type.
     """
 
     name: str
     games: tuple[str, ...]
     memories: tuple[str, ...]
     seeds: tuple[int, ...]
-    observability: tuple[str, ...] = OBSERVABILITIES
+    observability: tuple[str, ...] = ("full", "partial")
     algorithms: tuple[str, ...] = ("pqn",)
     preset: str = "paper"
     total_frames: int | None = None
@@ -88,12 +90,6 @@ class Study:
     question: str = ""
 
     def __post_init__(self) -> None:
-        """Check the shape of the grid.
-
-        Raises:
-            ValueError: an axis is empty or repeats itself, or a value is out of range.
-            TypeError: an axis holds something of the wrong type.
-        """
         if not isinstance(self.name, str) or not _NAME.fullmatch(self.name) or set(self.name) == {"."}:
             raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
         for axis in _AXES:
@@ -101,17 +97,19 @@ class Study:
         for name in ("preset", "baseline", "question"):
             if not isinstance(getattr(self, name), str):
                 raise TypeError(f"{name} must be text, got {getattr(self, name)!r}")
-        _check_settings(self.settings)
+        if not isinstance(self.settings, Mapping):
+            raise TypeError(f"settings must be a table of options, got {self.settings!r}")
+        if wrong := [name for name in self.settings if name in _GRID]:
+            raise ValueError(f"settings may not hold {wrong[0]!r}: the grid decides it")
+        for name in ("env_options", "network_options"):
+            if not isinstance(value := self.settings.get(name, {}), Mapping):
+                raise TypeError(f"settings: {name} must be a table of options, got {value!r}")
         if self.total_frames is not None and not (type(self.total_frames) is int and 1 <= self.total_frames <= 10**15):
             raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
-        """Build a study from plain values, as they stand in a TOML or JSON file.
-
-        Raises:
-            ValueError: a key is unknown or missing, or a value is out of range.
-        """
+        """A study from plain values, as they stand in a TOML or JSON file; refuses unknown and missing keys."""
         if not isinstance(values, Mapping):
             raise ValueError(f"a study is a table of names and values, got {values!r}")
         known = [item.name for item in fields(cls)]
@@ -123,12 +121,7 @@ class Study:
 
     @classmethod
     def load(cls, path: str | Path) -> "Study":
-        """Read a study from a TOML file.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is not TOML or not a study; names the file.
-        """
+        """Read a study from a TOML file; a ``ValueError`` names the file if it is none."""
         path = Path(path)
         try:
             return cls.from_dict({"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8")))
@@ -155,17 +148,12 @@ class Study:
         return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
 
     def config(self, run: RunSpec) -> "TrainConfig":
-        """The config of one run; with one torch thread unless told, so that results are equal everywhere.
-
-        Raises:
-            ValueError: the preset or a setting does not exist, or has a value that is not allowed.
-        """
+        """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
         from arcade_torch.agents.presets import preset
 
         others = set(self.algorithms) - {run.algorithm}
         changes = {"threads": 1} | {name: value for name, value in self.settings.items() if name not in others}
-        if self.total_frames is not None:
-            changes["total_frames"] = self.total_frames
+        changes |= {} if self.total_frames is None else {"total_frames": self.total_frames}
         base = preset(self.preset, env=run.game, algorithm=run.algorithm)
         for name in ("env_options", "network_options"):
             changes[name] = {**getattr(base, name), **changes.get(name, {})}
@@ -174,22 +162,9 @@ class Study:
         cell = {"env": run.game, "observability": run.observability, "memory": run.memory, "seed": run.seed}
         return preset(self.preset, algorithm=run.algorithm, **cell, **changes)
 
-    def command(self, run: RunSpec, out: Path) -> str:
-        """The line for a shell that trains one run of this study in its folder ``out``."""
-        config = out.parent.parent / "configs" / f"{run.name}.json"
-        return command_line(["train", "--config", str(config), "--out", str(out), "--resume"])
-
 
 def study_preset(name: str) -> Study:
-    """A ready-made study.
-
-    * ``demo``: what ``arcade-torch demo`` runs.
-    * ``paper-easy``: the paper's agents on the easy game of each family, both twins, five seeds.
-    * ``paper``: all of the paper's main experiment: 30 games, both twins, seven memories and none, five seeds.
-    * ``size-sweep``: depth and width of the memory on two games, for the figure of that name.
-
-    Raises:
-        ValueError: there is no such preset.
+    """A ready-made study, one of `STUDY_PRESETS`; its file in ``tools/data`` says what it asks.
 
     Example:
         >>> len(study_preset("paper").runs())
@@ -204,11 +179,10 @@ def demo_study(game: str, frames: int, seeds: int) -> Study:
     """The study behind ``arcade-torch demo``: one game, both twins, one memory model and the memory-free control."""
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
-    what = replace(study_preset("demo"), games=(game,), seeds=tuple(range(seeds)), total_frames=frames)
-    if game in study_preset("demo").games:
-        return what
+    demo = study_preset("demo")
+    what = replace(demo, games=(game,), seeds=tuple(range(seeds)), total_frames=frames)
     question = f"What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
-    return replace(what, question=question)
+    return what if game in demo.games else replace(what, question=question)
 
 
 def _axis(axis: str, value: Any) -> tuple[Any, ...]:
@@ -229,14 +203,3 @@ def _axis(axis: str, value: Any) -> tuple[Any, ...]:
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
     return values
-
-
-def _check_settings(settings: Any) -> None:
-    """Refuse anything but a table of fields; what they are called and hold is checked by ``TrainConfig``."""
-    if not isinstance(settings, Mapping):
-        raise TypeError(f"settings must be a table of options, got {settings!r}")
-    for name, value in settings.items():
-        if name in ("env_options", "network_options") and not isinstance(value, Mapping):
-            raise TypeError(f"settings: {name} must be a table of options, got {value!r}")
-        if name in _GRID:
-            raise ValueError(f"settings may not hold {name!r}: the grid decides it")

@@ -5,15 +5,16 @@ import errno
 import re
 import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arcade_torch.agents.runs.files import write_json
-from arcade_torch.tools.progress import Bars, Speed
+from arcade_torch.tools.machine import available_cores
+from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.runs import Run
-from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, available_cores
+from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -36,7 +37,7 @@ class StudyResult:
     rows: list[dict[str, Any]]
     """of ``results.csv``"""
     errors: dict[str, str]
-    """run name -> one line, for runs that failed in this invocation"""
+    """run name -> one line with the reason and the log, for runs that failed in this invocation"""
 
     @property
     def finished(self) -> int:
@@ -82,11 +83,10 @@ def study(
     try:
         folder.claim(what, command)
         folder.write_results(what)
-        jobs = []
-        for run in (run for run in plan if folder.run(run).final is None):
-            file = write_json(folder.root / "configs" / f"{run.name}.json", plan[run].to_dict())
-            jobs.append(Job(run.name, file, folder.run(run).path, folder.log(run)))
-        errors = _carry_out(what, folder, {run.name: run for run in plan}, jobs, engine, stream) if jobs else {}
+        jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
+        for run, job in jobs.items():
+            write_json(job.config, plan[run].to_dict())
+        errors = _carry_out(what, folder, list(plan), list(jobs.values()), engine, stream) if jobs else {}
         return StudyResult(folder.root, folder.write_results(what), errors)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -94,13 +94,14 @@ def study(
         raise DiskFullError(f"{error.strerror}: {error.filename or 'the study'}; make room and start again") from error
 
 
-def make_engine(name: str, workers: int = 0, **of_ray: Any) -> Engine:
-    """An engine by its name; ``auto`` takes processes where there is more than one core. For Ray see :class:`Ray`."""
+def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> Engine:
+    """An engine by its name; ``auto`` takes processes where there is more than one core."""
     if workers < 0:
         raise ValueError(f"workers must be at least 1 (or 0 for as many as there is room for), got {workers}")
+    of_ray = vars(ray or RayOptions())
     if name == "ray":
-        return Ray(workers, **of_ray)
-    if wrong := [key for key, value in of_ray.items() if value != getattr(Ray, key)]:
+        return Ray(**of_ray, workers=workers)
+    if wrong := [key for key, value in of_ray.items() if value != getattr(RayOptions, key)]:
         raise ValueError(f"--{wrong[0].replace('_', '-')} is for --engine ray, and the engine is {name}")
     if name == "processes" or (name == "auto" and len(available_cores()) > 1):
         return Processes(workers)
@@ -110,11 +111,7 @@ def make_engine(name: str, workers: int = 0, **of_ray: Any) -> Engine:
 
 
 def planned(what: Study, shard: str = "") -> "dict[RunSpec, TrainConfig]":
-    """The runs of a study with their configs; of shard ``3/10`` every tenth run from the third.
-
-    Raises:
-        ValueError: a game, a memory model or a setting does not exist, or it is no shard.
-    """
+    """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and all checked."""
     from arcade_torch.envs_jax import make
     from arcade_torch.models import make_memory, memory_names
 
@@ -130,19 +127,23 @@ def planned(what: Study, shard: str = "") -> "dict[RunSpec, TrainConfig]":
 
 
 def _carry_out(
-    what: Study, folder: StudyFolder, runs: Mapping[str, RunSpec], jobs: list[Job], engine: Engine, stream: Any
+    what: Study, folder: StudyFolder, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
 ) -> dict[str, str]:
-    ended, errors = set(runs) - {job.name for job in jobs}, dict[str, str]()
-    display = Display(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
-    with display, contextlib.closing(engine.run(jobs)) as results:  # type: ignore[type-var]
+    runs, errors = {run.name: run for run in plan}, dict[str, str]()
+    ended = set(runs) - {job.name for job in jobs}
+    bars = shown(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
+    with bars as note, contextlib.closing(engine.run(jobs)) as results:  # type: ignore[type-var]
         if ended:
-            display.note(f"{len(ended)} of {len(runs)} runs are finished already")
-        for result in results:
-            run, error = runs[result.name], ""
-            ended.add(result.name)
-            if folder.run(run).final is None:  # a process killed after its last word has done its work
-                error = errors[result.name] = result.error or "ended without a final evaluation"
-                display.note(f"{result.name} failed: {error} (log: {folder.log(run)})")
+            note(f"{len(ended)} of {len(runs)} runs are finished already")
+        for name, error in results:
+            run = runs[name]
+            ended.add(name)
+            if folder.run(run).final is not None:  # a process killed after its last word has done its work
+                error = ""
+            else:
+                error = error or "ended without a final evaluation"
+                errors[name] = f"{error} (log: {folder.job(run).log})"
+                note(f"{name} failed: {errors[name]}")
             folder.note_failure(run, error)
             folder.write_results(what)
             if error and ("No space left" in error or shutil.disk_usage(folder.root).free < LEAST_FREE_BYTES):
@@ -150,59 +151,41 @@ def _carry_out(
     return errors
 
 
-class Display:
-    """Shows how far a study is, from the ``progress.json`` of its runs: a bar for all and one for each run at work.
+@contextlib.contextmanager
+def shown(title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None) -> Iterator[Callable[[str], None]]:
+    """Show how far a study is, from the ``progress.json`` of its runs, a bar for all and one for each run at work.
 
-    ``ended`` holds the names of the runs that have ended; the caller adds to it.
+    ``ended`` holds the names of the runs that have ended; the caller adds to it. Gives a function that prints a line.
     """
+    stop = threading.Event()
+    with Bars(stream, "frames", first_line_s=3.0) as bars:
 
-    def __init__(self, title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None) -> None:
-        self.title, self.runs, self.ended = title, runs, ended
-        self.bars, self.speed = Bars(stream, first_line_s=3.0), Speed()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._loop, daemon=True, name="study-progress")
+        def loop() -> None:
+            while not stop.wait(0.5):
+                show_progress(bars, title, runs, ended)
 
-    def __enter__(self) -> "Display":
-        """Start to show."""
-        self.bars.__enter__()
-        self._thread.start()
-        return self
+        thread = threading.Thread(target=loop, daemon=True, name="study-progress")
+        thread.start()
+        try:
+            yield lambda text: bars.note(f"{title}: {text}")
+        finally:
+            stop.set()
+            thread.join()
+            show_progress(bars, title, runs, ended)
 
-    def __exit__(self, *exc: object) -> None:
-        """Show the last state and stop."""
-        self._stop.set()
-        self._thread.join()
-        line = self.show()
-        self.bars.__exit__()
-        if not self.bars.stream.isatty():
-            self.note(line)
 
-    def note(self, text: str) -> None:
-        """Print a line."""
-        self.bars.note(f"{self.title}: {text}")
-
-    def show(self) -> str:
-        """Read all folders once and draw the bars; returns what a log gets, in one line."""
-        seen = {name: run.progress() for name, run in self.runs.items()}
-        usual = next((wanted for _, wanted, _ in seen.values() if wanted), 0)
-        frames, total, terminal = 0, 0, self.bars.stream.isatty()
-        for name, (done, wanted, status) in seen.items():
-            wanted = wanted or usual
-            done = wanted if name in self.ended else min(done, wanted)
-            frames, total = frames + done, total + wanted
-            bar = f"  {name.replace('__', ' ')}"
-            if terminal and status == "running" and name not in self.ended:
-                self.bars.update(bar, done, wanted)
-            else:
-                self.bars.remove(bar)
-        pace = self.speed.words(frames, total)
-        share = 100 * frames / total if total else 0
-        runs = f"{len(self.ended)}/{len(self.runs)} runs"
-        line = f"{runs}, {frames:,} of {total:,} frames ({share:.0f} %){pace}"
-        if terminal or frames < total:
-            self.bars.update(self.title, frames, total or None, f"{runs}{pace}", f"{self.title}: {line}")
-        return line
-
-    def _loop(self) -> None:
-        while not self._stop.wait(0.5):
-            self.show()
+def show_progress(bars: Bars, title: str, runs: Mapping[str, Run], ended: set[str]) -> None:
+    """Read the folders of all runs once and draw the bars."""
+    seen = {name: run.progress() for name, run in runs.items()}
+    usual = next((wanted for _, wanted, _ in seen.values() if wanted), 0)
+    frames = total = 0
+    for name, (done, wanted, status) in seen.items():
+        wanted = wanted or usual
+        done = wanted if name in ended else min(done, wanted)
+        frames, total = frames + done, total + wanted
+        bar = f"  {name.replace('__', ' ')}"
+        if bars.terminal and status == "running" and name not in ended:
+            bars.update(bar, done, wanted)
+        else:
+            bars.remove(bar)
+    bars.update(title, frames, total, f"{len(ended)}/{len(runs)} runs")

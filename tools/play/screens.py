@@ -1,0 +1,139 @@
+"""Where a session is shown: a window of pygame, or a terminal with half blocks in 24-bit colours, two pixels each."""
+
+import os
+import re
+import select
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import groupby
+
+import numpy as np
+
+from arcade_torch.gym.window import Window
+from arcade_torch.tools.errors import MissingPackage, need
+from arcade_torch.tools.play.session import LEGEND, NEXT, QUIT, RESTART, TOGGLE, Frame, Session
+
+FPS = 30
+_DELAY_MS = 300  # how long a key is held before it repeats
+WINDOW_KEYS = {"K_UP": "up", "K_DOWN": "down", "K_LEFT": "left", "K_RIGHT": "right", "K_SPACE": "fire"}
+WINDOW_KEYS |= {"K_r": RESTART, "K_p": TOGGLE, "K_RETURN": NEXT, "K_ESCAPE": QUIT}
+
+_ARROWS = dict(zip("ABCD", ("up", "down", "right", "left"), strict=True))
+TERMINAL_KEYS = {
+    **{f"\x1b{prefix}{letter}".encode(): name for prefix in "[O" for letter, name in _ARROWS.items()},
+    b" ": "fire",
+    **dict.fromkeys((b"r", b"R"), RESTART),
+    **dict.fromkeys((b"p", b"P"), TOGGLE),
+    **dict.fromkeys((b"\r", b"\n"), NEXT),
+    **dict.fromkeys((b"\x1b", b"q", b"\x03", b"\x04"), QUIT),
+}
+_SEQUENCE = re.compile(rb"\x1b[\[O][^@-~]*[@-~]?|.", re.DOTALL)  # up to the final byte of a sequence, or one byte
+_REST_WITHIN_S = 0.05  # the rest of an arrow key's sequence arrives within this
+_ENTER, _LEAVE = "\x1b[?1049h\x1b[?25l\x1b[2J", "\x1b[0m\x1b[?25h\x1b[?1049l"
+_COLOURS = "\x1b[38;2;{};{};{};48;2;{};{};{}m"
+_TEXT_ROWS = 2
+
+
+def why_no_window() -> str | None:
+    """Why a window cannot be opened here, in a few words; None if it can."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        pygame = need("pygame")
+    except MissingPackage as error:
+        return str(error)
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in names):
+        return "there is no display"
+    try:
+        pygame.display.init()
+    except pygame.error as error:
+        return f"no display can be opened ({error})"
+    return None
+
+
+def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> None:
+    """Show a session and hand it the keys, until it is closed."""
+    window = Window(scale)
+    pygame = window.pygame
+    keys = {getattr(pygame, constant): name for constant, name in WINDOW_KEYS.items()}
+    try:
+        window.show(session.frame, session.caption)
+        pygame.key.set_repeat(*((_DELAY_MS, key_repeat_ms) if key_repeat_ms else ()))
+        while not session.closed:
+            for event in pygame.event.get((pygame.QUIT, pygame.KEYDOWN)):
+                key = QUIT if event.type == pygame.QUIT else keys.get(event.key)
+                if key is not None:
+                    session.press(key)
+                    window.show(session.frame, session.caption)
+            window.tick(FPS)
+    finally:
+        window.close()
+
+
+def play_in_terminal(session: Session) -> None:
+    """Show a session in this process's terminal and hand it the keys, until it is closed."""
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise ValueError("playing needs a window or a terminal, and this is neither: standard input is redirected")
+    with _raw_terminal() as source:
+        while not session.closed:
+            size = shutil.get_terminal_size()
+            print(screen(session, size.columns, size.lines), end="", flush=True)
+            data = os.read(source, 64)
+            while data.endswith((b"\x1b", b"\x1b[", b"\x1bO")) and select.select([source], [], [], _REST_WITHIN_S)[0]:
+                data += os.read(source, 64)
+            for key in decode_keys(data or b"\x04"):  # a closed terminal quits
+                session.press(key)
+
+
+@contextmanager
+def _raw_terminal() -> Iterator[int]:
+    """Keys one by one and unseen, on a screen of our own; everything as before afterwards, whatever happens."""
+    import termios
+    import tty
+
+    source = sys.stdin.fileno()
+    before = termios.tcgetattr(source)
+    try:
+        tty.setcbreak(source)
+        print(_ENTER, end="")
+        yield source
+    finally:
+        termios.tcsetattr(source, termios.TCSADRAIN, before)
+        print(_LEAVE, end="", flush=True)
+
+
+def decode_keys(data: bytes) -> list[str]:
+    """Names of the keys in what a terminal sent; a lone escape is quit, unknown sequences are left out.
+
+    Example:
+        >>> decode_keys(b"\\x1b[A p\\x1b")
+        ['up', 'fire', 'toggle', 'quit']
+    """
+    return [TERMINAL_KEYS[found] for found in _SEQUENCE.findall(data) if found in TERMINAL_KEYS]
+
+
+def screen(session: Session, columns: int, rows: int) -> str:
+    """What to write to the terminal to show a session."""
+    picture = half_blocks(session.frame, 2 * max(1, rows - _TEXT_ROWS), columns)
+    text = [words[:columns] for words in (session.caption, LEGEND)]
+    return "\x1b[H" + "\r\n".join(f"{line}\x1b[K" for line in [*picture, *text]) + "\x1b[J"
+
+
+def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
+    """Lines that draw a frame, made smaller by means over areas until it fits, two rows of pixels each.
+
+    The upper row has the colour of the text, the lower one that of the background.
+    """
+    image = need("PIL.Image")
+    picture = image.fromarray(frame)
+    picture.thumbnail((width, height), image.Resampling.BOX, reducing_gap=None)
+    pixels = np.asarray(picture)
+    pixels = np.pad(pixels, ((0, len(pixels) % 2), (0, 0), (0, 0))).tolist()
+    lines = []
+    for upper, lower in zip(pixels[::2], pixels[1::2], strict=True):
+        runs = [(colours, len(list(cells))) for colours, cells in groupby(zip(upper, lower, strict=True))]
+        parts = [_COLOURS.format(*top, *bottom) + "\u2580" * count for (top, bottom), count in runs]
+        lines.append("".join(parts) + "\x1b[0m")
+    return lines
