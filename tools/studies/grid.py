@@ -175,14 +175,14 @@ def study_preset(name: str) -> Study:
     return replace(Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name)
 
 
-def demo_study(game: str, frames: int, seeds: int) -> Study:
-    """The study behind ``arcade-torch demo``: one game, both twins, one memory model and the memory-free control."""
+def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
+    """The study behind ``arcade-torch demo``: games, both twins, one memory model and the memory-free control."""
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     demo = study_preset("demo")
-    what = replace(demo, games=(game,), seeds=tuple(range(seeds)), total_frames=frames)
-    question = f"What does a memory do for an agent that plays {game} as an MDP (full) and as a POMDP (partial)?"
-    return what if game in demo.games else replace(what, question=question)
+    what = replace(demo, games=games, seeds=tuple(range(seeds)), total_frames=frames)
+    question = f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and POMDPs (partial)?"
+    return what if games == demo.games else replace(what, question=question)
 
 
 def _axis(axis: str, value: Any) -> tuple[Any, ...]:
