@@ -107,12 +107,12 @@ class ArcadeCollector(BaseCollector):
         self._runner = PolicyRunner(policy, env.num_envs, env.device, store, store_states)
         self._buffer: RolloutBuffer | None = None
         self._frames, self._iter = 0, -1
-        self._start_over()
+        self.reset()
         if seed is not None:
             self.set_seed(seed)
 
-    def _start_over(self) -> None:
-        """Forget the running episodes: the next window begins with a reset."""
+    def reset(self) -> None:
+        """Start over: the next window begins with new episodes."""
         self._obs: dict[str, torch.Tensor] | None = None
         self._seen = (-1, -1)  # the env's generation that the observation is of
         self._acted = 0  # steps since the first reset
@@ -175,8 +175,7 @@ class ArcadeCollector(BaseCollector):
             self.pre_collect_hook()
         buffer, obs = self._look()
         first_window = self._acted == 0
-        buffer.begin(carry=not first_window, reuse=self.return_same_td)
-        first = 0 if first_window else self._overlap
+        first = buffer.begin(carry=not first_window, reuse=self.return_same_td, dense=dense)
         began_with = {key: value for key, value in obs.items() if key != "pixels"}
         self._obs, self._seen = {}, (-1, -1)  # nothing holds the first frames, and a window that fails is noticed
         random = random or self.policy is None or self._frames < self.init_random_frames
@@ -185,7 +184,7 @@ class ArcadeCollector(BaseCollector):
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
         self._obs, self._seen = obs, self.env.generation
-        wanted = buffer.finish(first, began_with, obs["pixels"], dense)
+        wanted = buffer.finish(began_with, obs["pixels"])
         for rows, steps, drawn in self._finals.draw(wanted):
             frames = to_torch(drawn, self.env.device)[: len(rows)]
             buffer.write_final(rows, steps, self._compressed(frames))
@@ -245,7 +244,7 @@ class ArcadeCollector(BaseCollector):
         buffer.write_outcome(step, raw.numbers)
         buffer.write_extras(step, extras)
         if self._final_frames != "none" and self._may_have_ended(raw.numbers):
-            self._finals.add(step, raw.step)
+            self._finals.add(step, *raw.final)
         self._acted += 1
         reads = ROOT_KEYS if step == buffer.length - 1 else self._runner.reads
         following = {"pixels": self._compressed(raw.pixels), **self.env.root_numbers(raw, reads)}
@@ -280,12 +279,8 @@ class ArcadeCollector(BaseCollector):
         """
         following: int = self.env.set_seed(seed, static_seed=static_seed)
         self._generator.manual_seed(seed)
-        self._start_over()
+        self.reset()
         return following
-
-    def reset(self) -> None:
-        """Start over with new episodes."""
-        self._start_over()
 
     def _maybe_fallback_update(self, policy_or_weights: Any = None, *, model_id: str | None = None) -> None:
         """Weights are live, since the policy is shared; only other weights have to be copied."""
@@ -343,7 +338,7 @@ class ArcadeCollector(BaseCollector):
         if isinstance(self.policy, nn.Module) and (strict or "policy_state_dict" in state_dict):
             self.policy.load_state_dict(state_dict["policy_state_dict"], strict=strict)
         self._generator.set_state(state_dict["generator"].cpu())
-        self._start_over()
+        self.reset()
         self._frames, self._iter = int(state_dict["frames"]), int(state_dict["iter"])
         self._acted = int(state_dict["acted"])
         if "recurrent_state" not in state_dict:

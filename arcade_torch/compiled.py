@@ -1,18 +1,20 @@
 """The compiled functions of a game or a mixture of games, shared by all envs that play it. Loads no torch."""
 
 import os
+import weakref
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
-from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome
+from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
 from arcade_torch.envs_jax.mixture import Batched
 from arcade_torch.envs_jax.validation import format_value
 
@@ -22,8 +24,8 @@ NUM_NUMBERS = 5
 
 # One compiled shape draws final observations: an eighth of the batch, at least 4 frames, of at most 8 different steps.
 _SHARE, _MIN_FRAMES, _MAX_STEPS = 8, 4, 8
-
 _Ids = str | tuple[str, ...]
+Spare = jax.Array | None
 
 
 class Step(NamedTuple):
@@ -36,23 +38,35 @@ class Step(NamedTuple):
 
 
 class CompiledGame:
-    """A game, batched or not, or a mixture, and the steps of the bridge; each is compiled once per number of envs."""
+    """A game, batched or not, or a mixture, and the steps of the bridge; each is compiled once per number of envs.
+
+    Functions that draw take ``spare``, memory of the size of the frames, and draw into it; see ``FrameMemory``.
+    """
 
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
-        self.step = jax.jit(self._step)
-        self.step_only = jax.jit(self._step_only)
-        self.draw_rows = tuple(jax.jit(partial(_draw_rows, group)) for group in self.batched.groups)
+        self.step = jax.jit(self._step, donate_argnums=2, keep_unused=True)
+        self.reset_or_step = jax.jit(self._reset_or_step)
+        self.step_only = jax.jit(self._step_only, donate_argnums=2, keep_unused=True)
+        draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
+        self.draw_rows = tuple(jax.jit(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
 
-    def _step(self, batch: Batch, action: jax.Array) -> Step:
+    def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack the numbers."""
         root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
         return Step(root, stepped.state, pixels, _pack(stepped, outcome))
 
-    def _step_only(self, batch: Batch, action: jax.Array) -> tuple[Batch, jax.Array, jax.Array]:
+    def _step_only(self, batch: Batch, action: jax.Array, spare: Spare = None) -> tuple[Batch, jax.Array, jax.Array]:
         """Step and draw, without any reset; returns the batch, the frames and the numbers."""
         stepped, outcome, pixels = self.batched.step_render(batch, action)
         return stepped, pixels, _pack(stepped, outcome)
+
+    def _reset_or_step(self, batch: Batch, action: jax.Array, ended: jax.Array) -> tuple[Batch, Outcome]:
+        """Begin anew where ``ended`` (bool [N]) is true, and step elsewhere; nothing is drawn."""
+        stepped, outcome = self.batched.step(batch, action)
+        # A row that begins anew has not stepped: it goes on from the random key it had, and gets nothing.
+        root = self.batched.reset_where(choose_rows(ended, batch, stepped), ended)
+        return root, choose_rows(ended, jax.tree.map(jnp.zeros_like, outcome), outcome)
 
 
 def _pack(stepped: Batch, outcome: Outcome) -> jax.Array:
@@ -61,11 +75,58 @@ def _pack(stepped: Batch, outcome: Outcome) -> jax.Array:
 
 
 def _draw_rows(
-    group: BatchedGame[Any], states: list[Any], flags: jax.Array, step: jax.Array, row: jax.Array, first: jax.Array
+    group: BatchedGame[Any], states: list[Any], flags: jax.Array, index: jax.Array, first: int, spare: Spare
 ) -> jax.Array:
-    """Draw the envs ``row`` as they were after ``step`` (indices [n]); the states begin with the env ``first``."""
+    """Draw n envs, each after some step: ``index`` [2, n] is step and env; the states begin with the env ``first``."""
+    step, row = index
     picked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[step, row - first], *states)
     return jax.vmap(group.game.render)(picked, flags[row])
+
+
+class Reused:
+    """Up to ``most`` (2 or more) blocks of memory, each given again once nobody can see it: new ones cost page faults.
+
+    A block is watched through the numpy array that was handed out over it. Whatever is made of that keeps it alive
+    (views, tensors, views of tensors, arrays of JAX), so when it is gone, nobody looks.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._blocks: list[tuple[Any, weakref.ref[Any]]] = []
+
+    def take(self, make: Callable[[], Any]) -> Any:
+        """A block that nobody can see, or else a new one. It is to be handed out."""
+        for place, (block, seen) in enumerate(self._blocks):
+            if seen() is None:
+                del self._blocks[place]
+                return block
+        return make()
+
+    def hand_out(self, block: Any, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Remember that ``array`` lies over the block, and return it; the oldest block too many is forgotten."""
+        self._blocks = [*self._blocks[1 - self._most :], (block, weakref.ref(array))]
+        return array
+
+
+class FrameMemory:
+    """Lets compiled functions draw where they drew before, once nobody can see those frames any more.
+
+    JAX stands behind ``Reused``: it does not write to memory that is seen from outside, but takes new. On a GPU nothing
+    is reused: there memory is JAX's own to give again, and torch may read it later than Python says.
+    """
+
+    def __init__(self, shape: tuple[int, ...], device: jax.Device, most: int = 3) -> None:
+        self._shape, self._device, self._reuses = shape, device, device.platform == "cpu"
+        self._reused = Reused(most)  # 3: what a caller acts on, what that came from, and what is drawn next
+
+    def spare(self) -> Spare:
+        """Memory to be given to the function that draws, once; None where nothing is reused."""
+        new = partial(jnp.empty, self._shape, jnp.uint8, device=self._device)
+        return self._reused.take(new) if self._reuses else None
+
+    def show(self, frames: jax.Array) -> jax.Array | npt.NDArray[np.uint8]:
+        """What may be handed out of the frames that were drawn: a read-only view, on a GPU the frames themselves."""
+        return self._reused.hand_out(frames, np.asarray(frames)) if self._reuses else frames
 
 
 class FinalObservations:
@@ -74,20 +135,19 @@ class FinalObservations:
     Keeping the states of up to ``max_steps`` steps costs nothing; neither the host nor the device waits.
     """
 
-    def __init__(self, compiled: CompiledGame, num_envs: int, max_steps: int) -> None:
-        batched = compiled.batched
+    def __init__(self, compiled: CompiledGame, num_envs: int, max_steps: int, device: jax.Device) -> None:
+        batched, steps = compiled.batched, min(max_steps, _MAX_STEPS)
         pairs = zip(compiled.draw_rows, batched.rows(num_envs), strict=True)
-        self._games = [_OneGame(draw_rows, rows, min(max_steps, _MAX_STEPS)) for draw_rows, rows in pairs]
+        self._games = [_OneGame(draw_rows, rows, steps, batched.game.obs_size, device) for draw_rows, rows in pairs]
         self._split_states = batched.states
         self._states: dict[int, tuple[Any, ...]] = {}
         self._partial: jax.Array | None = None
 
-    def add(self, index: int, step: Step) -> None:
+    def add(self, index: int, final_state: Any, partial: jax.Array) -> None:
         """Keep the state that a step led to, before the resets, under a number."""
-        self._states[index] = self._split_states(step.final_state)  # not the step, which would keep its frames alive
-        self._partial = step.root.partial
+        self._states[index], self._partial = self._split_states(final_state), partial
 
-    def draw(self, wanted: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, jax.Array]]:
+    def draw(self, wanted: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, jax.Array | np.ndarray]]:
         """Draw the observations that are wanted, and forget all steps.
 
         Args:
@@ -113,10 +173,11 @@ class FinalObservations:
 class _OneGame:
     """Draws rows of the states of the envs ``first`` to ``last``, which play one game."""
 
-    def __init__(self, draw_rows: Any, rows: slice, max_steps: int) -> None:
+    def __init__(self, draw_rows: Any, rows: slice, max_steps: int, obs_size: int, device: jax.Device) -> None:
         self.first, self.last, self._max_steps, self._draw_rows = rows.start, rows.stop, max_steps, draw_rows
         size = rows.stop - rows.start
         self._size = min(size, max(_MIN_FRAMES, size // _SHARE))
+        self._memory = FrameMemory((self._size, obs_size, obs_size, 3), device, most=8)  # so many portions at once
 
     def portions(self, rows: np.ndarray, steps: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Cut rows and their steps (in ascending order) into what one call draws."""
@@ -128,13 +189,12 @@ class _OneGame:
             yield rows[:count], steps[:count]
             rows, steps = rows[count:], steps[count:]
 
-    def draw(self, states: list[Any], flags: Any, step: np.ndarray, row: np.ndarray) -> jax.Array:
+    def draw(self, states: list[Any], flags: Any, step: np.ndarray, row: np.ndarray) -> jax.Array | np.ndarray:
         """One call; ``step`` counts in ``states``. What is short of the compiled shape is filled up."""
         states = states + [states[-1]] * (self._max_steps - len(states))
-        fill = (0, self._size - len(row))
-        indices = (np.pad(index, fill, mode="edge").astype(np.int32) for index in (step, row))
-        frames: jax.Array = self._draw_rows(states, flags, *indices, np.int32(self.first))
-        return frames
+        index = np.empty((2, self._size), np.int32)
+        index[:, : len(row)], index[:, len(row) :] = (step, row), ((step[-1],), (row[-1],))
+        return self._memory.show(self._draw_rows(states, flags, index, np.int32(self.first), self._memory.spare()))
 
 
 def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: dict[str, Any]) -> CompiledGame:

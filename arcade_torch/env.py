@@ -1,6 +1,7 @@
 """``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
 
 from collections.abc import Callable, Collection
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +18,10 @@ from arcade_torch.compiled import (
     TERMINATED,
     CompiledGame,
     FinalObservations,
-    Step,
+    FrameMemory,
     check_process,
 )
-from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, upload, wait_for_torch
+from arcade_torch.dlpack import TensorMemory, int32_argument, is_host, pick_devices, to_torch, wait_for_torch, write
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
@@ -32,11 +33,11 @@ _INTEGERS[torch.uint8] = np.uint8
 
 
 class RawStep(NamedTuple):
-    """One fused step, and the two tensors that are exported of it."""
+    """What one fused step gives."""
 
     pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
     numbers: torch.Tensor  # float32 [N, 5], see ``Step.numbers``
-    step: Step  # everything, as JAX made it
+    final: tuple[Any, jax.Array]  # the games' states before the resets, and who saw the partial view
 
 
 class ArcadeEnv(EnvBase):
@@ -106,8 +107,11 @@ class ArcadeEnv(EnvBase):
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         wait_for_torch(torch_device, jax_device)
-        self._live = _Live(self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device)))
+        first = self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device))
+        self._live = SimpleNamespace(batch=first, generation=0, view=0)  # assignment to an nn.Module is slow
         self._finals = self.final_observations(1)
+        shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
+        self._memory, self._copies = FrameMemory(shape, jax_device), TensorMemory(shape, torch_device)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
         made = make_specs(num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device)
@@ -180,7 +184,7 @@ class ArcadeEnv(EnvBase):
         Raises:
             ValueError: The state of another game or batch size, or a broken one.
         """
-        self._live.replace(self._snapshots.load(state))
+        self._go_on(self._snapshots.load(state))
         return self.observe()
 
     def observe(self) -> TensorDict:
@@ -204,7 +208,7 @@ class ArcadeEnv(EnvBase):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        self._live.replace(self._snapshots.load(TensorDict(state, batch_size=self.batch_size)))
+        self._go_on(self._snapshots.load(TensorDict(state, batch_size=self.batch_size)))
 
     # -- the fast path ----------------------------------------------------------------------------------------------
 
@@ -223,12 +227,12 @@ class ArcadeEnv(EnvBase):
             ValueError: Actions of a wrong shape or out of range.
         """
         argument = int32_argument(self._check_action(action), self._jax_device)
-        step = self._compiled.step(self._live.batch, argument)
+        step = self._compiled.step(self._live.batch, argument, self._memory.spare())
         if while_computing is not None:
             while_computing()
-        frames = to_torch(step.pixels, self.device)  # on the CPU it waits; the argument must live until here
-        self._live.replace(step.root)
-        return RawStep(frames, to_torch(step.numbers, self.device), step)
+        frames = to_torch(self._memory.show(step.pixels), self.device)  # on the CPU it waits; argument lives until here
+        self._go_on(step.root)
+        return RawStep(frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial))
 
     def root_numbers(self, raw: RawStep, keys: Collection[str]) -> dict[str, torch.Tensor]:
         """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if asked for."""
@@ -244,7 +248,12 @@ class ArcadeEnv(EnvBase):
 
     def final_observations(self, max_steps: int) -> FinalObservations:
         """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
-        return FinalObservations(self._compiled, self.num_envs, max_steps)
+        return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
+
+    def _go_on(self, batch: Batch) -> None:
+        """Put another state in place."""
+        self._live.batch = batch
+        self._live.generation += 1
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
@@ -287,17 +296,17 @@ class ArcadeEnv(EnvBase):
         root = self._root(batch, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
             validation.check_merge(tensordict, root)
-        self._live.replace(batch)
+        self._go_on(batch)
         return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._state_in_td:  # go on from the state the caller handed over
-            self._live.replace(self._snapshots.load(tensordict.get("state", None)))
+            self._go_on(self._snapshots.load(tensordict.get("state", None)))
         action = self._check_action(validation.tensor(tensordict, "action"))
         argument, before = int32_argument(action, self._jax_device), self._live.batch
-        stepped, pixels, numbers = self._compiled.step_only(before, argument)
-        frames = to_torch(pixels, self.device)
-        self._live.replace(stepped)
+        stepped, pixels, numbers = self._compiled.step_only(before, argument, self._memory.spare())
+        frames = to_torch(self._memory.show(pixels), self.device)
+        self._go_on(stepped)
         following = self._next(frames, action, to_torch(numbers, self.device))
         if self._state_in_td:
             following["state"] = self._snapshots.export(stepped)
@@ -308,10 +317,10 @@ class ArcadeEnv(EnvBase):
     def _only_marked(self, tensordict: TensorDictBase, before: Batch, following: TensorDict) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
         marked, stepped = validation.mask(tensordict, "_step", self.num_envs), self._live.batch
-        self._live.replace(before)  # where it stays if the next line refuses
+        self._go_on(before)  # where it stays if the next line refuses
         validation.check_merge(tensordict, following)
         rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before)))
-        self._live.replace(self._batched.narrow(rows))
+        self._go_on(self._batched.narrow(rows))
         left_alone = following.apply(torch.zeros_like)
         kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
         left_alone.update(tensordict.select(*kept, strict=False))
@@ -330,10 +339,10 @@ class ArcadeEnv(EnvBase):
         last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
         frames, done = raw.pixels, (raw.numbers[:, TERMINATED:] > 0).any(1).cpu().numpy()
         if done.any():
-            self._finals.add(0, raw.step)
-            frames = raw.pixels.clone()
+            self._finals.add(0, *raw.final)
+            frames = self._copies.take().copy_(raw.pixels)
             for rows, _, final in self._finals.draw(done[:, None]):
-                frames[upload(rows, self.device)] = to_torch(final, self.device)[: len(rows)]
+                write(frames, rows, to_torch(final, self.device)[: len(rows)])
         following = self._next(frames, last_action, raw.numbers)
         preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
         if preset is not None:
@@ -352,7 +361,7 @@ class ArcadeEnv(EnvBase):
             seed = int(torch.randint(2**32, ()))
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
-        self._live.replace(self._live.batch._replace(key=new[0], last_action=new[1]))
+        self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]))
 
     # -- exports ----------------------------------------------------------------------------------------------------
 
@@ -383,18 +392,3 @@ class ArcadeEnv(EnvBase):
         entries = {"pixels": frames, "last_action": action.to(torch.int64, copy=True), **counts}
         entries |= {"done": ends.any(-1, keepdim=True), "terminated": ends[:, :1], "truncated": ends[:, 1:]}
         return {**entries, "task": self.task} if self.task_in_td else entries
-
-
-class _Live:
-    """The state of the env, outside of ``nn.Module``, whose attribute assignment is slow."""
-
-    __slots__ = ("batch", "generation", "view")
-
-    def __init__(self, batch: Batch) -> None:
-        self.batch = batch
-        self.generation = self.view = 0
-
-    def replace(self, batch: Batch) -> None:
-        """Put another state in place."""
-        self.batch = batch
-        self.generation += 1

@@ -33,7 +33,7 @@ class PolicyRunner:
         store_states: bool,
     ) -> None:
         self._policy, self._size, self._device = policy, [batch_size], device
-        self._store = None if store is None else [_path(key) for key in store]
+        self._store = None if store is None else [path_of(key) for key in store]
         self._store_states = store_states
         reads = () if policy is None else getattr(policy, "in_keys", ROOT_KEYS)
         self.reads = tuple(key for key in ROOT_KEYS if key in reads or key == "is_init")
@@ -90,9 +90,9 @@ class PolicyRunner:
         td = self._policy(td)
         carried = TensorDict({}, batch_size=self._size, device=self._device)
         stored: dict[NestedKey, torch.Tensor] = {}
-        states = set(map(_path, state.keys(True, True)))
+        states = set(map(path_of, state.keys(True, True)))
         for key, value in td.items(True, True):
-            path = _path(key)
+            path = path_of(key)
             if path[0] == "next":
                 carried[path[1:]] = value
             is_state = path[0] == "next" or path in states
@@ -107,7 +107,7 @@ class PolicyRunner:
         return self._store is None or any(path[: len(prefix)] == prefix for prefix in self._store)
 
 
-def _path(key: NestedKey) -> tuple[str, ...]:
+def path_of(key: NestedKey) -> tuple[str, ...]:
     """A key as a tuple."""
     return (key,) if isinstance(key, str) else key
 

@@ -1,6 +1,5 @@
 """The storage of a collector: one window of L = overlap + T steps, every frame written once."""
 
-import weakref
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -9,7 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDict
 
 from arcade_torch.compiled import EPISODE_REWARD, NUM_NUMBERS, REWARD, STEP_COUNT, TERMINATED, TRUNCATED
-from arcade_torch.dlpack import is_host, upload
+from arcade_torch.dlpack import TensorMemory, upload, write
+from arcade_torch.policies import path_of
 
 FinalFrames = Literal["all", "truncated", "none"]
 
@@ -19,26 +19,6 @@ _ROOT_COLUMNS: dict[str, torch.dtype] = {
     "step_count": torch.int64,
     "episode_reward": torch.float32,
 }
-
-
-class _Frames:
-    """Gives memory for frames, and gives it again once no tensor lies over it: new memory costs page faults."""
-
-    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
-        self._shape, self._device = shape, device
-        self._blocks: list[tuple[torch.Tensor, weakref.ref[Any]]] = []  # two at most: a batch, and the one before it
-
-    def take(self) -> torch.Tensor:
-        """uint8 of the shape, with any content."""
-        free = (block for block, user in self._blocks if user() is None)
-        block = next(free, None)
-        if block is None:
-            block = torch.empty(self._shape, dtype=torch.uint8, device=self._device)
-        if not is_host(self._device):
-            return block  # torch's allocator for GPUs keeps memory by itself
-        array = block.numpy()  # lives as long as the tensors made of it
-        self._blocks = [*[pair for pair in self._blocks if pair[0] is not block][-1:], (block, weakref.ref(array))]
-        return torch.from_numpy(array)
 
 
 class RolloutBuffer:
@@ -71,13 +51,16 @@ class RolloutBuffer:
     ) -> None:
         self.num_envs, self.overlap, self.steps, self.length = num_envs, overlap, steps, overlap + steps
         self.device, self.final_frames, self._frame_shape = device, final_frames, frame_shape
-        self._new_pixels, self._new_dense = (_Frames((num_envs, self.length, *frame_shape), device) for _ in range(2))
+        window = (num_envs, self.length, *frame_shape)
+        self._new_pixels, self._new_dense = TensorMemory(window, device), TensorMemory(window, device)
         # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step has its own place.
         inside = -(-(self.length - 1) // max_steps) if final_frames == "truncated" else 0
         self._places = 1 + inside
+        self._new_final = TensorMemory((num_envs, self._places, *frame_shape), device)
         self._extra_shapes: dict[NestedKey, tuple[tuple[int, ...], torch.dtype]] = {}
         self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
         self._wanted = np.zeros((num_envs, self.length), np.bool_)  # whose final observation is kept
+        self._first, self._fills_dense = 0, False
         self._allocate()
 
     def _allocate(self) -> None:
@@ -91,7 +74,7 @@ class RolloutBuffer:
             for key, (shape, dtype) in self._extra_shapes.items()
         }
         self._dense: torch.Tensor | None = None  # the observation after every step, made when it is asked for
-        self._final = torch.zeros((self.num_envs, self._places, *self._frame_shape), dtype=torch.uint8, device=device)
+        self._final = self._new_final.take().zero_()
 
     @property
     def done(self) -> torch.Tensor:
@@ -100,17 +83,25 @@ class RolloutBuffer:
 
     # -- writing ----------------------------------------------------------------------------------------------------
 
-    def begin(self, carry: bool, reuse: bool) -> None:
-        """Make ready for new steps: move the overlap to the front (``carry``), take new storage unless ``reuse``."""
+    def begin(self, carry: bool, reuse: bool, dense: bool) -> int:
+        """Make ready for new steps, and say which is the first.
+
+        Args:
+            carry: Move the overlap to the front; otherwise it is filled anew.
+            reuse: Write over the storage of the last window.
+            dense: Whether the next observations of all steps are wanted.
+        """
         carry = carry and self.overlap > 0
+        self._first = self.overlap if carry else 0
         before, final, wanted = self._buffers(), self._final, self._wanted
         if not reuse:
             self._allocate()
         self._wanted = np.zeros_like(wanted)
-        if not carry:
-            return
-        if "dense" in before and self._dense is None:
+        self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")  # the next window begins with it
+        if self._fills_dense and self._dense is None:
             self._dense = self._new_dense.take()
+        if not carry:
+            return self._first
         for key, target in self._buffers().items():
             # Step by step when source and target overlap; upwards, so that nothing is overwritten before it is read.
             portion = self.overlap if self.overlap <= self.steps else 1
@@ -123,15 +114,18 @@ class RolloutBuffer:
             now, then = self._place_of(self._wanted, rows, steps), self._place_of(wanted, rows, steps + self.steps)
             row, to, source = (upload(index, self.device) for index in (rows, now, then))
             self._final[row, to] = final[row, source]
+        return self._first
 
     def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
-        """Write what was seen and done: the only copy of the frames."""
+        """Write what was seen and done. This copies the frames, while a cache still holds them."""
         self.pixels[:, step].copy_(frames)
-        _write(self._action, step, action)
+        if self._dense is not None and self._fills_dense and step > self._first:
+            self._dense[:, step - 1].copy_(frames)
+        write(self._action, np.s_[:, step], action)
 
     def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
         """Write what came of it, ``Step.numbers``."""
-        _write(self._numbers, step, numbers)
+        write(self._numbers, np.s_[:, step], numbers)
 
     def write_extras(self, step: int, extras: Mapping[NestedKey, torch.Tensor]) -> None:
         """Write what the policy wants stored; space is made at the first step."""
@@ -144,14 +138,12 @@ class RolloutBuffer:
         self._extra_shapes[key] = tuple(shape), dtype
         self._extras[key] = torch.zeros((self.num_envs, self.length, *shape), dtype=dtype, device=self.device)
 
-    def finish(self, first: int, root: Mapping[str, torch.Tensor], last: torch.Tensor, dense: bool) -> np.ndarray:
-        """Work out what each step began with, and lay out the next observations. The host waits here, once a window.
+    def finish(self, root: Mapping[str, torch.Tensor], last: torch.Tensor) -> np.ndarray:
+        """Work out what each step began with. The host waits here, once a window.
 
         Args:
-            first: First new step.
-            root: What that step began with: last_action [N], is_init, step_count, episode_reward [N, 1].
+            root: What the first new step began with: last_action [N], is_init, step_count, episode_reward [N, 1].
             last: What follows the last step, uint8 [N, ...].
-            dense: Whether the next observations of all steps are wanted.
 
         Returns:
             bool [N, L], the new steps whose final observations are to be drawn; see ``write_final``.
@@ -159,6 +151,7 @@ class RolloutBuffer:
         Raises:
             RuntimeError: A game truncated earlier than at its time limit.
         """
+        first = self._first
         for key, column in self._root.items():
             column[:, first] = root[key].reshape(self.num_envs)
         before, after = slice(first, self.length - 1), slice(first + 1, self.length)
@@ -168,13 +161,9 @@ class RolloutBuffer:
         self._root["step_count"][:, after] = numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
         self._root["episode_reward"][:, after] = numbers[..., EPISODE_REWARD].masked_fill(done, 0)
         self._final[:, -1] = last
-        dense = dense or bool(self.overlap and self.final_frames == "all")  # the next window may begin with them
-        if dense:
-            if self._dense is None:
-                self._dense = self._new_dense.take()
-            self._dense[:, before] = self.pixels[:, after]
+        if self._dense is not None and self._fills_dense:
             self._dense[:, -1] = last
-        if self.final_frames == "none" or (self.final_frames == "all" and not dense):
+        if self.final_frames == "none" or (self.final_frames == "all" and not self._fills_dense):
             return np.zeros_like(self._wanted)
         flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
         terminated, truncated = flags[..., 0], flags[..., 1]
@@ -188,11 +177,10 @@ class RolloutBuffer:
     def write_final(self, rows: np.ndarray, steps: np.ndarray, frames: torch.Tensor) -> None:
         """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n, ...]."""
         places = self._place_of(self._wanted, rows, steps)
-        row, step, place = (upload(index, self.device) for index in (rows, steps, places))
-        if self._dense is not None:
-            self._dense[row, step] = frames
+        if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
+            write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
         if self.final_frames == "truncated":
-            self._final[row, place] = frames
+            write(self._final.flatten(0, 1), rows * self._places + places, frames)
 
     def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """The places of the final observations of some envs and steps."""
@@ -265,13 +253,13 @@ class RolloutBuffer:
         """All buffers with axes [N, L, ...]."""
         dense = {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
         fixed = {"pixels": self.pixels, "action": self._action, "numbers": self._numbers, **self._root, **dense}
-        return {**fixed, **{("extras", *_parts(key)): buffer for key, buffer in self._extras.items()}}
+        return {**fixed, **{("extras", *path_of(key)): buffer for key, buffer in self._extras.items()}}
 
     def overlap_state(self) -> dict[str, Any]:
         """What the next window needs of this one, as plain tensors: nothing without an overlap."""
         if not self.overlap:
             return {}
-        buffers = {"/".join(_parts(key)): buffer[:, self.steps :].clone() for key, buffer in self._buffers().items()}
+        buffers = {"/".join(path_of(key)): buffer[:, self.steps :].clone() for key, buffer in self._buffers().items()}
         return {"buffers": buffers, "final": self._final.clone(), "wanted": torch.from_numpy(self._wanted).clone()}
 
     def load_overlap_state(self, state: dict[str, Any]) -> None:
@@ -280,11 +268,11 @@ class RolloutBuffer:
             return
         for name, saved in state["buffers"].items():
             parts = tuple(name.split("/"))
-            if parts[0] == "extras" and parts[1:] not in map(_parts, self._extras):
+            if parts[0] == "extras" and parts[1:] not in map(path_of, self._extras):
                 self._add_extra(parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype)
             if parts[0] == "dense" and self._dense is None:
                 self._dense = self._new_dense.take()
-        buffers = {"/".join(_parts(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
+        buffers = {"/".join(path_of(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
         pairs = [(name, buffers.get(name), saved) for name, saved in state["buffers"].items()]
         for name, target, saved in [*pairs, ("final", self._final, state["final"])]:
             if target is None or target.shape != saved.shape:
@@ -292,16 +280,3 @@ class RolloutBuffer:
                 raise ValueError(f"saved overlap {name!r} is {tuple(saved.shape)}, this collector's {here}")
             target.copy_(saved)
         self._wanted = state["wanted"].cpu().numpy().copy()
-
-
-def _write(buffer: torch.Tensor, step: int, value: torch.Tensor) -> None:
-    """Write one step of all envs; on the CPU through numpy, which costs a sixth of a tensor copy."""
-    if is_host(buffer.device):
-        buffer.numpy()[:, step] = value.numpy()
-    else:
-        buffer[:, step] = value
-
-
-def _parts(key: NestedKey) -> tuple[str, ...]:
-    """A key as a tuple."""
-    return (key,) if isinstance(key, str) else key

@@ -79,13 +79,22 @@ def choose_rows(mask: Array, yes: Any, no: Any) -> Any:
 class Steps(abc.ABC):
     """What a batch of one game and a batch of several do alike, put together from stepping, resetting and drawing."""
 
+    def __init__(self) -> None:
+        self.init, self.step, self.render = jax.jit(self._init), jax.jit(self._step), jax.jit(self._render)
+        self.reset_where, self.reset_render = jax.jit(self._reset_where), jax.jit(self._reset_render)
+        self.step_auto, self.step_render = jax.jit(self._step_auto), jax.jit(self._step_render)
+
+    @abc.abstractmethod
+    def _init(self, keys: Array, partial: Array) -> Batch:
+        """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""
+
     @abc.abstractmethod
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env."""
+        """Take one action in every env; ended episodes stay at their final state."""
 
     @abc.abstractmethod
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
-        """Begin a new episode where ``mask`` (bool [N]) is true."""
+        """Begin a new episode where ``mask`` (bool [N]) is true; all other rows keep their bits."""
 
     @abc.abstractmethod
     def _render(self, batch: Batch) -> Array:
@@ -126,13 +135,7 @@ class BatchedGame(Steps, Generic[State]):
     def __init__(self, game: Game[State]) -> None:
         check_foreign(game)
         self.game = game
-        self.init = jax.jit(self._init)
-        self.step = jax.jit(self._step)
-        self.reset_where = jax.jit(self._reset_where)
-        self.render = jax.jit(self._render)
-        self.step_auto = jax.jit(self._step_auto)
-        self.step_render = jax.jit(self._step_render)
-        self.reset_render = jax.jit(self._reset_render)
+        super().__init__()
 
     @property
     def groups(self) -> tuple["BatchedGame[State]", ...]:
@@ -160,21 +163,18 @@ class BatchedGame(Steps, Generic[State]):
         return batch
 
     def _init(self, keys: Array, partial: Array) -> Batch:
-        """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""
         key, first = _split(keys)
         zeros = jnp.zeros(keys.shape[0], jnp.int32)
         state = jax.vmap(self.game.reset)(first)
         return Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env; ended episodes stay at their final state."""
         key, now = _split(batch.key)
         state, reward, terminated, truncated = jax.vmap(self.game.step)(now, batch.state, action)
         stepped = Batch(key, state, batch.partial, action, batch.step_count + 1, batch.episode_reward + reward)
         return stepped, Outcome(reward, terminated, truncated, terminated | truncated)
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
-        """Begin a new episode where ``mask`` (bool [N]) is true; all other rows keep their bits."""
         key, first = _split(batch.key)
         zeros = jnp.zeros_like(batch.step_count)
         state = jax.vmap(self.game.reset)(first)
@@ -182,7 +182,6 @@ class BatchedGame(Steps, Generic[State]):
         return Batch(*choose_rows(mask, fresh, batch))
 
     def _render(self, batch: Batch) -> Array:
-        """Draw every env: uint8 [N, S, S, 3]."""
         return jax.vmap(self.game.render)(batch.state, batch.partial)
 
 

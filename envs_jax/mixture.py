@@ -96,13 +96,7 @@ class MixedGames(Steps):
         _check(games, shares)
         self.game = Mixture(tuple(games), shares)
         self.groups = tuple(BatchedGame(game) for game in games)
-        self.init = jax.jit(self._init)
-        self.step = jax.jit(self._step)
-        self.reset_where = jax.jit(self._reset_where)
-        self.render = jax.jit(self._render)
-        self.step_auto = jax.jit(self._step_auto)
-        self.step_render = jax.jit(self._step_render)
-        self.reset_render = jax.jit(self._reset_render)
+        super().__init__()
         self.wide = jax.jit(self._wide)
         self.narrow = jax.jit(self._narrow)
 
@@ -139,26 +133,22 @@ class MixedGames(Steps):
         """The states of each game's own envs, in the order of the games."""
         return tuple(state[game.id] for game in self.game.games)
 
-    # -- the functions of BatchedGame -------------------------------------------------------------------------------
+    # -- what Steps asks for -----------------------------------------------------------------------------------------
 
     def _init(self, keys: Array, partial: Array) -> Batch:
-        """Begin N episodes; see ``BatchedGame``."""
         pairs = zip(self.groups, self.rows(len(keys)), strict=True)
         return self._join([group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs])
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env; see ``BatchedGame``."""
         parts = self._split(batch, action)
         stepped = [group.step(*part) for group, part in zip(self.groups, parts, strict=True)]
         return self._join([one for one, _ in stepped]), _concatenate([outcome for _, outcome in stepped])
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
-        """Begin a new episode where ``mask`` is true; see ``BatchedGame``."""
         parts = self._split(batch, jnp.asarray(mask))
         return self._join([group.reset_where(*part) for group, part in zip(self.groups, parts, strict=True)])
 
     def _render(self, batch: Batch) -> Array:
-        """Draw every env: uint8 [N, S, S, 3]."""
         parts = self._split(batch, batch.partial)
         return jnp.concatenate([group.render(part) for group, (part, _) in zip(self.groups, parts, strict=True)])
 

@@ -3,7 +3,6 @@
 Loads no torch. Every array that is handed out is the caller's own.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -12,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.compiled import CompiledGame, FinalObservations, check_process
+from arcade_torch.compiled import CompiledGame, FinalObservations, FrameMemory, check_process
 from arcade_torch.envs_jax import Game
-from arcade_torch.envs_jax.batch import Batch, Outcome, choose_rows, env_keys
+from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
 
 Bools = npt.NDArray[np.bool_]
 Frames = npt.NDArray[np.uint8]
@@ -64,12 +63,14 @@ class NumpyBatch:
     def __init__(self, compiled: CompiledGame, flags: Bools) -> None:
         check_process()
         self._compiled, self._batched = compiled, compiled.batched
-        self._finals = FinalObservations(compiled, len(flags), max_steps=1)
         self.num_envs = len(flags)
         # Nothing runs before the first reset, so its shape is all that is needed of a batch, and nothing is compiled.
         shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
         batch: Batch = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
         self._batch = batch._replace(partial=jnp.asarray(flags))
+        (device,) = self._batch.partial.devices()
+        self._finals = FinalObservations(compiled, self.num_envs, 1, device)
+        self._memory = FrameMemory((self.num_envs, self.game.obs_size, self.game.obs_size, 3), device)
 
     @property
     def game(self) -> Game[Any]:
@@ -102,7 +103,7 @@ class NumpyBatch:
             uint8 [N, S, S, 3].
         """
         batch = self._batch if flags is None else self._batch._replace(partial=jnp.asarray(flags))
-        return _own(self._batched.render(batch), copy)
+        return np.array(self._batched.render(batch), copy=copy or None)
 
     def reset(self, mask: Bools, keys: jax.Array | None = None) -> None:
         """Begin a new episode where ``mask`` (bool [N]) is true, from ``keys`` (uint32 [N, 2]) if they are given."""
@@ -121,7 +122,7 @@ class NumpyBatch:
 
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
-        self._batch, outcome = _reset_or_step(self._compiled)(self._batch, action, ended)
+        self._batch, outcome = self._compiled.reset_or_step(self._batch, action, ended)
         return self._stepped(outcome)
 
     def _stepped(self, outcome: Outcome) -> Stepped:
@@ -137,33 +138,14 @@ class NumpyBatch:
             What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that; the n envs that
             ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
         """
-        step = self._compiled.step(self._batch, action)
+        step = self._compiled.step(self._batch, action, self._memory.spare())
         self._batch = step.root
-        frames = _own(step.pixels, copy)
+        frames = np.array(self._memory.show(step.pixels), copy=copy or None)
         numbers = np.asarray(step.numbers)
         _, episode_reward, step_count, terminated, truncated = numbers.T
         info = {"episode_reward": episode_reward.astype(np.float64), "step_count": step_count.astype(np.int64)}
         stepped = Stepped(numbers[:, 0].astype(np.float64), terminated > 0, truncated > 0, info)
         ended = stepped.terminated | stepped.truncated
-        self._finals.add(0, step)
+        self._finals.add(0, step.final_state, step.root.partial)
         drawn = [np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])]
         return stepped, frames, np.flatnonzero(ended), np.concatenate([frames[:0], *drawn])
-
-
-@functools.lru_cache(maxsize=64)
-def _reset_or_step(compiled: CompiledGame) -> Any:
-    """The compiled call behind ``NumpyBatch.reset_or_step``."""
-    batched = compiled.batched
-
-    def advance(batch: Batch, action: jax.Array, ended: jax.Array) -> tuple[Batch, Outcome]:
-        stepped, outcome = batched.step(batch, action)
-        # A row that begins anew has not stepped: it goes on from the random key it had, and gets nothing.
-        root = batched.reset_where(choose_rows(ended, batch, stepped), ended)
-        return root, choose_rows(ended, jax.tree.map(jnp.zeros_like, outcome), outcome)
-
-    return jax.jit(advance)
-
-
-def _own(array: jax.Array, copy: bool) -> Frames:
-    """Frames as numpy: the caller's own, or a read-only view of what JAX wrote."""
-    return np.array(array) if copy else np.asarray(array)

@@ -34,15 +34,8 @@ class StateOracle:
     def __init__(self, game: Any) -> None:
         self.side = game.level.side
         walk = snake(self.side)
-        last = self.side - 1
-        # Four walks, one from each corner.
-        flips = [(fx, fy) for fx in (0, 1) for fy in (0, 1)]
-        self.walks = np.stack(
-            [
-                np.stack([np.where(fx, last - walk[:, 0], walk[:, 0]), np.where(fy, last - walk[:, 1], walk[:, 1])], -1)
-                for fx, fy in flips
-            ]
-        )
+        flips = np.array(list(np.ndindex(2, 2)))[:, None]  # four walks, one from each corner
+        self.walks = np.where(flips, self.side - 1 - walk, walk)
         self.walk = np.zeros(0, np.int64)
 
     def act(self, seen: Any, is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:

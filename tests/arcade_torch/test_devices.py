@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import arcade_torch
 from arcade_torch import collector as collector_module
-from arcade_torch import compiled, dlpack, rollout_buffer
+from arcade_torch import compiled, dlpack
 from arcade_torch import env as env_module
 from arcade_torch.agents import Trainer, preset
 from arcade_torch.collector import ArcadeCollector
@@ -115,19 +115,18 @@ def test_final_observations_are_drawn_on_the_device_of_the_env() -> None:
     """Two host devices: they were drawn on JAX's default device."""
     code = """
 import jax, torch
-from arcade_torch.compiled import _OneGame
+from arcade_torch.compiled import FrameMemory
 from arcade_torch.env import ArcadeEnv
 from tests.arcade_torch.stub import LOCKSTEP
-used, draw = set(), _OneGame.draw
-def drawn(*args):
-    frames = draw(*args)
-    used.update(frames.devices())
-    return frames
-_OneGame.draw = drawn
+used, show = set(), FrameMemory.show
+def shown(memory, frames):
+    used.update((frames.shape[0], device) for device in frames.devices())
+    return show(memory, frames)
+FrameMemory.show = shown
 with jax.default_device(jax.devices()[1]):
     env = ArcadeEnv(LOCKSTEP, 6)
     env.rollout(12, break_when_any_done=False)
-print(used == {jax.devices()[0]})
+print(used == {(4, jax.devices()[0]), (6, jax.devices()[0])})  # of ends, and of all envs
 """
     options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
     assert output_of(code, options) == "True"
@@ -182,7 +181,8 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
             counted("numpy", original) if isinstance(x, array) else original  # numpy does not ask for __array__
         )(x, *rest, **options)
 
-    for module in (dlpack, rollout_buffer, env_module, collector_module):
+    monkeypatch.setattr(compiled.FrameMemory, "show", lambda self, frames: frames)
+    for module in (dlpack, env_module, collector_module):
         monkeypatch.setattr(module, "is_host", lambda value: False)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
     monkeypatch.setattr(torch, "from_numpy", _disable_current_modes()(torch.from_numpy))  # from pinned memory: no wait
