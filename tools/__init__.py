@@ -18,7 +18,7 @@ _PUBLIC = {
     "greedy_window": "arcade_torch.tools.analysis.windows",
     "study": "arcade_torch.tools.studies.runner",
     "Study": "arcade_torch.tools.studies.grid",
-    "report": "arcade_torch.tools.reports.build",
+    "report": "arcade_torch.tools.reports",
 }
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from arcade_torch.tools.analysis.recall_density import recall_density
     from arcade_torch.tools.analysis.windows import greedy_window
     from arcade_torch.tools.figures.saliency import saliency_figure
-    from arcade_torch.tools.reports.build import report
+    from arcade_torch.tools.reports import report
     from arcade_torch.tools.studies.grid import Study
     from arcade_torch.tools.studies.runner import study
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from arcade_torch.tools.bench.registry import BENCHES
 from arcade_torch.tools.errors import WORK_FAILED, is_told, one_line
 from arcade_torch.tools.extensions import load_extensions, take_imports
-from arcade_torch.tools.figures.registry import FIGURES
+from arcade_torch.tools.figures import FIGURES
 from arcade_torch.tools.optional import missing_package_message
 from arcade_torch.tools.options import parse
 

@@ -11,7 +11,7 @@ from arcade_torch.agents.runs.files import read_csv, read_json
 from arcade_torch.tools.analysis.gap_bias import gap_and_bias
 from arcade_torch.tools.bench.recall import read_recall
 from arcade_torch.tools.extensions import take_imports
-from arcade_torch.tools.figures.throughput import mean_series, read_rows, series
+from arcade_torch.tools.figures.logs import mean_series, read_rows, series
 from arcade_torch.tools.files import write_between, write_csv
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, next_seed, read_scores_file, replay

@@ -11,8 +11,7 @@ from typing import Any
 
 import tyro
 
-from arcade_torch.tools.figures import registry
-from arcade_torch.tools.figures.registry import FIGURES, Options
+from arcade_torch.tools.figures import FIGURES, Options, make_figure
 from arcade_torch.tools.options import parse as parse_options
 
 
@@ -34,7 +33,7 @@ class Figure:
         keep_freed_memory()
         need("matplotlib")
         with Bars() as bars:
-            made = registry.make_figure(self.name, self.options, bars.update)
+            made = make_figure(self.name, self.options, bars.update)
         if self.options.csv:
             rows = [row for picture in made.pictures for row in picture.rows]
             print(csv_text(rows, list(dict.fromkeys(name for row in rows for name in row))), end="")
@@ -54,7 +53,7 @@ def parse(words: Sequence[str], prog: str) -> Figure:
     _, group, name = prog.split()
     entry = FIGURES[name]
     words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
-    registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
+    Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
     entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
     options: Any = parse_options(entry.options, words, prog)
     if options.out is None and group == "analyze":
