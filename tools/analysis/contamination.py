@@ -137,8 +137,8 @@ def contamination(
                 break
     if not parts:
         raise ValueError(f"none of {skipped} episodes was long enough: {shortest} frames are needed")
-    compared, places = map(np.concatenate, zip(*parts, strict=True)), np.array(points, dtype=np.int64)
-    return Contamination(strengths, steps, *compared, places, error, skipped, what)
+    flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Contamination(strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what)
 
 
 def shuffled_beginning(agent: Any, env: Any = None, *, identity: bool = False, **options: Any) -> Contamination:
