@@ -187,6 +187,11 @@ def test_no_two_agents_share_a_colour(names: list[str]) -> None:
     assert len(set(agent_colours(names).values())) == len(names)
 
 
+def test_an_agent_whose_name_is_blank_has_a_colour_too() -> None:
+    assert list(agent_colours([" ", "lru 2x512"])) == [" ", "lru 2x512"]
+    assert agent_colours(["pqn-lru 2x512"])["pqn-lru 2x512"] == agent_colours(["lru"])["lru"]
+
+
 def test_a_picture_in_a_page_has_ids_of_its_own_and_escapes_names() -> None:
     with drawing("light") as plt:
         figure, axis = plt.subplots()

@@ -93,7 +93,7 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour for every agent: that of its memory, or a spare one where there is none or another agent has it."""
     found: dict[str, str] = {}
     for place, name in enumerate(names):
-        memory = name.lower().split()[0].rpartition("-")[2]
+        memory = name.lower().partition(" ")[0].rpartition("-")[2]
         colour = AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
         free = [spare for spare in SPARE_COLOURS if spare not in found.values()]
         found[name] = free[0] if colour in found.values() and free else colour
