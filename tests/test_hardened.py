@@ -14,8 +14,7 @@ from arcade_torch.agents import TrainConfig, load, preset
 from arcade_torch.agents.runs.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CsvLog, checksum, is_final, read_csv, read_json
 from arcade_torch.agents.runs.folder import RunFolder
-from arcade_torch.tools.figures.curves import curves_of_runs
-from arcade_torch.tools.figures.throughput import read_rows
+from arcade_torch.tools.figures.logs import curves_of_runs, read_rows
 from arcade_torch.tools.files import write_between
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
@@ -325,7 +324,7 @@ def test_seeds_that_never_met_make_no_curve(tmp_path: Path) -> None:
         rows = "".join(f"{each},0.5,0,8\n" for each in frames)
         (run.path / "eval.csv").write_text(f"frames,mean,std,n\n{rows}")
     group = ("mlp", "MineSweeperEasy", "full")
-    assert curves_of_runs({group: runs}) == []
+    assert curves_of_runs({group: runs}) == {}
     assert len(curves_of_runs({group: runs[:1]})) == 1
 
 

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from urllib.parse import unquote, urldefrag
 
 import numpy as np
@@ -127,6 +127,16 @@ def test_the_reference_has_every_public_module() -> None:
         assert f"::: {name}\n" in pages[f"api/{name}.md"] and f"]({name}.md)" in pages["api/index.md"]
         assert reference.first_line(ROOT, name)
     assert not any("/_" in page or "._" in page for page in pages)
+
+
+def test_the_comment_behind_a_field_is_its_docstring_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in = SimpleNamespace(Extension=object, Docstring=lambda text, parent: SimpleNamespace(value=text))
+    monkeypatch.setitem(sys.modules, "griffe", stand_in)
+    extension = hook("docstrings").OurDocstrings()
+    for line, wanted in (("    n: int  # how `many`", "how `many`"), ("    n: int", None), ("n = 1  # noqa: X", None)):
+        field = SimpleNamespace(docstring=None, lines=[line])
+        extension.on_object(obj=field)
+        assert getattr(field.docstring, "value", None) == wanted
 
 
 def test_every_formula_becomes_mathml() -> None:

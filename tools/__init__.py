@@ -14,7 +14,7 @@ _PUBLIC = {
     "gap_and_bias": "analysis.gap_bias",
     "greedy_window": "analysis.windows",
     "recall_density": "analysis.recall_density",
-    "report": "reports.build",
+    "report": "reports",
     "saliency": "analysis.pixel_saliency",
     "saliency_figure": "figures.saliency",
     "shuffled_beginning": "analysis.contamination",
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from arcade_torch.tools.analysis.recall_density import recall_density
     from arcade_torch.tools.analysis.windows import greedy_window
     from arcade_torch.tools.figures.saliency import saliency_figure
-    from arcade_torch.tools.reports.build import report
+    from arcade_torch.tools.reports import report
     from arcade_torch.tools.studies.grid import Study
     from arcade_torch.tools.studies.runner import study
 

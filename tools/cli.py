@@ -16,7 +16,7 @@ from typing import Any
 
 from arcade_torch.tools.bench.registry import BENCHES
 from arcade_torch.tools.errors import WORK_FAILED, MissingPackage, is_told, one_line
-from arcade_torch.tools.figures.registry import FIGURES
+from arcade_torch.tools.figures import FIGURES
 from arcade_torch.tools.options import load_extensions, take_imports
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 
 from arcade_torch.tools.bench.registry import compare, page, read_results
-from arcade_torch.tools.figures.registry import ScoreOptions, make_figure
-from arcade_torch.tools.reports.build import report
+from arcade_torch.tools.figures import ScoreOptions, make_figure
+from arcade_torch.tools.reports import report
 from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.folder import StudyFolder
 from tests.fuzz.contract import attempt, content, fuzz

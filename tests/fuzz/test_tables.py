@@ -10,8 +10,8 @@ from hypothesis import given
 from arcade_torch.agents.runs.files import read_csv, read_json
 from arcade_torch.tools.analysis.gap_bias import gap_and_bias
 from arcade_torch.tools.bench.recall import Recall
-from arcade_torch.tools.figures import throughput
-from arcade_torch.tools.figures.throughput import mean_series, series
+from arcade_torch.tools.figures import logs
+from arcade_torch.tools.figures.logs import mean_series, series
 from arcade_torch.tools.files import read_rows, write_between, write_csv
 from arcade_torch.tools.options import name_and_value, take_imports
 from arcade_torch.tools.play.scores import COLUMNS, append_score, next_seed, read_scores_file, replay
@@ -103,7 +103,7 @@ def test_benchmarks_are_drawn_from_a_table_or_it_is_refused(files: Path, seed: i
     file = _written(files / "bench.csv", _cells(BENCH, random.Random(seed)))
 
     def read() -> None:
-        rows = throughput.read_rows(file)
+        rows = logs.read_rows(file)
         games = list(dict.fromkeys(row["game"] for row in rows))
         for game in games:
             series(rows, game, "step+draw")

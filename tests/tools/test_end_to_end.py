@@ -14,7 +14,7 @@ import pytest
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, machine, players
 from arcade_torch.tools.bench.envs import read_all
-from arcade_torch.tools.figures.throughput import NEEDED
+from arcade_torch.tools.figures.logs import NEEDED
 from arcade_torch.tools.studies.folder import StudyFolder
 
 ROOT = Path(__file__).resolve().parents[2]

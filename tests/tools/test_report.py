@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arcade_torch.tools import gap_and_bias, report
+from arcade_torch.tools import gap_and_bias, report, reports
 from arcade_torch.tools.figures import saliency
 from arcade_torch.tools.figures.style import agent_colours, drawing, svg
 from arcade_torch.tools.players import Baseline, references
-from arcade_torch.tools.reports import build, findings
 from arcade_torch.tools.runs import Score
 from tests.tools.fabricated import small_study, write_run, write_study
 
@@ -27,7 +26,7 @@ LEVELS = {
 
 @pytest.fixture
 def no_oracles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "references", lambda game, folder, rules, options: LEVELS)
+    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
 
 
 @pytest.fixture
@@ -126,42 +125,42 @@ def table(mlp: list[float], lru: list[float]) -> Any:
 
 
 def test_the_headline_claims_only_what_the_interval_allows() -> None:
-    clear = findings.gap_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "lru")
+    clear = reports.score_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "gap", "lru")
     assert ": over these three seeds memory narrows the observability gap by 0.70" in clear
-    many = findings.gap_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "lru")
+    many = reports.score_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "gap", "lru")
     assert ": memory narrows the observability gap by 0.70" in many
-    worse = findings.gap_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "lru")
+    worse = reports.score_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "gap", "lru")
     assert "memory widens the observability gap by 0.70" in worse
-    vague = findings.gap_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "lru")
+    vague = reports.score_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "gap", "lru")
     assert "contains zero, so three seeds do not settle it" in vague
-    single = findings.gap_sentence(table([0.1], [0.9]), "lru")
+    single = reports.score_sentence(table([0.1], [0.9]), "gap", "lru")
     assert "single seed" in single and "narrows" not in single
 
 
 def test_few_seeds_come_with_a_caution() -> None:
-    assert "With two seeds" in findings.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
-    assert "no intervals" in findings.coverage_sentence(table([0.1], [0.3]))
+    assert "With two seeds" in reports.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
+    assert "no intervals" in reports.coverage_sentence(table([0.1], [0.3]))
 
 
 def test_the_way_from_random_to_oracle_is_a_share() -> None:
-    said = findings.learning_sentence("X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0})
+    said = reports.learning_sentence("X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0})
     assert "mlp 25 %" in said and "a seed of mlp did not get above random" in said
-    assert findings.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
+    assert reports.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
 
 
 def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert findings.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
+    assert reports.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
     same = {player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")}
-    monkeypatch.setattr(build, "references", lambda game, folder, rules, options: same)
+    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: same)
     write_study(tmp_path / "s", small_study())
     assert "random policy" in report(tmp_path / "s", saliency=False).read_text()
 
 
 def test_reference_lines_follow_the_options_of_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    monkeypatch.setattr(build, "references", lambda *words: asked.append(words) or LEVELS)
+    monkeypatch.setattr(reports, "references", lambda *words: asked.append(words) or LEVELS)
     folder = write_study(tmp_path / "s", small_study())
     for run in small_study().runs():
         file = folder.run(run).path / "config.json"
@@ -186,6 +185,11 @@ def test_a_mine_costs_what_the_options_say_and_a_damaged_file_is_made_anew(tmp_p
 @given(st.lists(st.sampled_from(["pqn-lru", "ppo-lru", "mlp", "gru", "lstm", "dqn-lru"]), unique=True))
 def test_no_two_agents_share_a_colour(names: list[str]) -> None:
     assert len(set(agent_colours(names).values())) == len(names)
+
+
+def test_an_agent_whose_name_is_blank_has_a_colour_too() -> None:
+    assert list(agent_colours([" ", "lru 2x512"])) == [" ", "lru 2x512"]
+    assert agent_colours(["pqn-lru 2x512"])["pqn-lru 2x512"] == agent_colours(["lru"])["lru"]
 
 
 def test_a_picture_in_a_page_has_ids_of_its_own_and_escapes_names() -> None:

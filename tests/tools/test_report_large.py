@@ -6,8 +6,8 @@ import pytest
 
 from arcade_torch.agents import preset, train
 from arcade_torch.agents.runs.files import read_csv
-from arcade_torch.tools import cli, report
-from arcade_torch.tools.reports import build, panels
+from arcade_torch.tools import cli, report, reports
+from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import representatives, select_cells
 from arcade_torch.tools.runs import Runs, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -41,7 +41,7 @@ def check(page: str) -> Checker:
 
 
 def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(build, "references", lambda game, folder, rules, options: LEVELS)
+    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
     page = report(folder.root, saliency=False, recall=False, contamination=False).read_text()
     assert len(page) < 400_000
@@ -63,9 +63,9 @@ def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: P
     for (agent, game, twin), group in runs.groups().items():
         finals.setdefault((game, twin), {})[agent] = [run.value("eval_final") for run in group]
     cells, note = select_cells(runs, finals, study.baseline)
-    assert {cell.agent for cell in cells} == {"mlp", "lru"}
-    assert {cell.game for cell in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
-    assert all(len(cell.runs) == 3 for cell in cells)
+    assert {agent for agent, _, _ in cells} == {"mlp", "lru"}
+    assert {game for _, game, _ in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
+    assert all(len(paths) == 3 for paths in cells.values())
     assert "Shown: mlp and lru on" in note and "out of 3 agents and 5 games" in note and "first 3 of 4 seeds" in note
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.figures import throughput
+from arcade_torch.tools.figures.logs import NEEDED
 from arcade_torch.tools.files import write_csv
 
 RATES = {"step+draw": 100.0, "step": 1000.0, "env": 60.0, "collector": 80.0, "fill": 5000.0, "copy": 4000.0}
@@ -49,7 +49,7 @@ def test_rates_are_those_with_every_frame_consumed(tmp_path: Path, capsys: pytes
 def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_bench(tmp_path / "b.csv")
     (tmp_path / "x.csv").write_text("a,b\n1,2\n")
-    (tmp_path / "e.csv").write_text(",".join(throughput.NEEDED) + "\n")
+    (tmp_path / "e.csv").write_text(",".join(NEEDED) + "\n")
     wrong = {
         "throughput is drawn from one file": [],
         "b.csv does not exist": ["--runs", str(tmp_path / "nowhere" / "b.csv")],

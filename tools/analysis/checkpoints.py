@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 import arcade_torch
-from arcade_torch.tools.analysis.windows import Twin
+from arcade_torch.agents import load
+from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.runs import AgentKey, agent_names, find_runs
 
@@ -26,9 +27,8 @@ class Label:
     game: str
     observability: str  # the twin that is looked at
     seed: int  # of the training
-    frames: int  # of training behind it
     path: Path  # run folder or checkpoint
-    agent: str = ""  # its name among those it is compared with, see `with_names`
+    agent: str  # its name among those it is compared with; that of its memory until then
 
     @property
     def task(self) -> tuple[str, str, str]:
@@ -38,31 +38,6 @@ class Label:
     def __str__(self) -> str:
         """Agent, game, twin and seed in a few words."""
         return f"{self.agent} on {self.game} ({self.observability}), seed {self.seed}"
-
-
-def load_labelled(path: Path, observability: Twin | None = None) -> tuple[Any, Label]:
-    """An agent and what it is, called by the name of its memory alone."""
-    from arcade_torch.agents import load
-
-    agent = load(path)
-    config = agent.config
-    key = AgentKey.of(config.to_dict())
-    return agent, Label(
-        key, config.env, observability or config.observability, config.seed, agent.frames, path, key.memory
-    )
-
-
-def with_names(measured: Sequence[tuple[Label, Found]]) -> list[tuple[Label, Found]]:
-    """Measures of checkpoints, with names that tell their agents apart."""
-    names = agent_names(label.key for label, _ in measured)
-    named = [(replace(label, agent=names[label.key]), found) for label, found in measured]
-    seen: dict[tuple[Any, ...], Path] = {}
-    for label, _ in named:
-        cell = (*label.task, label.seed)
-        if cell in seen:
-            raise ValueError(f"{seen[cell]} and {label.path} are both {label}: give one of them")
-        seen[cell] = label.path
-    return named
 
 
 def by_task(measured: Sequence[tuple[Label, Found]]) -> dict[tuple[str, str, str], list[Found]]:
@@ -77,7 +52,7 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Run folders and checkpoints as they are, and the finished runs below other folders; notes on the rest."""
     found, notes = list[Path](), list[str]()
     for path in paths:
-        if (path / "meta.json").is_file() or (path / "config.json").is_file() or (path / "checkpoints").is_dir():
+        if any((path / name).exists() for name in ("meta.json", "config.json", "checkpoints")):
             found.append(path)
         else:
             runs = find_runs([path])
@@ -86,49 +61,50 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     return found, notes
 
 
-NO_OPTIONS = ("agent", "env", "observability", "progress")
-"""Arguments of a measure that do not decide its numbers, or stand in the label."""
+MODEL = ("agent", "env")  # arguments of a measure that are no options
 
 
 def measure_run(
-    path: Path,
-    measure: Callable[..., Found],
-    options: Mapping[str, Any],
-    observability: Twin | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    path: Path, measure: Callable[..., Found], options: Mapping[str, Any], progress: Progress | None = None
 ) -> tuple[Label, Found]:
     """A measure of a checkpoint, kept under everything that it depends on: the very weights, the game, all options.
 
-    ``measure`` takes an agent and returns a dataclass of arrays, numbers and words; ``observability`` is another twin
-    than the one trained on, ``progress`` is called with (done, of how many).
+    ``measure`` takes an agent and returns a dataclass of arrays, numbers and words. Of ``options`` it gets those that
+    it has arguments for; ``observability`` is another twin than the one trained on.
     """
-    agent, label = load_labelled(path, observability)
-    how: Any = signature(measure)
-    defaults = {name: item.default for name, item in how.parameters.items() if name not in NO_OPTIONS}
-    chosen = {name: list(x) if isinstance(x, tuple) else x for name, x in (defaults | dict(options)).items()}
+    agent, how, given = load(path), signature(measure), {**options, "progress": progress}
+    config, key = agent.config, AgentKey.of(agent.config.to_dict())
+    twin = options.get("observability") or config.observability
+    label = Label(key, config.env, twin, config.seed, path, key.memory)
+    known = {name: given.get(name, item.default) for name, item in how.parameters.items() if name not in MODEL}
     weights = hashlib.sha256()
     for name, value in sorted(agent.network.state_dict().items()):
         weights.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    own = {"game": label.game, "rules": agent.config.rules, "observability": label.observability, "format": 2}
-    own |= {"frames": label.frames, "weights": weights.hexdigest()[:16], "version": arcade_torch.__version__}
+    own = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items() if name != "progress"}
+    own |= {"game": label.game, "rules": config.rules, "observability": twin, "format": 2}
+    own |= {"frames": agent.frames, "weights": weights.hexdigest()[:16], "version": arcade_torch.__version__}
 
     def compute() -> dict[str, Any]:
-        found = measure(agent, observability=observability, progress=progress, **options)
-        return {name: np.asarray(value) for name, value in vars(found).items()}
+        return {name: np.asarray(value) for name, value in vars(measure(agent, **known)).items()}
 
-    arrays = cached_arrays(path, measure.__name__, own | chosen, compute)
-    kind, names = how.return_annotation, (field.name for field in fields(how.return_annotation))
-    return label, kind(**{name: arrays[name].item() if arrays[name].ndim == 0 else arrays[name] for name in names})
+    arrays = cached_arrays(path, measure.__name__, own, compute)
+    values = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items() if name != "options"}
+    return label, how.return_annotation(**values)
 
 
 def measure_runs(
     paths: Sequence[Path],
     measure: Callable[..., Found],
     options: Mapping[str, Any],
-    observability: Twin | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[tuple[Label, Found]]:
     """`measure_run` of every path, with names that tell the agents apart."""
-    told = [partial(progress, path.name) if progress else None for path in paths]
-    each = zip(paths, told, strict=True)
-    return with_names([measure_run(path, measure, options, observability, tell) for path, tell in each])
+    each = [(path, partial(progress, path.name) if progress else None) for path in paths]
+    measured = [measure_run(path, measure, options, tell) for path, tell in each]
+    names, seen = agent_names(label.key for label, _ in measured), dict[Any, Path]()
+    named = [(replace(label, agent=names[label.key]), found) for label, found in measured]
+    for label, _ in named:
+        if (cell := (label.task, label.seed)) in seen:
+            raise ValueError(f"{seen[cell]} and {label.path} are both {label}: give one of them")
+        seen[cell] = label.path
+    return named

@@ -10,7 +10,7 @@ Source: POPGym Arcade (ICML 2026), definitions of Gap and Bias. Intervals: strat
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +25,6 @@ SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
 """Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already."""
 DIFFICULTIES = ("Easy", "Medium", "Hard")
 
-Value = TypeVar("Value", float, Array)
-
 
 def game_of(env_id: str) -> str:
     """The game of an environment id, without difficulty and version.
@@ -39,7 +37,7 @@ def game_of(env_id: str) -> str:
     return "NoisyCartPole" if game in ("NoisyPole", "NoisyCartpole") else game
 
 
-def normalise(env_id: str, value: Value) -> Value:
+def normalise(env_id: str, value: Any) -> Any:
     """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for five games, x for the others.
 
     Returns outside a game's range stay outside [0, 1]. The id may have its version or not.
@@ -55,59 +53,34 @@ def normalise(env_id: str, value: Value) -> Value:
 
 @dataclass(frozen=True)
 class AgentRow:
-    """One agent of the table.
-
-    Attributes:
-        agent: its name.
-        seeds: smallest number of seeds behind any of its cells.
-        mdp_raw: return on the MDPs, mean over tasks.
-        pomdp_raw: return on the POMDPs.
-        mdp: the same, normalised to [0, 1] task by task.
-        pomdp: the same, normalised.
-        gap: mdp - pomdp.
-        bias: mdp - mdp of the memory-free agent.
-        coverage: measured coverage of the interval of Gap; NaN where there is no interval.
-        mdp_iqm: interquartile mean of the normalised returns of all MDP runs.
-        pomdp_iqm: the same of the POMDP runs.
-    """
+    """One agent of the table; returns are means over tasks."""
 
     agent: str
-    seeds: int
-    mdp_raw: Interval
+    seeds: int  # smallest number of seeds behind any of its cells
+    mdp_raw: Interval  # return on the MDPs
     pomdp_raw: Interval
-    mdp: Interval
+    mdp: Interval  # the same, normalised to [0, 1] task by task
     pomdp: Interval
-    gap: Interval
-    bias: Interval
-    coverage: float
-    mdp_iqm: Interval
+    gap: Interval  # mdp - pomdp
+    bias: Interval  # mdp - mdp of the memory-free agent
+    coverage: float  # measured coverage of the interval of Gap; NaN where there is no interval
+    mdp_iqm: Interval  # interquartile mean of the normalised returns of all MDP runs
     pomdp_iqm: Interval
 
 
 @dataclass(frozen=True)
 class GapBias:
-    """Table of Gap and Bias.
+    """Table of Gap and Bias."""
 
-    Attributes:
-        rows: one an agent, in the order in which agents were met, the memory-free one first.
-        tasks: environment ids over which the means go: those that every agent has on both twins.
-        dropped: environment ids left out because some agent lacks them.
-        metric: what the score of a run is.
-        baseline: the memory-free agent.
-        confidence: nominal confidence of the intervals.
-        draws: bootstrap draws.
-        without: the same rows leaving out one game (all its difficulties), by game; empty for a single game.
-    """
-
-    rows: tuple[AgentRow, ...]
-    tasks: tuple[str, ...]
-    dropped: tuple[str, ...]
-    metric: str
-    baseline: str
-    confidence: float
-    draws: int
-    without: Mapping[str, tuple[AgentRow, ...]] = field(default_factory=dict)
-    _values: Mapping[str, Mapping[str, Array]] = field(default_factory=dict, repr=False)
+    rows: tuple[AgentRow, ...]  # one an agent, in the order in which agents were met, the memory-free one first
+    tasks: tuple[str, ...]  # environment ids over which the means go: those that every agent has on both twins
+    dropped: tuple[str, ...]  # environment ids left out because some agent lacks them
+    metric: str  # what the score of a run is
+    baseline: str  # the memory-free agent
+    confidence: float  # nominal, of the intervals
+    draws: int  # of the bootstrap
+    without: Mapping[str, tuple[AgentRow, ...]]  # rows leaving out one game, all its difficulties; empty for one game
+    _values: Mapping[str, Mapping[str, Array]] = field(repr=False)
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
@@ -118,13 +91,10 @@ class GapBias:
 
     def gap_difference(self, first: str, second: str) -> Interval:
         """Gap(first) - Gap(second) with an interval from the same draws."""
-        return self._difference("gap", first, second)
+        return self.difference("gap", first, second)
 
-    def pomdp_difference(self, first: str, second: str) -> Interval:
-        """Normalised POMDP return of first minus that of second."""
-        return self._difference("pomdp", first, second)
-
-    def _difference(self, name: str, first: str, second: str) -> Interval:
+    def difference(self, name: str, first: str, second: str) -> Interval:
+        """The same of any number of the rows, ``pomdp`` for one."""
         known = min(self.row(first).seeds, self.row(second).seeds) > 1
         values = self._values[first][name] - self._values[second][name]
         return percentile_interval(values[0], values[1:], self.confidence, known)
@@ -136,8 +106,7 @@ class GapBias:
             for row in rows:
                 values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
                 for name in NUMBERS:
-                    interval: Interval = getattr(row, name)
-                    values |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
+                    values |= zip((name, f"{name}_low", f"{name}_high"), getattr(row, name), strict=True)
                 found.append(values | {"coverage": row.coverage})
         return found
 
@@ -184,14 +153,13 @@ def gap_and_bias(
     tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]
     if not tasks:
         raise ValueError("no task has finished runs of every agent on both twins: nothing to compare yet")
-    values = _values(cells, agents, tasks, draws, seed)
+    rows, values = _rows(cells, agents, tasks, draws, confidence, seed, iqm=True)
     games = list(dict.fromkeys(game_of(task) for task in tasks))
     without = {}
     for game in games if len(games) > 1 else []:
         rest = [task for task in tasks if game_of(task) != game]
-        without[game] = _rows(cells, rest, _values(cells, agents, rest, draws, seed, with_iqm=False), confidence)
+        without[game], _ = _rows(cells, agents, rest, draws, confidence, seed, iqm=False)
     dropped = tuple(game for game in every if game not in tasks)
-    rows = _rows(cells, tasks, values, confidence)
     return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, values)
 
 
@@ -209,35 +177,26 @@ def _cells(scores: Sequence[Score]) -> Cells:
     return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
 
 
-def _values(
-    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, seed: int, with_iqm: bool = True
-) -> dict[str, dict[str, Array]]:
-    """Agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its bootstrap draws."""
-    found: dict[str, dict[str, Array]] = {}
+def _rows(
+    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, confidence: float, seed: int, iqm: bool
+) -> tuple[tuple[AgentRow, ...], dict[str, dict[str, Array]]]:
+    """A row an agent, and agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its draws."""
+    rows, values = list[AgentRow](), dict[str, dict[str, Array]]()
     for i, agent in enumerate(agents):
-        mine = found[agent] = {}
+        mine, counts = values.setdefault(agent, {}), list[tuple[int, ...]]()
         for j, (twin, name) in enumerate(zip(TWINS, ("mdp", "pomdp"), strict=True)):
             seeds = [cells[agent, task, twin] for task in tasks]
             drawn = bootstrap.resampled(seeds, draws, np.random.default_rng([seed, i, j]))
             raw = [np.vstack([first, again]) for first, again in zip(seeds, drawn, strict=True)]
             scaled = [normalise(task, each) for task, each in zip(tasks, raw, strict=True)]
             mine[f"{name}_raw"], mine[name] = bootstrap.mean_over_tasks(raw), bootstrap.mean_over_tasks(scaled)
-            mine[f"{name}_iqm"] = bootstrap.iqm(scaled if with_iqm else [each[:1] for each in scaled])
-        mine["gap"] = mine["mdp"] - mine["pomdp"]
-        mine["bias"] = mine["mdp"] - found[agents[0]]["mdp"]
-    return found
-
-
-def _rows(
-    cells: Cells, tasks: Sequence[str], values: Mapping[str, Mapping[str, Array]], confidence: float
-) -> tuple[AgentRow, ...]:
-    """A row an agent, the memory-free one first."""
-    rows, free_seeds = list[AgentRow](), 0
-    for agent, mine in values.items():
-        full, partial = (tuple(len(cells[agent, task, twin]) for task in tasks) for twin in TWINS)
-        seeds, free_seeds = min(full + partial), free_seeds or min(full)
-        known = {name: min(seeds, free_seeds if name == "bias" else seeds) > 1 for name in mine}
+            mine[f"{name}_iqm"] = bootstrap.iqm(scaled if iqm else [each[:1] for each in scaled])
+            counts.append(tuple(map(len, seeds)))
+        mine["gap"], mine["bias"] = mine["mdp"] - mine["pomdp"], mine["mdp"] - values[agents[0]]["mdp"]
+        fewest = min(map(min, counts))
+        free_seeds = min(len(cells[agents[0], task, "full"]) for task in tasks)
+        known = dict.fromkeys(mine, fewest > 1) | {"bias": min(fewest, free_seeds) > 1}
         ends = {name: percentile_interval(x[0], x[1:], confidence, known[name]) for name, x in mine.items()}
-        coverage = bootstrap.measured_coverage(full, partial, confidence) if seeds > 1 else float("nan")
-        rows.append(AgentRow(agent, seeds, coverage=coverage, **ends))
-    return tuple(rows)
+        coverage = bootstrap.measured_coverage(*counts, confidence) if fewest > 1 else float("nan")
+        rows.append(AgentRow(agent, fewest, coverage=coverage, **ends))
+    return tuple(rows), values

@@ -37,14 +37,12 @@ class PaperTable:
         """The table, three decimals; errors four."""
         head = ("agent", "MDP", "POMDP", "Gap", "Bias", "POMDP*", "Gap*", "Bias*", "SEM", "95% half-width")
         lines = ["{:<10}{:>7}{:>7}{:>8}{:>8}{:>8}{:>8}{:>8}  {:<14}  {}".format(*head)]
-        without = {row.agent: row for row in self.table.without["Tetris"]}
-        for row in self.table.rows:
-            rest, mdp, pomdp = without[row.agent], self.mdp[row.agent], self.pomdp[row.agent]
-            lines.append(
-                f"{row.agent:<10}{row.mdp.value:>7.3f}{row.pomdp.value:>7.3f}{row.gap.value:>+8.3f}{row.bias.value:>+8.3f}"
-                f"{rest.pomdp.value:>8.3f}{rest.gap.value:>+8.3f}{rest.bias.value:>+8.3f}"
-                f"  {mdp.sem:.4f}/{pomdp.sem:.4f}   {mdp.half_width:.4f}/{pomdp.half_width:.4f}"
-            )
+        for row, rest in zip(self.table.rows, self.table.without["Tetris"], strict=True):
+            shown = row.mdp, row.pomdp, row.gap, row.bias, rest.pomdp, rest.gap, rest.bias
+            numbers = "{:>7.3f}{:>7.3f}{:>+8.3f}{:>+8.3f}{:>8.3f}{:>+8.3f}{:>+8.3f}".format(*(x.value for x in shown))
+            mdp, pomdp = self.mdp[row.agent], self.pomdp[row.agent]
+            errors = f"{mdp.sem:.4f}/{pomdp.sem:.4f}   {mdp.half_width:.4f}/{pomdp.half_width:.4f}"
+            lines.append(f"{row.agent:<10}{numbers}  {errors}")
         lines.append(f"* without Tetris; errors: MDP/POMDP; {len(self.table.tasks)} tasks, {SEEDS} seeds (people) each")
         return "\n".join(lines)
 
@@ -55,24 +53,18 @@ def paper_table() -> PaperTable:
     Intervals are normal and 95 %, from the published standard deviations, with independent tasks; errors of Gap and
     Bias add in quadrature, as both sides are separate runs.
     """
-    table, deviations = gap_and_bias(PAPER_RETURNS, draws=1), dict[tuple[str, str], list[tuple[str, float]]]()
-    for line in read_csv(PAPER_RETURNS):
-        game = game_of(line["env"])
-        scale = 0.5 if game in SIGNED_GAMES else 1.0
-        for twin, column in (("full", "mdp_std"), ("partial", "pomdp_std")):
-            deviations.setdefault((line["model"], twin), []).append((game, scale * float(line[column])))
+    table, published = gap_and_bias(PAPER_RETURNS, draws=1), read_csv(PAPER_RETURNS)
 
     def spread(agent: str, twin: str, without: str = "") -> Spread:
-        kept = np.array([value for game, value in deviations[agent, twin] if game != without])
-        half = 1.96 * np.sqrt((kept**2 / SEEDS).sum()) / kept.size
-        return Spread(float(kept.mean() / np.sqrt(SEEDS * kept.size)), float(half))
+        column = {"full": "mdp_std", "partial": "pomdp_std"}[twin]
+        here = [(game_of(row["env"]), float(row[column])) for row in published if row["model"] == agent]
+        stds = np.array([std * (0.5 if game in SIGNED_GAMES else 1.0) for game, std in here if game != without])
+        half = 1.96 * np.sqrt((stds**2 / SEEDS).sum()) / stds.size
+        return Spread(float(stds.mean() / np.sqrt(SEEDS * stds.size)), float(half))
 
     def widened(row: AgentRow, without: str = "") -> AgentRow:
-        mdp, pomdp, base = (
-            spread(agent, twin, without).half_width
-            for agent, twin in ((row.agent, "full"), (row.agent, "partial"), (table.baseline, "full"))
-        )
-        bias = 0.0 if row.agent == table.baseline else np.hypot(mdp, base)
+        mdp, pomdp = (spread(row.agent, twin, without).half_width for twin in TWINS)
+        bias = 0.0 if row.agent == table.baseline else np.hypot(mdp, spread(table.baseline, "full", without).half_width)
         halves = {"mdp": mdp, "pomdp": pomdp, "gap": np.hypot(mdp, pomdp), "bias": bias}
         values = {name: (getattr(row, name).value, float(half)) for name, half in halves.items()}
         intervals: Any = {name: Interval(x, x - half, x + half) for name, (x, half) in values.items()}

@@ -11,7 +11,6 @@ Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation 
 instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -20,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.tools.analysis.policy import Policy, Target, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, episode_window
+from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
+from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
 Norm = Literal["l2sq", "l2", "l1"]
@@ -29,21 +28,13 @@ Norm = Literal["l2sq", "l2", "l1"]
 
 @dataclass(frozen=True)
 class Saliency:
-    """What `saliency` found.
+    """What `saliency` found."""
 
-    Attributes:
-        maps: float32 [n + 1, H, W], one map a frame; sums over pixels where the norm is additive give ``per_frame``.
-        per_frame: float64 [n + 1], for each frame sum over actions of the norm over all pixels and channels.
-        output: float32 [A], what was differentiated, at step n.
-        n: index of the step whose decision is explained.
-        target: which output.
-    """
-
-    maps: NDArray[np.float32]
-    per_frame: NDArray[np.float64]
-    output: NDArray[np.float32]
-    n: int
-    target: str
+    maps: NDArray[np.float32]  # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame
+    per_frame: NDArray[np.float64]  # [n + 1], of each frame the sum over actions of the norm over all pixels, channels
+    output: NDArray[np.float32]  # [A], what was differentiated, at step n
+    n: int  # index of the step whose decision is explained
+    target: str  # which output
 
     def shares(self) -> NDArray[np.float64]:
         """float64 [n + 1], `per_frame` divided by its sum (zeros where all gradients vanish)."""
@@ -104,32 +95,20 @@ def saliency(
     for name, given in (("last_action", actions), ("is_init", starts)):
         if given.shape[0] != total:
             raise ValueError(f"{name} must have one entry a frame ({total}), got {given.shape[0]}")
-    steps = n % total + 1
-    policy, scalars = policy_of(model), outputs(model, target)
+    steps, policy, scalars = n % total + 1, policy_of(model), outputs(model, target)
     with policy.evaluating(), torch.enable_grad():
-        features = policy.features(frames[:steps], chunk, dtype)
+        leaf = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
         before = policy.initial_state(1) if state is None else state
-        how = features, actions[:steps], starts[:steps].bool(), before, reduce
-        jacobian, output = _memory_jacobian(policy, scalars, *how)
-        maps, totals = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
-    values = output.float().cpu().numpy()
-    sums = totals.double().cpu().numpy()
-    return Saliency(maps.float().cpu().numpy(), sums, values, steps - 1, resolve(model, target))
+        out, _ = policy.remember(leaf[None], actions[None, :steps], starts[None, :steps].bool(), before)
+        values = scalars(out[:, -1])[0]
+        jacobian = _jacobian(values, leaf, reduce)
+        maps, sums = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
+    arrays = maps.float().cpu().numpy(), sums.double().cpu().numpy(), values.detach().float().cpu().numpy()
+    return Saliency(*arrays, steps - 1, resolve(model, target))
 
 
-def _memory_jacobian(
-    policy: Policy,
-    scalars: Callable[[Tensor], Tensor],
-    features: Tensor,
-    last_action: Tensor,
-    is_init: Tensor,
-    state: Any,
-    reduce: Reduce,
-) -> tuple[Tensor, Tensor]:
-    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs at the last step by the features, and these outputs [A]."""
-    leaf = features.clone().requires_grad_()
-    out, _ = policy.remember(leaf[None], last_action[None], is_init[None], state)
-    values = scalars(out[:, -1])[0]
+def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
+    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E]."""
     rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
     found: Tensor | None = None
     if values.requires_grad:
@@ -140,7 +119,7 @@ def _memory_jacobian(
         except RuntimeError:  # an operator without a batching rule
             each = [torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True) for row in rows]
             found = torch.stack([gradient for (gradient,) in each])
-    return leaf.new_zeros(len(rows), *leaf.shape) if found is None else found, values.detach()
+    return leaf.new_zeros(len(rows), *leaf.shape) if found is None else found
 
 
 def _frame_norms(
@@ -163,15 +142,10 @@ def _frame_norms(
 
 @dataclass(frozen=True)
 class EpisodeSaliency(Saliency):
-    """Saliency of the last decision of an episode, with what was seen and done.
+    """Saliency of the last decision of an episode, with what was seen and done."""
 
-    Attributes:
-        frames: uint8 [n + 1, H, W, 3].
-        action: int64 [n + 1], chosen on each frame.
-    """
-
-    frames: NDArray[np.uint8]
-    action: NDArray[np.int64]
+    frames: NDArray[np.uint8]  # [n + 1, H, W, 3]
+    action: NDArray[np.int64]  # [n + 1], chosen on each frame
 
 
 def episode_saliency(
@@ -185,23 +159,18 @@ def episode_saliency(
     reduce: Reduce = "per_action",
     norm: Norm = "l2sq",
     target: Target = "auto",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> EpisodeSaliency:
-    """Saliency of the last decision of a greedy episode in the agent's own game; see `saliency` for the other options.
+    """Saliency of the last decision of a greedy episode in the agent's own game, cut after ``max_steps``.
 
-    Args:
-        agent: an agent of this package.
-        seed: of the first episode; each further one takes the next.
-        max_steps: episodes are cut after this many steps.
-        show: frames that are wanted: episodes are played until one has as many; else the longest counts.
-        tries: at most so many episodes.
-        observability: another twin than the one trained on.
-        progress: called once, with (1, 1).
+    At most ``tries`` episodes are played, from ``seed`` on, until one has the ``show`` frames that are wanted; else the
+    longest counts. All else is as for `greedy_window` and `saliency`; ``progress`` is called once, with (1, 1).
     """
     windows: list[Window] = []
-    while len(windows) < tries and not (windows and windows[-1].n + 1 >= show):
-        at = seed + len(windows)
-        windows.append(episode_window(agent, seed=at, observability=observability, max_steps=max_steps))
+    for at in range(seed, seed + tries):
+        windows.append(greedy_window(agent, seed=at, observability=observability, max_steps=max_steps))
+        if windows[-1].n + 1 >= show:
+            break
     w = max(windows, key=lambda window: window.n)
     seen = w.frames, w.last_action, w.is_init, w.state
     found = saliency(agent, *seen, reduce=reduce, norm=norm, target=target)

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
-TARGETS = ("q", "logits", "probs", "value")
-"""Outputs that can be asked for by name."""
+Progress = Callable[[int, int], None]  # called with (done, of how many)
+TARGETS = ("q", "logits", "probs", "value")  # outputs that can be asked for by name
 
 
 def read_plain(out: Tensor, what: str) -> Tensor:
@@ -75,14 +75,13 @@ class Policy:
     @contextmanager
     def evaluating(self) -> Iterator[None]:
         """Evaluation mode for a while; the mode before comes back."""
-        training = self.module is not None and self.module.training
-        if self.module is not None:
-            self.module.eval()
+        module = nn.Identity() if self.module is None else self.module
+        training = module.training
+        module.eval()
         try:
             yield
         finally:
-            if self.module is not None:
-                self.module.train(training)
+            module.train(training)
 
 
 def policy_of(model: Any) -> Policy:

@@ -16,32 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arcade_torch.tools.analysis.bootstrap import Array
 from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, saliency
-from arcade_torch.tools.analysis.policy import Target, resolve
+from arcade_torch.tools.analysis.policy import Progress, Target, resolve
 from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Twin, Window, greedy_windows, resolve_agent
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class RecallDensity:
-    """Recall density of one checkpoint.
+    """Recall density of one checkpoint."""
 
-    Attributes:
-        deltas: float64, delta of every frame, oldest first, one trajectory after the other; each sums to 1.
-        lengths: int64 [m], frames of each trajectory.
-        ended: bool [m], whether the trajectory ends with the decision that ended its episode.
-        dropped: trajectories left out because they have fewer than three frames.
-        silent: trajectories left out because all their gradients vanish.
-        target: what was differentiated.
-    """
-
-    deltas: Array
-    lengths: NDArray[np.int64]
-    ended: NDArray[np.bool_]
-    dropped: int
-    silent: int
-    target: str
+    deltas: Array  # float64, delta of every frame, oldest first, one trajectory after the other; each sums to 1
+    lengths: NDArray[np.int64]  # [m], frames of each trajectory
+    ended: NDArray[np.bool_]  # [m], whether the trajectory ends with the decision that ended its episode
+    dropped: int  # trajectories left out because they have fewer than three frames
+    silent: int  # trajectories left out because all their gradients vanish
+    target: str  # what was differentiated
 
     @property
     def shares(self) -> tuple[Array, ...]:
@@ -50,23 +40,24 @@ class RecallDensity:
 
     def mass(self, bins: int) -> Array:
         """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1."""
-        return np.asarray(np.mean([binned(share, bins) for share in self._some()], axis=0))
+        return self._mean(lambda share: binned(share, bins))
 
     def points(self, taus: Array) -> Array:
         """The paper's point-sampled curve at ``taus`` in [0, 1]; does not integrate to 1."""
-        return np.asarray(np.mean([point_sampled(share, taus) for share in self._some()], axis=0))
+        return self._mean(lambda share: point_sampled(share, taus))
 
     def last_share(self) -> float:
         """Mean share of the last frame."""
-        return float(np.mean([share[-1] for share in self._some()]))
+        return float(self._mean(lambda share: share[-1]))
 
-    def _some(self) -> tuple[Array, ...]:
+    def _mean(self, of: Callable[[Array], Array]) -> Array:
+        """Mean over trajectories."""
         if not self.lengths.size:
             raise ValueError(
                 f"no trajectory is left: {self.dropped} had fewer than {MIN_STEPS} frames, "
                 f"{self.silent} no gradient at all; play more episodes"
             )
-        return self.shares
+        return np.asarray(np.mean([of(share) for share in self.shares], axis=0))
 
 
 def recall_density(
@@ -81,7 +72,7 @@ def recall_density(
     norm: Norm = "l1",
     reduce: Reduce = "per_action",
     target: Target = "auto",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> RecallDensity:
     """Recall density of an agent over whole greedy episodes.
 
@@ -94,9 +85,8 @@ def recall_density(
         end: ``last``: n is the last frame before the terminating action, which is no typical decision (a failure may be
             imminent); ``random``: n is drawn uniformly from index 2 on.
         cap: longest trajectory; longer episodes give a window of that length with a random end.
-        norm: of the gradient of one action over all pixels and channels; ``l1`` is the paper's.
-        reduce: ``per_action`` sums the norms of single actions, ``sum`` takes the norm of the sum over actions.
-        target: what is differentiated, see `outputs`: Q-values or, for a policy, action probabilities by default.
+        norm: over all pixels and channels, as for `saliency`, and so are ``reduce`` and ``target``; ``l1`` is the
+            paper's.
         progress: called with (trajectories done, episodes).
 
     Returns:
@@ -125,7 +115,7 @@ def density_of_windows(
     A start flag inside a window leaves exactly nothing on the frames before it; ``progress`` is called with the number
     of windows done. Everything else is as for `recall_density`.
     """
-    shares, ended, dropped, silent = [], [], 0, 0
+    shares, ended, dropped, silent = [np.zeros(0)], [], 0, 0
     for count, w in enumerate(windows, start=1):
         if w.n + 1 < MIN_STEPS:
             dropped += 1
@@ -139,8 +129,8 @@ def density_of_windows(
                 silent += 1
         if progress is not None:
             progress(count)
-    lengths, flat = np.array([share.size for share in shares], dtype=np.int64), np.concatenate([*shares, np.zeros(0)])
-    return RecallDensity(flat, lengths, np.array(ended, dtype=np.bool_), dropped, silent, resolve(model, target))
+    lengths, what = np.array([share.size for share in shares[1:]], dtype=np.int64), resolve(model, target)
+    return RecallDensity(np.concatenate(shares), lengths, np.array(ended, dtype=np.bool_), dropped, silent, what)
 
 
 def binned(shares: Array, bins: int) -> Array:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from arcade_torch.agents import load
+from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.agents.evaluation import held_out_seed, make_eval_env
 from arcade_torch.tools.analysis.policy import policy_of
 
 MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
@@ -23,29 +26,17 @@ Twin = Literal["full", "partial"]
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive steps of one episode; on the last frame the decision was taken that is looked at.
+    """Consecutive steps of one episode; on the last frame the decision was taken that is looked at."""
 
-    Attributes:
-        frames: uint8 [T, S, S, 3].
-        last_action: int64 [T], the action that led to each frame.
-        is_init: bool [T], true at index 0 at most, and only if the window begins with the episode.
-        action: int64 [T], the action chosen on each frame.
-        reward: float32 [T], what it earned.
-        state: recurrent state before the first frame, batch of one.
-        ended: whether the action at the last frame ended the episode (else the window ends earlier).
-        seed: of the batch of episodes.
-        row: which episode of that batch.
-    """
-
-    frames: Tensor
-    last_action: Tensor
-    is_init: Tensor
-    action: Tensor
-    reward: Tensor
-    state: Any
-    ended: bool
-    seed: int
-    row: int = 0
+    frames: Tensor  # uint8 [T, S, S, 3]
+    last_action: Tensor  # int64 [T], the action that led to each frame
+    is_init: Tensor  # bool [T], true at index 0 at most, and only if the window begins with the episode
+    action: Tensor  # int64 [T], the action chosen on each frame
+    reward: Tensor  # float32 [T], what it earned
+    state: Any  # recurrent state before the first frame, batch of one
+    ended: bool  # whether the action at the last frame ended the episode (else the window ends earlier)
+    seed: int  # of the batch of episodes
+    row: int = 0  # which episode of that batch
 
     @property
     def n(self) -> int:
@@ -60,13 +51,16 @@ class Window:
         return replace(self, **cut, ended=False)
 
 
-def greedy_window(agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_STEPS) -> Window:
+def greedy_window(
+    agent: Any, env: Any = None, *, seed: int = 0, observability: Twin | None = None, max_steps: int = MAX_STEPS
+) -> Window:
     """Play one greedy episode and return what the agent saw.
 
     Args:
-        agent: has ``act(obs, state) -> (action, extras, state)`` and ``initial_state(batch_size)``, and acts greedily.
-        env: ``ArcadeEnv`` with one environment.
-        seed: of the episode.
+        agent: as for `resolve_agent`.
+        env: ``ArcadeEnv`` with one environment; by default one of the agent's own game.
+        seed: of the episode; without ``env`` that of a held-out environment.
+        observability: another twin than the one trained on (without ``env``).
         max_steps: the episode is cut after this many steps.
 
     Returns:
@@ -75,11 +69,13 @@ def greedy_window(agent: Any, env: Any, *, seed: int = 0, max_steps: int = MAX_S
     Raises:
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
+    seed = held_out_seed(seed) if env is None else seed
+    player, env = resolve_agent(agent, env, observability, num_envs=1)
     if tuple(env.batch_size) != (1,):
         raise ValueError(f"a window is played in a batch of one environment, got batch size {list(env.batch_size)}")
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
-    (window,), _ = play(agent, env, seed=seed, keep=max_steps, max_steps=max_steps)
+    (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps)
     return window
 
 
@@ -89,7 +85,7 @@ def greedy_windows(
     """Play greedy episodes side by side, one window each; a batch of episodes is in memory at a time.
 
     Args:
-        agent: as for `greedy_window`.
+        agent: has ``act(obs, state) -> (action, extras, state)`` and ``initial_state(batch_size)``, and acts greedily.
         env: ``ArcadeEnv`` of any batch size N. Batch b plays with a seed made of ``seed`` and b, so another N plays
             other episodes.
         episodes: number of windows.
@@ -107,7 +103,8 @@ def greedy_windows(
         raise ValueError(f"episodes must be at least 1 and the cap at least {MIN_STEPS}, got {episodes} and {cap}")
     size = int(env.batch_size[0])
     for group in range(-(-episodes // size)):
-        rng, batch_seed = np.random.default_rng([seed, group]), _episode_seed(seed, group)
+        rng, drawn = np.random.default_rng([seed, group]), np.random.SeedSequence([seed, group]).generate_state(1)
+        batch_seed = held_out_seed(int(drawn[0]) % SEED_LIMIT)
         windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
         ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
         if (late := ends >= cap).any():  # these windows begin later than what was kept: play the very same again
@@ -119,21 +116,11 @@ def greedy_windows(
             yield window.up_to(int(n))
 
 
-def _episode_seed(seed: int, group: int) -> int:
-    """Environment seed of a batch of episodes: held out from training, and different for every (seed, group)."""
-    from arcade_torch.agents.config import SEED_LIMIT
-    from arcade_torch.agents.evaluation import held_out_seed
-
-    drawn = np.random.SeedSequence([seed, group]).generate_state(1, np.uint32)[0]
-    return held_out_seed(int(drawn) % SEED_LIMIT)
-
-
 def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
     """Index of the last frame of the window in an episode of ``length`` frames."""
-    last = length - 1
-    if end == "random":
-        return int(rng.integers(min(MIN_STEPS - 1, last), length))
-    return last if length <= cap else int(rng.integers(cap - 1, length))
+    if end == "last" and length <= cap:
+        return length - 1
+    return int(rng.integers(cap - 1 if end == "last" else min(MIN_STEPS, length) - 1, length))
 
 
 @torch.no_grad()
@@ -178,44 +165,27 @@ def play(
     return windows, lengths.numpy()
 
 
-def resolve_agent(agent: Any, env: Any = None, observability: Twin | None = None) -> tuple[Any, Any]:
-    """Something that acts, and environments for it: by default 16 of the agent's own game, on the twin that is named.
+def resolve_agent(
+    agent: Any, env: Any = None, observability: Twin | None = None, num_envs: int = SIDE_BY_SIDE
+) -> tuple[Any, Any]:
+    """Something that acts, and environments for it: by default of its own game, on the twin that is named.
 
-    Args:
-        agent: an agent, the path of its run folder or checkpoint, or with ``env`` given anything `policy_of` takes.
-        env: environments.
-        observability: another twin than the one trained on (without ``env``).
+    ``agent`` is an agent, the path of its run folder or checkpoint, or with ``env`` given anything that acts as an
+    agent does or that `policy_of` takes. Without ``env`` there are ``num_envs``, on the device of the agent's network.
 
     Raises:
         ValueError: there is no environment for it, or more than one.
     """
-    if isinstance(agent, str | Path):
-        from arcade_torch.agents import load
-
-        agent = load(agent)
+    agent = load(agent) if isinstance(agent, str | Path) else agent
     player = agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
-    if env is not None and observability is not None:
-        raise ValueError("observability belongs to the environments: leave it out, or leave env out")
-    if env is None and not hasattr(agent, "config"):
+    if env is not None:
+        if observability is not None:
+            raise ValueError("observability belongs to the environments: leave it out, or leave env out")
+        return player, env
+    if not hasattr(agent, "config"):
         raise ValueError(f"{type(agent).__name__} does not say which game it plays: hand over env as well")
-    return player, _own_env(agent, SIDE_BY_SIDE, observability) if env is None else env
-
-
-def _own_env(agent: Any, num_envs: int, observability: Twin | None) -> Any:
-    """Environments of an agent's own game, on the device of its network."""
-    from arcade_torch.agents.evaluation import make_eval_env
-
     twin = observability or agent.config.observability
     if twin not in get_args(Twin):
         raise ValueError(f"this agent was trained on {twin} twins: name one of them, full or partial")
     device = str(next(agent.network.parameters()).device)
-    return make_eval_env(replace(agent.config, device=device), num_envs, twin)
-
-
-def episode_window(
-    agent: Any, *, seed: int = 0, observability: Twin | None = None, max_steps: int = MAX_STEPS
-) -> Window:
-    """Play one greedy episode in the agent's own game; the seed is one of held-out environments."""
-    from arcade_torch.agents.evaluation import held_out_seed
-
-    return greedy_window(agent, _own_env(agent, 1, observability), seed=held_out_seed(seed), max_steps=max_steps)
+    return player, make_eval_env(replace(agent.config, device=device), num_envs, twin)

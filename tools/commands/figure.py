@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.figures import registry
+from arcade_torch.tools.figures import FIGURES, Options, make_figure
 from arcade_torch.tools.options import parse as parse_options
 
 
@@ -21,15 +21,15 @@ class Figure(Command):
     """A figure that was asked for."""
 
     name: str
-    options: registry.Options
+    options: Options
 
     @classmethod
     def parse(cls, words: Sequence[str], prog: str) -> "Figure":
         """Read the options of one figure; runs are named with or without ``--runs``."""
         _, group, name = prog.split()
-        entry = registry.FIGURES[name]
+        entry = FIGURES[name]
         words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
-        registry.Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
+        Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
         entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
         options: Any = parse_options(entry.options, words, prog)
         if group == "analyze" and options.out is None and options.runs and options.runs[0].is_dir():
@@ -48,7 +48,7 @@ class Figure(Command):
         keep_freed_memory()
         need("matplotlib")
         with Bars() as bars:
-            made = registry.make_figure(self.name, self.options, bars.update)
+            made = make_figure(self.name, self.options, bars.update)
         if self.options.csv:
             rows = [row for picture in made.pictures for row in picture.rows]
             print(csv_text(rows, list(dict.fromkeys(name for row in rows for name in row))), end="")

@@ -156,7 +156,7 @@ class Report(Command):
 def write_page(study: Path, out: Path | None = None, **how: Any) -> None:
     """Write the report of a study, and say where it is."""
     from arcade_torch.tools.progress import Bars
-    from arcade_torch.tools.reports.build import report
+    from arcade_torch.tools.reports import report
 
     with Bars() as bars:
         print(f"report: {report(study, out, progress=bars.update, **how).resolve()}")

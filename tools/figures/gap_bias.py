@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Array, Interval, seed_coverage
+from arcade_torch.tools.analysis.bootstrap import Interval, seed_coverage
 from arcade_torch.tools.analysis.gap_bias import DIFFICULTIES, AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
-from arcade_torch.tools.figures.registry import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
+from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
 from arcade_torch.tools.files import Table, read_csv
-from arcade_torch.tools.runs import Score, agent_names, find_runs, is_baseline, read_scores, table_of
+from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, is_baseline, read_scores
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),
@@ -49,12 +49,12 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     found = find_runs(options.runs)
     sized = agent_names(found.names, sized=True)
     names = {key: name if is_baseline(name, options.baseline) else sized[key] for key, name in found.names.items()}
-    every = zip(found.runs, found.scores(options.metric), strict=True)
-    scores = [replace(score, agent=names[run.key]) for run, score in every]
+    every = list(zip(found.runs, found.scores(options.metric), strict=True))
     notes, tables = list(found.notes), dict[str, GapBias]()
-    for game in dict.fromkeys(score.game for score in scores):
+    for game in dict.fromkeys(run.game for run in found.runs):
         try:
-            tables[game] = _computed([score for score in scores if score.game == game], options)
+            here = [replace(score, agent=names[run.key]) for run, score in every if run.game == game]
+            tables[game] = _computed(here, options)
         except ValueError as error:
             notes.append(f"left out, {game}: {error}")
     if not tables:
@@ -103,11 +103,11 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     colours = agent_colours([row.agent for row in rows])
     for place, row in enumerate(row for row in rows if not _is_person(row.agent)):
         point, colour = (row.bias.value, row.gap.value), colours[row.agent]
-        xerr, yerr = (whiskers(*line[:, None]) for line in _ends(row.bias, row.gap))
-        axis.errorbar(*point, yerr, xerr, fmt=MARKERS[place % len(MARKERS)], color=colour, capsize=2, lw=1)
+        look = {"fmt": MARKERS[place % len(MARKERS)], "color": colour, "capsize": 2, "lw": 1}
+        axis.errorbar(*point, *(whiskers(*np.array([each]).T) for each in (row.gap, row.bias)), **look)
         axis.annotate(row.agent, point, (6, 5), textcoords="offset points", color=colour, fontsize="small")
-    axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
-    axis.axvline(0.0, color=NEUTRAL, lw=1, ls="--")
+    for line in (axis.axhline, axis.axvline):
+        line(0.0, color=NEUTRAL, lw=1, ls="--")
     axis.margins(0.15)
     axis.grid(True, axis="both")
     axis.set_xlabel("Memory Bias\n(MDP - memory-free MDP, normalised return)")
@@ -117,10 +117,9 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
     chosen = [row for row in rows if not (name == "bias" and _is_person(row.agent))]
-    ends = _ends(*(getattr(row, name) for row in chosen))
-    colours = agent_colours([row.agent for row in rows])
-    places, errors = range(len(chosen)), {"yerr": whiskers(*ends.T), "error_kw": {"lw": 1}, "capsize": 3}
-    axis.bar(places, ends[:, 1], 0.72, color=[colours[row.agent] for row in chosen], **errors)
+    ends, places = np.array([getattr(row, name) for row in chosen]).T, range(len(chosen))
+    colours, errors = agent_colours([row.agent for row in rows]), {"error_kw": {"lw": 1}, "capsize": 3}
+    axis.bar(places, ends[0], 0.72, color=[colours[row.agent] for row in chosen], yerr=whiskers(*ends), **errors)
     axis.set_xticks(places, [row.agent for row in chosen], rotation=35, ha="right", rotation_mode="anchor")
     axis.set(title=PANELS[name][0], ylabel=PANELS[name][1])
     if name in ("gap", "bias"):
@@ -137,9 +136,9 @@ def _without_each(table: GapBias) -> Any:
         for place, agent in enumerate(agents):
             if name == "bias" and (_is_person(agent) or agent == table.baseline):
                 continue
-            ends = _ends(*(getattr(rows[place], name) for rows in columns.values()))
-            style = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
-            axis.errorbar(places + offsets[place], ends[:, 1], whiskers(*ends.T), label=agent, **style)
+            ends = np.array([getattr(rows[place], name) for rows in columns.values()]).T
+            look = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
+            axis.errorbar(places + offsets[place], ends[0], whiskers(*ends), label=agent, **look)
         axis.set_title(PANELS[name][0], loc="left")
         axis.set_ylabel(PANELS[name][1])
         axis.axvline(0.5, color=NEUTRAL, lw=0.8)
@@ -148,11 +147,6 @@ def _without_each(table: GapBias) -> Any:
     axes[0, 0].legend(ncols=len(agents), loc="lower center", bbox_to_anchor=(0.5, 1.08))
     axes[-1, 0].set_xticks(places, list(columns), rotation=25, ha="right")
     return figure
-
-
-def _ends(*intervals: Interval) -> Array:
-    """Low, value and high of each, float64 [n, 3]."""
-    return np.array([[each.low, each.value, each.high] for each in intervals])
 
 
 def _is_person(agent: str) -> bool:
@@ -169,8 +163,14 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
             f"independent (a bootstrap over {SEEDS} seeds would cover {100 * seed_coverage(SEEDS):.0f} %)"
         )
         return Made(notes=[paper.text()]), paper.table, note
-    scores, notes = _scores(options)
-    table = _computed(scores, options)
+    if not options.runs:
+        raise ValueError("name at least one study folder, run folder or CSV file")
+    bare = [path for path in options.runs if (path / "results.csv").is_file() and not any(path.rglob("config.json"))]
+    tables = [path for path in options.runs if path.is_file() or path in bare]  # bare: a study that has lost its runs
+    folders = [path for path in options.runs if path not in tables]
+    found = find_runs(folders) if folders else Runs(())
+    table = _computed(read_scores([*tables, *(run.path for run in found.runs)], options.metric), options)
+    notes = found.notes + found.single_seeds()
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
@@ -183,20 +183,6 @@ def _computed(scores: list[Score], options: SweepOptions) -> GapBias:
     return gap_and_bias(scores, **how)
 
 
-def _scores(options: ScoreOptions) -> tuple[list[Score], list[str]]:
-    """Scores of tables, and of the finished runs below folders."""
-    if not options.runs:
-        raise ValueError("name at least one study folder, run folder or CSV file")
-    tables = [path for path in options.runs if table_of(path)]
-    if len(tables) == len(options.runs):
-        return read_scores(tables, options.metric), []
-    found = find_runs([path for path in options.runs if path not in tables])
-    notes = found.notes + found.single_seeds()
-    if not tables:
-        return found.scores(options.metric), notes
-    return read_scores([*tables, *(run.path for run in found.runs)], options.metric), notes
-
-
 def _printed(table: GapBias, what: str) -> Table:
     """The table as it is printed; an interval stands under its value."""
 
@@ -204,9 +190,11 @@ def _printed(table: GapBias, what: str) -> Table:
         ends = "" if np.isnan(interval.low) else f"\n{interval.low:+.3f} {interval.high:+.3f}"
         return f"{interval.value:+.3f}{ends}"
 
-    names = ("mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm", "mdp_raw", "pomdp_raw")
-    head = ("MDP", "POMDP", "gap", "bias", "MDP IQM", "POMDP IQM", "MDP raw", "POMDP raw")
-    rows = [(row.agent, row.seeds, *(cell(getattr(row, name)) for name in names)) for row in table.rows]
+    head = {
+        **{"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias", "mdp_iqm": "MDP IQM"},
+        **{"pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"},
+    }
+    rows = [(row.agent, row.seeds, *(cell(getattr(row, name)) for name in head)) for row in table.rows]
     coverage = {row.seeds: row.coverage for row in table.rows if row.coverage == row.coverage}
     measured = ", ".join(f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in sorted(coverage.items()))
     caption = (
@@ -214,4 +202,4 @@ def _printed(table: GapBias, what: str) -> Table:
         if measured
         else "no intervals: a single seed"
     )
-    return Table(f"gap and bias over {what}", ("agent", "seeds", *head), rows, caption)
+    return Table(f"gap and bias over {what}", ("agent", "seeds", *head.values()), rows, caption)

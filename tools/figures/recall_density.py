@@ -1,6 +1,6 @@
 """Recall density: bars of few bins with all memory models pooled, curves of many bins for each model."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,7 @@ from arcade_torch.tools.analysis import recall_density as measure
 from arcade_torch.tools.analysis.bootstrap import Pooled, pooled
 from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures import style
-from arcade_torch.tools.figures.registry import DensityOptions, Made, Picture, Progress
+from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.runs import is_baseline, listed
@@ -18,7 +17,7 @@ from arcade_torch.tools.runs import is_baseline, listed
 BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
 MEMORY_FREE = ("mlp", "feedforward")
 THIRDS = ("oldest third", "middle third", "most recent third")
-POINTS = 101
+POINTS = 101  # of the paper's curve, in the npz file
 
 Densities = Sequence[tuple[Label, measure.RecallDensity]]
 Masses = Mapping[tuple[str, str, str], Pooled]  # (agent, game, twin) -> mass in bins, over trajectories, then seeds
@@ -28,65 +27,64 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
     """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
     if not options.bins or min(options.bins) < 1 or options.episodes < 1:
         raise ValueError(f"--bins and --episodes must be at least 1, got {list(options.bins)} and {options.episodes}")
-    paths, notes = checkpoints_of(options.runs)
-    measured, more = _measure(paths, options, progress)
-    made = Made([], notes + more)
+    measured, notes = _measure(options, progress)
+    made = Made([], notes)
+    frames = np.concatenate([density.lengths for _, density in measured])
+    counts = _range([len(density.lengths) for _, density in measured])
+    end = "the one that ended the episode" if options.end == "last" else "at a random step"
     for bins in options.bins:
         tasks = by_task([(label, density.mass(bins)) for label, density in measured])
         masses = {task: pooled(rows, options.confidence) for task, rows in tasks.items()}
         few = bins <= BARS_UP_TO
         figure, seeds = _stacked_bars(masses, bins) if few else _curves(measured, masses, bins, options.confidence)
-        frames = np.concatenate([density.lengths for _, density in measured])
-        counts = _range([len(density.lengths) for _, density in measured])
-        end = "the one that ended the episode" if options.end == "last" else "at a random step"
         note = f"{seeds} x {counts} greedy trajectories (mean length {frames.mean():.0f} frames); decision: {end}"
         note += "; dotted: uniform memory; without memory: all in the most recent part" * few
-        numbers = []
-        for (agent, game, twin), value in masses.items():
+        rows = []
+        for (agent, game, twin), (values, mass, low, high) in masses.items():
             what = {"agent": agent, "game": game, "observability": twin, "bins": bins, "bin": np.arange(bins)}
-            numbers += style.rows_of(**what, seeds=len(value.seeds), mass=value.mean, low=value.low, high=value.high)
+            rows += style.rows_of(**what, seeds=len(values), mass=mass, low=low, high=high)
         arrays = _arrays(measured) if bins == options.bins[0] else {}
-        made.pictures.append(Picture(f"recall-density-{bins}", figure, note, numbers, arrays))
-    cells = [
-        (label, len(one.lengths), f"{one.lengths.mean():.1f}", f"{100 * one.last_share():.1f}", _percent(one.mass(3)))
-        for label, one in measured
-    ]
+        made.pictures.append(Picture(f"recall-density-{bins}", figure, note, rows, arrays))
+    cells = []
+    for label, one in measured:
+        thirds = " / ".join(f"{100 * share:.1f}" for share in one.mass(3))
+        cells.append((label, len(one.lengths), f"{one.lengths.mean():.1f}", f"{100 * one.last_share():.1f}", thirds))
     head = ("run", "trajectories", "mean length", "on the last frame %", "thirds %")
     made.tables.append(Table("share of the gradient of the last decision", head, cells))
     return made
 
 
-def _measure(paths: Sequence[Any], options: DensityOptions, progress: Progress | None) -> tuple[Densities, list[str]]:
+def _measure(options: DensityOptions, progress: Progress | None) -> tuple[Densities, list[str]]:
     """Densities of checkpoints, and notes on those that gave none."""
-    how = {name: getattr(options, name) for name in ("episodes", "end", "norm", "reduce", "target", "seed")}
-    how["cap"] = options.max_frames
-    twin = options.observability
-    every = measure_runs(paths, measure.recall_density, how, twin, progress)
+    paths, notes = checkpoints_of(options.runs)
+    every = measure_runs(paths, measure.recall_density, vars(options) | {"cap": options.max_frames}, progress)
     found = [(label, one) for label, one in every if one.lengths.size]
     bare = [(label.path.name, one) for label, one in every if not one.lengths.size]
-    empty = [f"{name} ({one.dropped} too short, {one.silent} without gradient)" for name, one in bare]
+    empty = listed([f"{name} ({one.dropped} too short, {one.silent} without gradient)" for name, one in bare])
     if not found:
-        raise ValueError(f"no trajectory is left of any checkpoint: {listed(empty)}")
-    notes = [f"left out, no trajectory: {listed(empty)}"] if empty else []
-    short = sum(density.dropped for _, density in found)
-    notes += [f"{short} trajectories with fewer than 3 frames were left out"] if short else []
-    tasks = list(by_task(found))
-    cells = [task[:2] for task in tasks]
-    alone = [f"{agent} on {game}" for agent, game in dict.fromkeys(cells) if cells.count((agent, game)) < 2]
-    return found, notes + ([f"only one twin is there: {listed(alone)}"] if alone else [])
+        raise ValueError(f"no trajectory is left of any checkpoint: {empty}")
+    if bare:
+        notes.append(f"left out, no trajectory: {empty}")
+    if short := sum(density.dropped for _, density in found):
+        notes.append(f"{short} trajectories with fewer than 3 frames were left out")
+    cells = [f"{agent} on {game}" for agent, game, _ in by_task(found)]
+    if alone := [cell for cell in cells if cells.count(cell) < 2]:
+        notes.append(f"only one twin is there: {listed(alone)}")
+    return found, notes
 
 
 def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
     """Two panels, MDP and POMDP; a bar a game, all memory models and seeds pooled; the darkest part is most recent."""
     remembering = {
         task: value for task, value in masses.items() if not any(is_baseline(task[0], name) for name in MEMORY_FREE)
-    } or dict(masses)
+    } or masses
     games = list(dict.fromkeys(game for _, game, _ in remembering))
+    tasks = style.agents_by_task(remembering)
     figure, axes = style.panels(1, 2, (max(8.0, 3.4 + 1.1 * len(games)), 4.2), sharey=True)
     for axis, twin, shades in zip(axes[0], TWIN_NAMES, (style.MDP_THIRDS, style.POMDP_THIRDS), strict=True):
-        drawn = [[value.mean for (_, name, t), value in remembering.items() if (name, t) == (g, twin)] for g in games]
-        here = [i for i, rows in enumerate(drawn) if rows]
-        parts = np.array([np.mean(drawn[i], axis=0) for i in here]).reshape(len(here), bins)
+        here = [place for place, game in enumerate(games) if (game, twin) in tasks]
+        drawn = [np.mean([value.mean for value in tasks[games[place], twin].values()], axis=0) for place in here]
+        parts = np.array(drawn).reshape(len(here), bins)
         blend = need("matplotlib.colors").LinearSegmentedColormap.from_list("shades", shades)
         for part in range(bins):
             label = THIRDS[part] if bins == 3 else f"{part + 1} of {bins}"
@@ -106,8 +104,7 @@ def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
 
 def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -> tuple[Any, str]:
     """One row an agent, one panel a game; MDP and POMDP, with reference lines."""
-    agents = list(dict.fromkeys(agent for agent, _, _ in masses))
-    games = list(dict.fromkeys(game for _, game, _ in masses))
+    agents, games = (list(dict.fromkeys(task[part] for task in masses)) for part in (0, 1))
     size = max(6.4, 3.4 * len(games)), 1.1 + 2.7 * len(agents)
     figure, axes = style.panels(len(agents), len(games), size, sharex=True, sharey=True)
     handles: dict[str, Any] = {}
@@ -138,10 +135,6 @@ def plot(series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths
     if len(lengths):
         axis.stairs(measure.no_memory(lengths, bins), edges, color=style.NEUTRAL, lw=1, ls="-.", label="no memory")
     axis.set(xlim=(0, 1), ylim=(0, 1.05))
-
-
-def _percent(shares: Iterable[float]) -> str:
-    return " / ".join(f"{100 * share:.1f}" for share in shares)
 
 
 def _range(counts: Sequence[int]) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures.registry import Made, Picture, Progress, SaliencyOptions
+from arcade_torch.tools.figures import Made, Picture, Progress, SaliencyOptions
 from arcade_torch.tools.figures.style import TWIN_NAMES, rows_of
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.runs import find_runs
@@ -27,8 +27,7 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
     if len(paths) > 1 and all((path / "eval.json").is_file() for path in paths):
         first = [runs[0].path for runs in find_runs(paths).groups().values()]
         paths = [path for path in paths if path in first or path in options.runs]
-    how = {name: getattr(options, name) for name in ("seed", "max_steps", "reduce", "norm", "target")}
-    measured = measure_runs(paths, episode_saliency, how, options.observability, progress)
+    measured = measure_runs(paths, episode_saliency, vars(options), progress)
     drawn, cells = list[Row](), list[tuple[str, int, str]]()
     arrays, numbers = dict[str, Any](), list[dict[str, Any]]()
     for index, (label, found) in enumerate(measured):

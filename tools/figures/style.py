@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from io import BytesIO, StringIO
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.tools.analysis.bootstrap import Array, seed_coverage
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures.registry import NUMBERS, PICTURES, Options, Picture
+from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
 
 AGENT_COLOURS = {
@@ -39,32 +40,18 @@ MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")  # recall density: the darkest is
 POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
-CLEAN_BEST, DISTURBED_BEST, OTHER_BAR = "#354e6a", "#a33a2f", "#b3b3b3"  # bars of contamination examples
 NEUTRAL = "#555555"
 
-_RC: dict[str, dict[str, Any]] = {
-    "light": {
-        "font.size": 10,
-        "font.family": "sans-serif",
-        "lines.linewidth": 1.8,
-        "lines.markersize": 5,
-        "patch.linewidth": 1.6,
-        "grid.linewidth": 0.8,
-        "savefig.dpi": 160,
-    },
-    "print": {
-        "font.size": 7.5,
-        "font.family": "serif",
-        "lines.linewidth": 1.2,
-        "lines.markersize": 3.2,
-        "patch.linewidth": 1.0,
-        "grid.linewidth": 0.4,
-        "savefig.dpi": 400,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
-        "mathtext.fontset": "stix",
-    },
+_STYLES = {  # light, print
+    "font.size": (10, 7.5),
+    "font.family": ("sans-serif", "serif"),
+    "mathtext.fontset": ("dejavusans", "stix"),
+    "lines.linewidth": (1.8, 1.2),
+    "lines.markersize": (5, 3.2),
+    "patch.linewidth": (1.6, 1.0),
+    "grid.linewidth": (0.8, 0.4),
+    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), (0.8, 0.6)),
+    "savefig.dpi": (160, 400),
 }
 _SHARED = {
     "axes.spines.top": False,
@@ -88,7 +75,7 @@ def drawing(style: str) -> Iterator[Any]:
     """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
     need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
-    with plt.rc_context(_SHARED | _RC[style]):
+    with plt.rc_context(_SHARED | {name: values[style == "print"] for name, values in _STYLES.items()}):
         try:
             yield plt
         finally:
@@ -106,16 +93,16 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour for every agent: that of its memory, or a spare one where there is none or another agent has it."""
     found: dict[str, str] = {}
     for place, name in enumerate(names):
-        memory = name.lower().split()[0].rpartition("-")[2]
+        memory = name.lower().partition(" ")[0].rpartition("-")[2]
         colour = AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
         free = [spare for spare in SPARE_COLOURS if spare not in found.values()]
         found[name] = free[0] if colour in found.values() and free else colour
     return found
 
 
-def whiskers(low: Any, value: Any, high: Any) -> Any:
+def whiskers(value: Array, low: Array, high: Array) -> Any:
     """Lengths of error bars [2, n] for matplotlib; NaN, which is not drawn, where there is no interval."""
-    return np.maximum([np.asarray(value) - low, np.asarray(high) - value], 0.0)
+    return np.maximum([value - low, high - value], 0.0)
 
 
 def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:
@@ -125,8 +112,6 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> s
         >>> seeds_note([1], 0.95)
         'n = 1 seed, no interval (needs two)'
     """
-    from arcade_torch.tools.analysis.bootstrap import seed_coverage
-
     low, high = min(seeds), max(seeds)
     count = f"n = {low} seed{'s' * (low > 1)}" if low == high else f"n = {low} to {high} seeds"
     if high < 2:
@@ -136,6 +121,14 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> s
         f"{count}; {what}: {100 * confidence:g} % bootstrap interval over seeds, "
         f"measured coverage with {max(low, 2)} seeds {100 * share:.0f} %"
     )
+
+
+def agents_by_task(found: Mapping[tuple[str, str, str], Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    """(agent, game, twin) -> value, sorted by task: (game, twin) -> agent -> value."""
+    tasks: dict[tuple[str, str], dict[str, Any]] = {}
+    for (agent, game, twin), value in found.items():
+        tasks.setdefault((game, twin), {})[agent] = value
+    return tasks
 
 
 def rows_of(**columns: Any) -> list[dict[str, Any]]:
@@ -178,6 +171,7 @@ def svg(figure: Any, name: str) -> str:
     """A figure as an SVG element that can stand in a page beside others."""
     buffer = StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    need("matplotlib.pyplot").close(figure)
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text)
@@ -191,5 +185,6 @@ def png(figure: Any, colours: int = 128) -> bytes:
     """A figure as a small PNG file, its colours counted."""
     buffer, packed = BytesIO(), BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
+    need("matplotlib.pyplot").close(figure)
     need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(packed, "PNG", optimize=True)
     return packed.getvalue()

@@ -8,18 +8,20 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
+from arcade_torch.tools.analysis.contamination import Contamination
 from arcade_torch.tools.analysis.contamination import contamination as noise
 from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
+from arcade_torch.tools.analysis.recall_density import RecallDensity
 from arcade_torch.tools.analysis.recall_density import recall_density as density_of
-from arcade_torch.tools.figures import contamination, curves, gap_bias, recall_density, saliency
-from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, drawing, png, svg
+from arcade_torch.tools.figures import contamination, gap_bias, logs, recall_density, saliency, style
+from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.runs import Runs, is_baseline
 
 FULL, SMALL = (4.9, 3.0), (3.3, 2.3)  # inches; small ones for many tasks
@@ -35,52 +37,28 @@ MOST_GAMES = MOST_SEEDS = 3
 Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]  # (game, twin) -> agent -> final returns of its seeds
 Levels = Mapping[str, Mapping[str, float]]  # game -> player -> mean return
 Progress = Callable[[str, int, int], None]
+Cells = Mapping[tuple[str, str, str], Sequence[Path]]  # (agent, game, twin) -> folders of its finished runs
 
 
-class Panel(NamedTuple):
-    """A picture, what stands below it, and the task it is of, as ``GAME-TWIN`` (empty where there are several)."""
-
-    picture: str
-    caption: str = ""
-    task: str = ""
-
-
-class Section(NamedTuple):
-    """Pictures, rows of the table, and what could not be shown."""
-
-    panels: list[Panel]
-    rows: list[dict[str, Any]]
-    notes: list[str]
-
-
-class Cell(NamedTuple):
-    """An agent on one twin of a game, and the folders of its finished runs, one a seed."""
-
-    agent: str
-    game: str
-    twin: str
-    runs: tuple[Path, ...]
-
-
-def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[list[Cell], str]:
+def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[Cells, str]:
     """The cells that are looked into, and a note on those that are not."""
     groups = runs.groups()
     paths = {task: [run.path for run in group if (run.path / "checkpoints").is_dir()] for task, group in groups.items()}
     bare = len(runs.runs) - sum(map(len, paths.values()))
     notes = [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."] if bare else []
-    cells = [Cell(*task, tuple(found[:MOST_SEEDS])) for task, found in paths.items() if found]
+    cells = {task: found[:MOST_SEEDS] for task, found in paths.items() if found}
     most = max(map(len, paths.values()), default=0)
     seeds = f"the first {MOST_SEEDS} of {most} seeds" if most > MOST_SEEDS else ""
     if len(cells) <= MOST_CELLS:
         return cells, " ".join(notes + ([f"Shown: {seeds} of each agent."] if seeds else []))
     agents, games = representatives(finals, baseline)
-    out_of = f"{len({cell.agent for cell in cells})} agents and {len({cell.game for cell in cells})} games"
+    out_of = f"{len({agent for agent, _, _ in cells})} agents and {len({game for _, game, _ in cells})} games"
     notes.append(
         f"Shown: {' and '.join(agents)} on {', '.join(games)}{', ' + seeds if seeds else ''}, out of {out_of}: the "
         "memory with the highest mean return where observations are partial, beside the memory-free agent, on the "
         "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
     )
-    return [cell for cell in cells if cell.agent in agents and cell.game in games], " ".join(notes)
+    return {task: found for task, found in cells.items() if task[0] in agents and task[1] in games}, " ".join(notes)
 
 
 def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
@@ -106,12 +84,11 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
     return pair, there[:MOST_GAMES]
 
 
-def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], small: bool) -> list[Panel]:
-    """One picture a task; the twins of a game share their y axis."""
-    every, panels = curves.curves_of_runs(runs.groups(), kind), []
-    for game, twin in dict.fromkeys((curve.game, curve.observability) for curve in every):
-        here = [curve for curve in every if (curve.game, curve.observability) == (game, twin)]
-        seen = np.concatenate([curve.seeds.ravel() for curve in every if curve.game == game])
+def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], small: bool) -> list[dict[str, str]]:
+    """One picture a task, with what stands below it; the twins of a game share their y axis."""
+    every, panels = logs.curves_of_runs(runs.groups(), kind), []
+    for (game, twin), here in style.agents_by_task(every).items():
+        seen = np.concatenate([curve.returns.seeds.ravel() for task, curve in every.items() if task[1] == game])
         means = levels.get(game, {})
         low, high = min([seen.min(), *means.values()]), max([seen.max(), *means.values()])
         margin = 0.07 * (high - low) or 0.5
@@ -121,59 +98,52 @@ def curve_panels(runs: Runs, kind: str, levels: Levels, agents: Sequence[str], s
                 near = next((name for name, at in shown.items() if abs(at - mean) < 2 * margin), None)
                 name = LEVEL_NAMES[player]
                 shown |= {name: mean} if near is None else {f"{near}, {name}": shown.pop(near)}
-        with drawing("light") as plt:
-            figure, axis = plt.subplots(figsize=SMALL if small else FULL, layout="constrained")
-            curves.plot(here, axis, agents, shown)
-            axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")
-            drawn = svg(figure, f"{kind} {game}, {TWIN_NAMES[twin]}")
-        counts = sorted({len(curve.seeds) for curve in here})
+        figure, ((axis,),) = style.panels(1, 1, SMALL if small else FULL)
+        logs.plot(here, axis, agents, shown)
+        axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")
+        counts = sorted({len(curve.returns.seeds) for curve in here.values()})
         seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
         caption = f"mean of {seeds}" + ("; band: interval over seeds" if counts != [1] else "")
-        panels.append(Panel(drawn, "" if small else caption, f"{game}-{twin}"))
+        picture = style.svg(figure, f"{kind} {game}, {TWIN_NAMES[twin]}")
+        panels.append({"picture": picture, "caption": "" if small else caption, "task": f"{game}-{twin}"})
     return panels
 
 
-def score_panels(table: GapBias) -> list[Panel]:
-    """Normalised returns on both twins, Gap and Bias."""
-    panels = []
+def score_panels(table: GapBias) -> list[str]:
+    """Pictures of normalised returns on both twins, Gap and Bias."""
+    found = []
     for name in gap_bias.PANELS:
-        with drawing("light") as plt:
-            figure, axis = plt.subplots(figsize=FULL, layout="constrained")
-            gap_bias.plot_bars(table.rows, axis, name)
-            panels.append(Panel(svg(figure, name)))
-    return panels
+        figure, ((axis,),) = style.panels(1, 1, FULL)
+        gap_bias.plot_bars(table.rows, axis, name)
+        found.append(style.svg(figure, name))
+    return found
 
 
-def saliency_strips(cells: Sequence[Cell], progress: Progress | None) -> list[dict[str, Any]]:
+def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, Any]]:
     """Frames under heat of every cell, from its first seed; with the value drawn brightest and the last share (%)."""
     strips = []
-    for done, cell in enumerate(cells, start=1):
-        _, found = measure_run(cell.runs[0], episode_saliency, {"show": SHOW, "tries": TRIES})
-        frames, shares = found.frames, 100 * found.shares()
-        count = min(SHOW, len(frames))
-        with drawing("light") as plt:
-            figure = plt.figure(figsize=(4.8, 1.4 * -(-count // 4)), layout="constrained")
-            axes = figure.subplots(-(-count // 4), 4, squeeze=False).flatten()
-            for axis in axes[count:]:
-                axis.set_axis_off()
-            peak = saliency.plot(frames, found.maps, axes[:count], below=shares)
-            source = "data:image/png;base64," + b64encode(png(figure)).decode("ascii")
-        last = float(shares[-1])
-        strips.append({"cell": cell, "source": source, "frames": len(frames), "peak": peak, "last_share": last})
+    for done, ((agent, game, twin), paths) in enumerate(cells.items(), start=1):
+        _, found = measure_run(paths[0], episode_saliency, {"show": SHOW, "tries": TRIES})
+        shares, count = 100 * found.shares(), min(SHOW, len(found.frames))
+        figure, axes = style.panels(-(-count // 4), 4, (4.8, 1.4 * -(-count // 4)))
+        for axis in axes.flat[count:]:
+            axis.set_axis_off()
+        peak = saliency.plot(found.frames, found.maps, axes.flat[:count], below=shares)
+        what = {"agent": agent, "game": game, "twin": twin, "frames": len(shares), "last_share": shares[-1]}
+        strips.append(what | {"peak": peak, "source": b64encode(style.png(figure)).decode("ascii")})
         if progress is not None:
             progress("saliency", done, len(cells))
     return strips
 
 
-def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progress | None) -> Section:
+def recall_section(cells: Cells, agents: Sequence[str], progress: Progress | None) -> dict[str, Any]:
     """Recall density of every cell, a picture a task; numbers are kept in the run folders."""
 
-    def measure(cell: Cell, tell: Any) -> tuple[Any, dict[str, Any]]:
-        found = [measure_run(path, density_of, DENSITY, None, tell)[1] for path in cell.runs]
-        found = [density for density in found if density.shares]
+    def summary(measured: Sequence[tuple[Any, RecallDensity]]) -> tuple[Any, dict[str, Any]]:
+        found = [density for _, density in measured if density.shares]
+        shares = [share for density in found for share in density.shares]
         if not found:
             raise ValueError("no episode of three frames")
-        shares = [share for density in found for share in density.shares]
         row = {"seeds": len(found), "episodes": len(shares), "length": np.mean([s.size for s in shares])}
         row |= {"last": np.mean([s[-1] for s in shares]), "first": np.mean([s[0] for s in shares])}
         return found, row | {"older": np.mean([density.mass(2)[0] for density in found])}
@@ -185,21 +155,20 @@ def recall_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progr
         recall_density.plot({agent: (mass, colours[agent]) for agent, mass in masses.items()}, axis, bins)
         axis.set_xlabel("time in the episode (1: the decision)")
 
-    return _section(("recall density", "recall"), cells, measure, plot, progress)
+    return _section("recall density", cells, (density_of, DENSITY), summary, plot, progress)
 
 
-def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress: Progress | None) -> Section:
+def contamination_section(cells: Cells, agents: Sequence[str], progress: Progress | None) -> dict[str, Any]:
     """Share of decisions that one noisy frame changes, by delay; a picture a task."""
 
-    def measure(cell: Cell, tell: Any) -> tuple[Any, dict[str, Any]]:
-        measured = [measure_run(path, noise, NOISE, None, tell) for path in cell.runs]
+    def summary(measured: Sequence[tuple[Any, Contamination]]) -> tuple[Any, dict[str, Any]]:
         found = [one for _, one in measured]
         (every,) = contamination.pool(by_task(measured)).values()
         flips = np.array([item.mean("flip")[0] for item in found])
         later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
-        row: dict[str, Any] = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
-        row |= {"change": every["change"].mean[0, 1], "at_once": _mean(flips[:, 0])}
-        return every, row | {"one": _mean(flips[:, 1]), "later": _mean(later)}
+        row = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
+        means = {"at_once": _mean(flips[:, 0]), "one": _mean(flips[:, 1]), "later": _mean(later)}
+        return every, row | means | {"change": every["change"].mean[0, 1]}
 
     def plot(here: Mapping[str, Any], axis: Any) -> None:
         delays = NOISE["delays"][: contamination.reached(here.values())]
@@ -207,34 +176,34 @@ def contamination_section(cells: Sequence[Cell], agents: Sequence[str], progress
         contamination.from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    return _section(("contamination", "noise"), cells, measure, plot, progress)
+    return _section("contamination", cells, (noise, NOISE), summary, plot, progress)
 
 
 def _section(
-    names: tuple[str, str],
-    cells: Sequence[Cell],
-    measure: Callable[[Cell, Any], tuple[Any, dict[str, Any]]],
+    name: str,
+    cells: Cells,
+    measure: tuple[Callable[..., Any], Mapping[str, Any]],
+    summary: Callable[[Any], tuple[Any, dict[str, Any]]],
     plot: Callable[[Mapping[str, Any], Any], None],
     progress: Progress | None,
-) -> Section:
-    """Measure every cell for a row of the table, and draw the agents of each task in one picture."""
-    made, tasks = Section([], [], []), dict[tuple[str, str], dict[str, Any]]()
-    for cell in cells:
-        who, twin = f"{cell.agent} on {cell.game}", TWIN_NAMES[cell.twin]
+) -> dict[str, Any]:
+    """Measure every cell for a row of the table, and draw the agents of each task in one picture; notes on the rest."""
+    pictures, rows, notes, drawn = list[str](), list[dict[str, Any]](), list[str](), dict[tuple[str, str, str], Any]()
+    for (agent, game, twin), paths in cells.items():
+        tell = partial(progress, f"{name}, {agent} on {game}") if progress else None
         try:
-            found, row = measure(cell, partial(progress, f"{names[0]}, {who}") if progress else None)
+            measured = [measure_run(path, *measure, tell) for path in paths]
+            drawn[agent, game, twin], row = summary(measured)
         except ValueError as error:  # episodes too short
-            made.notes.append(f"{who} {twin}: {error}")
-            continue
-        tasks.setdefault((cell.game, cell.twin), {})[cell.agent] = found
-        made.rows.append({"agent": cell.agent, "game": cell.game, "twin": twin} | row)
-    for (game, twin), here in tasks.items():
-        with drawing("light") as plt:
-            figure, axis = plt.subplots(figsize=SMALL, layout="constrained")
-            plot(here, axis)
-            axis.set_title(title := f"{game}, {TWIN_NAMES[twin]}")
-            made.panels.append(Panel(svg(figure, f"{names[1]} {title}"), "", f"{game}-{twin}"))
-    return made
+            notes.append(f"{agent} on {game} {TWIN_NAMES[twin]}: {error}")
+        else:
+            rows.append({"agent": agent, "game": game, "twin": TWIN_NAMES[twin]} | row)
+    for (game, twin), here in style.agents_by_task(drawn).items():
+        figure, ((axis,),) = style.panels(1, 1, SMALL)
+        plot(here, axis)
+        axis.set_title(title := f"{game}, {TWIN_NAMES[twin]}")
+        pictures.append(style.svg(figure, f"{name} {title}"))
+    return {"pictures": pictures, "rows": rows, "notes": notes}
 
 
 def _mean(values: Any) -> float:

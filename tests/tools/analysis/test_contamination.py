@@ -10,7 +10,7 @@ from torch import Tensor
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination, shuffled_beginning
-from arcade_torch.tools.analysis.contamination import disturbed_frames, examples, replayed, shuffle_order
+from arcade_torch.tools.analysis.contamination import disturbed_frames, replayed, shuffle_order
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
@@ -115,19 +115,6 @@ def test_a_policy_has_a_divergence_that_is_zero_where_nothing_changes() -> None:
     assert np.nanmax(np.abs(found.kl[:, 0])) < 1e-9 < found.mean("kl")[1, 0]
     with pytest.raises(ValueError, match="target must be q, logits or probs, not value"):
         contamination(agent, target="value", starts=1)
-
-
-def test_examples_hold_the_frames_and_the_values_of_every_version() -> None:
-    policy, w = linear_policy(0.9, dtype=torch.float32), window(13)
-    found = examples(policy, w, [2, 8])
-    assert found.frames.shape == (3, 3, 4, 4, 3) and found.labels == ("clean", "noise on frame 2", "noise on frame 8")
-    np.testing.assert_array_equal(found.frames[0, 2], w.frames[12])
-    assert not np.array_equal(found.frames[1, 1], w.frames[2]) and np.array_equal(found.frames[1, 2], w.frames[12])
-    np.testing.assert_allclose(found.values.sum(1), 0, atol=1e-2)  # relative values
-    order = examples(policy, w)
-    assert order.frames.shape == (2, 5, 4, 4, 3) and np.array_equal(order.frames[0, 3:], order.frames[1, 3:])
-    with pytest.raises(ValueError, match="indices from 0 to 12"):
-        examples(policy, w, [13])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from arcade_torch.agents import preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.figures.registry import FIGURES
+from arcade_torch.tools.figures import FIGURES
 from arcade_torch.tools.figures.style import AGENT_COLOURS
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import write_run
@@ -252,7 +252,7 @@ def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
         assert read_csv(tmp_path / "recall-density-16.csv") == rows  # made anew
 
 
-def test_contamination_of_checkpoints_is_drawn_with_an_example(
+def test_contamination_of_checkpoints_is_drawn(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["analyze", "contamination", *map(str, sorted(trained.iterdir())), "--starts", "6", "--delays", "0", "1"]
@@ -262,7 +262,7 @@ def test_contamination_of_checkpoints_is_drawn_with_an_example(
     rows = read_csv(tmp_path / "contamination-noise-MineSweeperEasy-v0-full.csv")
     assert [(row["sigma"], row["delay"]) for row in rows] == [("0.0", "0"), ("0.0", "1"), ("1.0", "0"), ("1.0", "1")]
     assert float(rows[0]["change"]) < 1e-5 < float(rows[2]["change"])
-    assert (tmp_path / "contamination-noise-example-MineSweeperEasy-v0-full.png").exists()
+    assert (tmp_path / "contamination-noise-MineSweeperEasy-v0-full.png").exists()
 
 
 def test_two_checkpoints_of_one_seed_are_not_pooled_as_two_seeds(

@@ -1,0 +1,246 @@
+"""What runs and benchmarks have written down: training curves, frames per second, and settings."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, get_args, get_type_hints
+
+import numpy as np
+
+from arcade_torch.agents import preset
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
+from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
+from arcade_torch.tools.files import markdown_table, read_csv
+from arcade_torch.tools.runs import Run, find_runs, flatten
+
+POINTS = 120  # of a curve of training returns
+AXIS = {"eval": "greedy return", "train": "training return, running mean"}
+
+NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "frames_per_s_with_check")
+OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
+LIMIT = "writing the same bytes"
+
+NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
+"""Fields that tell runs apart, or decide nothing."""
+ALGORITHMS = get_args(get_type_hints(TrainConfig)["algorithm"])
+
+
+class Curve(NamedTuple):
+    """One agent on one task: returns at some frames."""
+
+    frames: Array
+    returns: Pooled
+
+
+def curves(options: CurveOptions, progress: Progress | None) -> Made:
+    """The figure ``curves``: a panel a task, a line an agent, mean over seeds with a band."""
+    found = find_runs(options.runs)
+    kind = "eval" if options.metric == "eval_final" else "train"
+    every = curves_of_runs(found.groups(), kind, options.confidence)
+    if not every:
+        raise ValueError(f"no run below {options.runs[0]} has logged a {AXIS[kind]}: nothing to draw")
+    tasks, agents = style.agents_by_task(every), list(dict.fromkeys(agent for agent, _, _ in every))
+    columns = min(4, len(tasks))
+    lines = math.ceil(len(tasks) / columns)
+    figure, axes = style.panels(lines, columns, (max(5.5, 3.9 * columns), 0.8 + 3.0 * lines))
+    for axis in axes.flat[len(tasks) :]:
+        axis.set_axis_off()
+    of_game: dict[str, Any] = {}
+    for axis, ((game, twin), here) in zip(axes.flat, tasks.items(), strict=False):
+        axis.sharey(of_game.setdefault(game, axis))  # twins are there to be compared
+        plot(here, axis, agents)
+        axis.set(title=f"{game}, {style.TWIN_NAMES.get(twin, twin)}", ylabel=AXIS[kind])
+    handles = {handle.get_label(): handle for axis in axes.flat for handle in axis.get_lines()}
+    shown = [handles[agent] for agent in agents if agent in handles]
+    figure.legend(handles=shown, loc="outside upper center", ncols=min(8, len(shown)))
+    rows = []
+    for (agent, game, twin), (frames, (seeds, mean, low, high)) in every.items():
+        what = {"agent": agent, "game": game, "observability": twin, "seeds": len(seeds)}
+        rows += style.rows_of(**what, frames=frames.astype(np.int64), mean=mean, low=low, high=high)
+    note = style.seeds_note([len(curve.returns.seeds) for curve in every.values()], options.confidence, "bands")
+    return Made([Picture("curves", figure, note, rows)], found.notes + found.single_seeds())
+
+
+def plot(
+    curves: Mapping[str, Curve], axis: Any, agents: Sequence[str], levels: Mapping[str, float] | None = None
+) -> None:
+    """Draw the curves of one task; ``levels`` are dashed lines with a name."""
+    longest = max(float(curve.frames[-1]) for curve in curves.values())
+    unit, name = (1e6, "million frames") if longest >= 2e6 else (1e3, "thousand frames")
+    for agent, (frames, returns) in curves.items():
+        place, colour, x = agents.index(agent), style.agent_colours(agents)[agent], frames / unit
+        if np.isfinite(returns.low).any():
+            axis.fill_between(x, returns.low, returns.high, color=colour, alpha=0.18, lw=0)
+        marker = style.MARKERS[place % len(style.MARKERS)] if x.size <= 12 else None
+        line = style.DASHES[place % len(style.DASHES)]
+        axis.plot(x, returns.mean, color=colour, label=agent, marker=marker, ls=line)
+    for level, value in (levels or {}).items():
+        axis.axhline(value, color=style.NEUTRAL, lw=1, ls="--")
+        axis.annotate(level, (1, value), (-2, 2), xycoords=("axes fraction", "data"), textcoords="offset points",
+                      ha="right", color=style.NEUTRAL, fontsize="small")  # fmt: skip
+    axis.set_xlabel(name)
+
+
+def curves_of_runs(
+    groups: Mapping[tuple[str, str, str], Sequence[Run]], kind: str = "eval", confidence: float = 0.95
+) -> dict[tuple[str, str, str], Curve]:
+    """A curve for each group, (agent, game, observability) -> its runs, that has logged something.
+
+    It goes over the frames that all runs of the group have reached. ``kind`` is ``eval`` (greedy evaluations) or
+    ``train`` (running mean of training returns, exploration included).
+    """
+    found = {}
+    for task, runs in groups.items():
+        histories = [history for run in runs if (history := _history(run, kind))[0].size]
+        if not histories:
+            continue
+        end = min(frames[-1] for frames, _ in histories)
+        start = max(frames[0] for frames, _ in histories)
+        longest = max((frames for frames, _ in histories), key=len)
+        grid = longest[(longest >= start) & (longest <= end)] if kind == "eval" else np.linspace(start, end, POINTS)
+        if grid.size:
+            seeds = [np.interp(grid, frames, values) for frames, values in histories]
+            found[task] = Curve(grid, pooled(seeds, confidence))
+    return found
+
+
+def _history(run: Run, kind: str) -> tuple[Array, Array]:
+    name, column = ("eval.csv", "mean") if kind == "eval" else ("metrics.csv", "train_return_ewm")
+    rows = [row for row in run.table(name) if row.get(column)]
+    try:
+        frames = np.array([float(row["frames"]) for row in rows])
+        return frames, np.array([float(row[column]) for row in rows])
+    except ValueError as error:
+        raise ValueError(f"{run.path / name} is damaged: {error}") from None
+
+
+def throughput(options: Options, progress: Progress | None) -> Made:
+    """The figure ``throughput``: our games with and without drawing, and their mean by layer.
+
+    ``options.runs`` is the one file of ``bench envs``; rates have the checksum over every frame inside the clock.
+    """
+    if len(options.runs) != 1:
+        raise ValueError(
+            f"throughput is drawn from one file of `arcade-torch bench envs --out FILE.csv`, got {len(options.runs)}: "
+            "give --runs FILE.csv"
+        )
+    rows = read_rows(options.runs[0])
+    sizes = sorted({int(row["obs_size"]) for row in rows})
+    here = [row for row in rows if int(row["obs_size"]) == sizes[0]]
+    notes = [f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"] * (len(sizes) > 1)
+    games, counts = list(dict.fromkeys(row["game"] for row in here)), sorted({int(row["num_envs"]) for row in here})
+    drawn, bare = ({game: series(here, game, kind) for game in games} for kind in ("step+draw", "step"))
+    rest = {name: mean_series(here, games, kind) for name, kind in (OURS | {LIMIT: "fill"}).items()}
+    figure, ((left, right),) = style.panels(1, 2, (11.5, 5.4), sharey=True)
+    for place, game in enumerate(games):
+        spare = len(style.SPARE_COLOURS)
+        marker = style.MARKERS[(place + place // spare) % len(style.MARKERS)]
+        look = {"color": style.SPARE_COLOURS[place % spare], "marker": marker}
+        _line(left, drawn[game], label=game, **look)
+        _line(left, bare[game], ls=":", **look)
+    left.plot([], [], color=style.NEUTRAL, ls=":", label="the same without drawing")
+    for name, marker, size in zip(OURS, "*vo", (11, None, None), strict=True):
+        _line(right, rest[name], label=f"{name}, mean of {len(games)}", color="#0072b2", marker=marker, ms=size)
+    _line(right, rest[LIMIT], label=LIMIT, color=style.NEUTRAL, ls="--")
+    for axis, title in ((left, "this package's games"), (right, "their mean, by layer")):
+        axis.set_xscale("log", base=2)
+        axis.set_yscale("log", base=10)
+        axis.set_xticks(counts, [str(count) for count in counts])
+        axis.minorticks_off()
+        axis.set(xlabel="environments", title=title)
+        columns = 2 if len(axis.lines) < 9 else 3
+        axis.legend(fontsize="small", ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    left.set_ylabel("frames/s")
+    first, numbers = here[0], list[dict[str, Any]]()
+    note = (
+        f"{sizes[0]} px, every frame consumed by a checksum inside the clock; median of repeats, no interval; "
+        f"{first.get('jax_device', 'unknown device')}, {first.get('cores', '?')} cores, "
+        f"arcade-torch {first.get('arcade-torch', '?')} ({first.get('commit') or 'no commit'})"
+    )
+    for kind, lines in {"drawing": drawn, "no drawing": bare, "mean": rest}.items():
+        for name, line in lines.items():
+            numbers += style.rows_of(series=name, kind=kind, num_envs=list(line), frames_per_s=list(line.values()))
+    return Made([Picture("throughput", figure, note, numbers)], notes)
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a benchmark's file."""
+    wanted = "the CSV file that `arcade-torch bench envs --out` wrote"
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: give {wanted}")
+    rows = read_csv(path)
+    for name in NEEDED:
+        if not rows or name not in rows[0]:
+            raise ValueError(f"{path} has no column {name}: give {wanted}")
+    for row in rows:
+        for name, kind in (("obs_size", int), ("num_envs", int), ("frames_per_s_with_check", float)):
+            try:
+                if not 0 < kind(row[name]) < 10**12:
+                    raise ValueError
+            except ValueError:
+                raise ValueError(f"{path}: {name} is {row[name]!r}, expected a number above 0") from None
+    if not any(row["measure"] == "step+draw" for row in rows):
+        raise ValueError(f"{path} has no row with the measure step+draw: nothing to draw")
+    return rows
+
+
+def series(rows: Sequence[Mapping[str, str]], game: str, measure: str) -> dict[int, float]:
+    """Number of envs -> frames consumed per second, of one game."""
+    here = [row for row in rows if (row["game"], row["measure"]) == (game, measure)]
+    return dict(sorted((int(row["num_envs"]), float(row["frames_per_s_with_check"])) for row in here))
+
+
+def mean_series(rows: Sequence[Mapping[str, str]], games: Sequence[str], measure: str) -> dict[int, float]:
+    """Mean rate over games, at the numbers of envs that all of them were measured with."""
+    every = [series(rows, game, measure) for game in games]
+    shared = sorted(set.intersection(*map(set, every)))
+    return {count: float(np.mean([one[count] for one in every])) for count in shared}
+
+
+def _line(axis: Any, rates: Mapping[int, float], **look: Any) -> None:
+    if rates:
+        axis.plot(list(rates), list(rates.values()), **look)
+
+
+def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
+    """``hyperparameters``: CSV and Markdown, and the table as a picture; one column an algorithm.
+
+    Generated from the configs themselves, so that it cannot go stale.
+    """
+    configs: dict[str, list[Mapping[str, Any]]] = {}
+    if options.paper:
+        notes = [f"total_frames is that of {TrainConfig().env}; the paper's budget depends on the game"]
+        configs = {name: [preset("paper", algorithm=name).to_dict()] for name in ALGORITHMS}
+    else:
+        found = find_runs(options.runs)
+        notes = list(found.notes)
+        for run in found.runs:
+            configs.setdefault(str(run.config.get("algorithm", "pqn")), []).append(run.config)
+    columns = {name: _settings(here, name) for name, here in configs.items()}
+    names = dict.fromkeys(name for column in columns.values() for name in column)
+    rows = [{"setting": name} | {key: column.get(name, "") for key, column in columns.items()} for name in names]
+    head, table = ["setting", *columns], [list(row.values()) for row in rows]
+    figure, axes = style.panels(1, 1, (2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2)))
+    axes[0, 0].set_axis_off()
+    drawn = axes[0, 0].table(table, colLabels=head, bbox=(0, 0, 1, 1), cellLoc="left", edges="horizontal")
+    drawn.auto_set_font_size(False)
+    for (line, _), cell in drawn.get_celld().items():
+        cell.set_edgecolor("#d0d0d0")
+        cell.set_text_props(weight="normal" if line else "bold")
+    base, _ = options.path("hyperparameters")
+    page = write_atomic(base.with_suffix(".md"), markdown_table(head, table) + "\n")
+    return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=[page])
+
+
+def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:
+    """Each setting's value, or all its values where runs differ; without the settings of other algorithms."""
+    values: dict[str, set[str]] = {}
+    others, flat = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}, list[dict[str, Any]]()
+    for config in configs:
+        own = flatten({key: value for key, value in config.items() if key not in others})
+        flat.append({name.removeprefix(f"{algorithm}."): value for name, value in own.items() if value != {}})
+    for name in dict.fromkeys(name for settings in flat for name in settings):
+        values[name] = {str(settings.get(name, "-")) for settings in flat}
+    return {name: " / ".join(sorted(found)) for name, found in values.items()}
