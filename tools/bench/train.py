@@ -72,7 +72,8 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
         if name not in FORMS:
             raise ValueError(f"a form is {', '.join(FORMS)}, or several of them joined by '+'; got {form!r}")
         settings |= FORMS[name]
-    config = preset(network, env=options.env, memory=memory, observability="partial", device=options.device, **settings)
+    settings |= {"algorithm": "pqn", "env": options.env, "memory": memory, "observability": "partial"}
+    config = preset(network, device=options.device, **settings)
     return dataclasses.replace(config, pqn=dataclasses.replace(config.pqn, warmup_steps=0))
 
 
