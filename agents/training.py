@@ -109,7 +109,7 @@ class Trainer:
         numbers = self.config.learner
         steps = max(0, numbers.warmup_steps - numbers.steps_before)  # the first window fills the overlap too
         windows = -(-steps // numbers.num_steps)
-        stride = max(1, numbers.frames_per_update * windows // 3200)  # frames are plenty
+        stride = max(1, numbers.frames_per_update * windows // 3200)  # 3,200 frames are plenty
         seen = []
         for _ in range(windows):
             pixels = self.collector.collect(random=True).get("pixels")[:, numbers.steps_before :]
