@@ -56,7 +56,8 @@ class Options(BenchOptions):
     hidden_size: int = 64  # Width of the memory block.
     seconds: float = 60.0  # Budget of each training, processor time.
     seed: int = 0  # Of weights and data.
-    out: Path | None = Path("recall.csv")  # Table; rows it holds are not measured again.
+    out: Path | None = Path("recall.csv")
+    """Table; rows it holds are not measured again."""
     page: Path | None = None  # Markdown page that gets the table between its marks.
 
 

@@ -15,7 +15,8 @@ from arcade_torch.tools.options import at_least, name_and_value
 class Shown(Command):
     """What both commands are told about the game and its picture."""
 
-    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]  # Environment id.
+    game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
+    """Environment id."""
     both: bool = False  # Show both twins, the MDP on the left.
     scale: int = 2  # Width of a frame's pixel in the picture.
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
