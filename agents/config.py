@@ -352,7 +352,7 @@ def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
 
     Numbers of learners that neither of them uses make no difference.
     """
-    mine, theirs = _flatten(one.to_dict()), _flatten(other.to_dict())
+    mine, theirs = flatten(one.to_dict()), flatten(other.to_dict())
     unused = tuple(f"{name}." for name in GROUPS if name not in (one.algorithm, other.algorithm))
     names = [n for n in mine.keys() | theirs.keys() if n not in RESUME_MAY_CHANGE and not n.startswith(unused)]
     return [f"{n} ({mine.get(n)!r} != {theirs.get(n)!r})" for n in sorted(names) if mine.get(n) != theirs.get(n)]
@@ -367,8 +367,7 @@ def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     return dict(values)
 
 
-def _flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in plain.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return flat
+def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has ``pqn.gamma``."""
+    parts = [flatten(x, f"{prefix}{n}.") if isinstance(x, Mapping) else {prefix + n: x} for n, x in plain.items()]
+    return {name: value for part in parts for name, value in part.items()}

@@ -1,13 +1,12 @@
 """POPGym Arcade for PyTorch: ten pixel games as MDP/POMDP twins, stepped in JAX, seen by TorchRL without a copy.
 
-Public names are resolved on first use, so that importing the package costs little and
-``import arcade_torch.envs_jax`` never loads torch.
+Public names are resolved on first use: importing the package costs little, ``arcade_torch.envs_jax`` loads no torch.
 """
 
+import sys
 from importlib import import_module
+from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING, Any
-
-import arcade_torch.gym  # noqa: F401  (puts the games into Gymnasium's registry)
 
 __version__ = "0.2.0"
 
@@ -33,11 +32,28 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
             raise AttributeError(f"module 'arcade_torch' has no attribute {name!r}; public names: {', '.join(__all__)}")
-        value = getattr(import_module(_PUBLIC[name]), name)
-        globals()[name] = value
-        return value
+        return globals().setdefault(name, getattr(import_module(_PUBLIC[name]), name))
 
 
 def __dir__() -> list[str]:
     """Public names, for completion."""
     return sorted(__all__)
+
+
+class _GymnasiumFinder:
+    """Puts the games into Gymnasium's registry when somebody imports it; to import it here would triple the time."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+        """What is found without this, for Gymnasium with one more thing to do behind its import."""
+        spec: Any = PathFinder.find_spec(name, path, target) if name == "gymnasium" else None
+        if spec is not None:
+            run = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: (run(module), import_module("arcade_torch.gym"))
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    import_module("arcade_torch.gym")
+else:
+    sys.meta_path.insert(0, _GymnasiumFinder)

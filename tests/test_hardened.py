@@ -14,8 +14,8 @@ from arcade_torch.agents import TrainConfig, load, preset
 from arcade_torch.agents.runs.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CsvLog, checksum, is_final, read_csv, read_json
 from arcade_torch.agents.runs.folder import RunFolder
-from arcade_torch.tools.figures.logs import curves_of_runs, read_rows
-from arcade_torch.tools.files import write_between
+from arcade_torch.tools.figures.logs import Rate, curves_of_runs
+from arcade_torch.tools.files import read_rows, write_between
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
 from arcade_torch.tools.runs import Run, find_runs, read_scores
@@ -226,13 +226,14 @@ def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(
     ("changes", "message"),
     [
         ({"seeds": 10**12}, "1 to 10000"),  # would have made the list of them
+        ({"total_frames": 10**400}, r"from 1 to 10\*\*15"),
         ({"seeds": [10**400]}, r"below 2\*\*32"),
         ({"games": ["../../x"]}, r"names of folders.*got '\.\./\.\./x'"),
         ({"memories": ["a/b"]}, "names of folders"),
-        ({"name": ".."}, "a study's name"),
-        ({"settings": 5}, "settings must be a table of options"),
-        ({"settings": {"--out": "x y"}, "preset": None}, "preset must be text"),
-        ({"question": 5}, "question must be text"),
+        ({"name": ".."}, "name must be made of letters"),
+        ({"settings": 5}, "settings must be a mapping of option names"),
+        ({"settings": {"--out": "x y"}, "preset": None}, "preset must be a string"),
+        ({"question": 5}, "question must be a string"),
     ],
 )
 def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[str, Any], message: str) -> None:
@@ -275,7 +276,7 @@ def test_records_of_runs_that_hold_no_table_are_damage(tmp_path: Path) -> None:
 def test_a_table_that_is_none_is_refused_by_name(tmp_path: Path, data: bytes, message: str) -> None:
     file = tmp_path / "x.csv"
     file.write_bytes(data)
-    for read in (read_csv, read_scores, read_rows):
+    for read in (read_csv, read_scores, lambda file: read_rows(file, Rate)):
         with pytest.raises(ValueError, match=message):
             read(file)
 

@@ -49,6 +49,14 @@ def test_every_page_is_in_the_navigation_once_and_every_entry_is_a_page() -> Non
     assert sorted(named) == sorted(pages)
 
 
+def test_a_linked_text_of_the_repository_is_a_page() -> None:
+    """A Markdown file that is only copied has links that lead nowhere; `make docs` refuses them."""
+    sources = {page.relative_to(ROOT).as_posix(): page for page in (*DOCS.rglob("*.md"), *ROOT.glob("*.md"))}
+    sources |= {source: ROOT / source for source in links.PAGES if source.endswith(".md")}
+    linked = [path for source, page in sources.items() for path in links.targets(page.read_text("utf-8"), source)]
+    assert {links.place(path) for path in linked if path.endswith(".md")} <= set(in_navigation())
+
+
 def test_every_game_and_every_memory_model_has_a_page() -> None:
     games = {re.sub(r"(Easy|Medium|Hard)-v\d+$", "", id).lower() for id in (*registered_ids(), *probe_ids())}
     assert {page.stem for page in (DOCS / "games").glob("*.md")} == games

@@ -28,21 +28,21 @@ With any command: --import FILE.py (or MODULE) first imports what registers your
 
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("study", "small study of one game: learning, gap, bias and saliency in one HTML page"),
-    "list": ("list", "games, memory models, what scripted players earn, and pictures of the games"),
-    "train": ("train", "train one agent into a run folder"),
-    "evaluate": ("train", "greedy returns of a trained agent"),
-    "study": ("study", "run a grid of trainings from one TOML file, resumable run by run"),
-    "report": ("study", "write the HTML page of a study"),
-    **{f"analyze {name}": ("figure", entry.summary) for name, entry in FIGURES.items() if entry.analysis},
-    **{f"figure {name}": ("figure", entry.summary) for name, entry in FIGURES.items()},
-    "play": ("play", "play a game by hand, in a window or in the terminal"),
-    "record": ("play", "a GIF or MP4 of a random, scripted or trained player"),
-    **{f"bench {name}": ("bench", summary) for name, summary in BENCHES.items()},
-    "bench all": ("bench", "every benchmark into one file, and a page of its tables"),
-    "bench compare": ("bench", "what became better or worse between two such files"),
+    "demo": ("study.Demo", "small study of one game: learning, gap, bias and saliency in one HTML page"),
+    "list": ("list.List", "games, memory models, what scripted players earn, and pictures of the games"),
+    "train": ("train.Train", "train one agent into a run folder"),
+    "evaluate": ("train.Evaluate", "greedy returns of a trained agent"),
+    "study": ("study.StudyCommand", "run a grid of trainings from one TOML file, resumable run by run"),
+    "report": ("study.Report", "write the HTML page of a study"),
+    **{f"analyze {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items() if entry.analysis},
+    **{f"figure {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items()},
+    "play": ("play.Play", "play a game by hand, in a window or in the terminal"),
+    "record": ("play.Record", "a GIF or MP4 of a random, scripted or trained player"),
+    **{f"bench {name}": ("bench.Bench", summary) for name, summary in BENCHES.items()},
+    "bench all": ("bench.BenchAll", "every benchmark into one file, and a page of its tables"),
+    "bench compare": ("bench.BenchCompare", "what became better or worse between two such files"),
 }
-"""Name -> module in `arcade_torch.tools.commands`, and what it does in a few words."""
+"""Name -> module and class in `arcade_torch.tools.commands`, and what it does in a few words."""
 GROUPS = {
     group: [name.split()[1] for name in COMMANDS if name.startswith(f"{group} ")]
     for group in dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name)
@@ -98,8 +98,8 @@ def _say(text: str) -> None:
 
 def command_class(name: str) -> Any:
     """The dataclass of a command; `parse` reads its options and `run` does the work."""
-    module = import_module(f"arcade_torch.tools.commands.{COMMANDS[name][0]}")
-    return module.COMMANDS.get(name) or next(iter(module.COMMANDS.values()))
+    module, kind = COMMANDS[name][0].split(".")
+    return getattr(import_module(f"arcade_torch.tools.commands.{module}"), kind)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

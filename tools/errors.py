@@ -25,10 +25,8 @@ class MissingPackage(ImportError):
         super().__init__(f"the package {top} is missing: pip install {wanted}")
 
 
-BAD_INPUT = (
-    *(ValueError, TypeError, MissingPackage, FileNotFoundError, FileExistsError),
-    *(PermissionError, NotADirectoryError, IsADirectoryError),
-)
+_FILES = (FileNotFoundError, FileExistsError, PermissionError, NotADirectoryError, IsADirectoryError)
+BAD_INPUT = (ValueError, TypeError, *_FILES)
 """What the library raises for bad input, beside its own error types."""
 
 WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
@@ -58,7 +56,7 @@ def is_told(error: BaseException) -> bool:
     if type(error).__module__.startswith("arcade_torch."):
         return True
     if not isinstance(error, ValueError | TypeError):
-        return isinstance(error, BAD_INPUT)
+        return isinstance(error, _FILES)
     at = error.__traceback__
     while at is not None and at.tb_next is not None:
         at = at.tb_next

@@ -23,21 +23,13 @@ Row = TypeVar("Row", bound=NamedTuple)
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        title: above it.
-        columns: headers.
-        rows: cells; written with ``str``.
-        caption: below it.
-        left: how many columns are aligned left and name the row; the others are numbers.
-    """
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[object]]
-    caption: str = ""
-    left: int = 1
+    title: str  # above it
+    columns: Sequence[str]  # headers
+    rows: Sequence[Sequence[object]]  # cells; written with ``str``
+    caption: str = ""  # below it
+    left: int = 1  # how many columns are aligned left and name the row; the others are numbers
 
     def show(self) -> None:
         """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
@@ -89,15 +81,15 @@ def write_between(page: Path, begin: str, end: str, text: str) -> Path:
     return write_atomic(page, f"{old.partition(begin)[0]}{begin}\n\n{text}\n\n{end}{old.partition(end)[2]}")
 
 
-def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> Path:
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> Path:
     """Write rows as CSV atomically; see `csv_text`."""
     return write_atomic(path, csv_text(rows, columns))
 
 
-def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> str:
-    """Rows as CSV; a missing key or None gives an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, columns, restval="", extrasaction="ignore", lineterminator="\n")
+def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
+    """Rows as CSV, by default with every column that one has; a missing key or None gives an empty cell."""
+    buffer, known = io.StringIO(), dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(buffer, columns or list(known), restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return buffer.getvalue()
@@ -109,7 +101,7 @@ def read_rows(path: Path, kind: type[Row]) -> list[Row]:
         return [kind(*(of(row[name]) for name, of in kind.__annotations__.items())) for row in read_csv(path)]
     except (KeyError, ValueError) as error:
         wanted = ", ".join(kind._fields)
-        raise ValueError(f"{path} is no table with columns {wanted} ({error}); choose another --out") from None
+        raise ValueError(f"{path} is no table with columns {wanted} ({error})") from None
 
 
 def measured_rows(

@@ -67,10 +67,11 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
 
 
 def at_least(options: Any, **least: float) -> None:
-    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``."""
+    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``; of several, any."""
     for name, bound in least.items():
-        if not getattr(options, name) >= bound:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {bound}, got {getattr(options, name)}")
+        value = getattr(options, name)
+        if not (value and min(value) >= bound if isinstance(value, tuple) else value >= bound):
+            raise ValueError(f"--{name.replace('_', '-')} must be at least {bound}, got {value}")
 
 
 def whole_number(text: str) -> int:

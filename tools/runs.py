@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.config import flatten
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 
 METRICS = ("eval_final", "train_max_ewm")
@@ -25,21 +26,13 @@ _NOT_SETTINGS = {
 
 @dataclass(frozen=True)
 class AgentKey:
-    """What makes two runs seeds of the same agent.
+    """What makes two runs seeds of the same agent."""
 
-    Attributes:
-        algorithm: name of the learner; empty in tables that do not say.
-        memory: name of the memory model, or of the agent in such a table.
-        network: preset of the network.
-        size: of the memory block, ``LAYERSxWIDTH``; empty for that of the preset.
-        options: other options of the network, (name, value), sorted.
-    """
-
-    algorithm: str
-    memory: str
-    network: str = ""
-    size: str = ""
-    options: tuple[tuple[str, str], ...] = ()
+    algorithm: str  # name of the learner; empty in tables that do not say
+    memory: str  # name of the memory model, or of the agent in such a table
+    network: str = ""  # preset of the network
+    size: str = ""  # of the memory block, ``LAYERSxWIDTH``; empty for that of the preset
+    options: tuple[tuple[str, str], ...] = ()  # other options of the network, (name, value), sorted
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> "AgentKey":
@@ -185,19 +178,6 @@ def read_record(file: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ValueError(f"{file} is damaged: it holds no table of names and values")
     return values
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys.
-
-    Example:
-        >>> flatten({"device": "cpu", "pqn": {"gamma": 0.9}})
-        {'device': 'cpu', 'pqn.gamma': 0.9}
-    """
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
 
 
 def open_run(path: Path) -> Run | None:

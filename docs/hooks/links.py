@@ -12,6 +12,7 @@ PAGES = {
     "results/parity.md": "results/parity.md",
     "results/small.md": "results/small.md",
     "results/probe.md": "results/probe.md",
+    "results/recipe.md": "results/recipe.md",
     "examples/notebooks": "notebooks.md",
 }
 """Repository path to place on the site, for what does not lie in docs/."""

@@ -8,13 +8,9 @@ SHIP_CELLS = sum(SHIPS)  # hitting one pays 1 / SHIP_CELLS
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        side: Cells per side of the sea.
-    """
-
-    side: int
+    side: int  # cells per side of the sea
 
     @property
     def cells(self) -> int:

@@ -17,13 +17,9 @@ BRICK_REWARD = tuple(weight / (sum(_WEIGHTS) * COLUMNS) for weight in _WEIGHTS) 
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        paddle: Width of the paddle in columns.
-    """
-
-    paddle: int
+    paddle: int  # width of the paddle in columns
 
     @property
     def right(self) -> int:

@@ -16,15 +16,10 @@ START = 0.05  # all four variables start uniformly in [-START, START]
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        max_steps: Time limit in steps; each survived step pays ``1 / max_steps``.
-        sigma: Standard deviation of the noise on what is drawn (m, m/s, rad, rad/s).
-    """
-
-    max_steps: int
-    sigma: float = 0.0
+    max_steps: int  # time limit in steps; each survived step pays ``1 / max_steps``
+    sigma: float = 0.0  # standard deviation of the noise on what is drawn (m, m/s, rad, rad/s)
 
 
 LEVELS = {

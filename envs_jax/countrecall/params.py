@@ -7,15 +7,10 @@ MOVE_BUDGET = 100  # counter moves that fit in an episode: one step a card is sp
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        cards: Turns of an episode; a right answer pays ``1 / cards``.
-        suits: How many suits there are.
-    """
-
-    cards: int
-    suits: int
+    cards: int  # turns of an episode; a right answer pays ``1 / cards``
+    suits: int  # how many suits there are
 
     @property
     def most(self) -> int:

@@ -5,15 +5,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        side: Cells per side of the board.
-        mines: Mines on the board.
-    """
-
-    side: int
-    mines: int
+    side: int  # cells per side of the board
+    mines: int  # mines on the board
 
     @property
     def cells(self) -> int:

@@ -9,16 +9,13 @@ TREASURE_REWARD = 1.0
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        side: Cells per side of the map.
-        usual_place: Places in the list of free cells (x-major) from which the reference takes the treasure's x and y in
-            every episode. They are inferred from the measured distribution of its treasures.
-    """
-
-    side: int
+    side: int  # cells per side of the map
     usual_place: tuple[int, int]
+    """Places in the list of free cells (x-major) from which the reference takes the treasure's x and y in every
+    episode. They are inferred from the measured distribution of its treasures.
+    """
 
     @property
     def cells(self) -> int:

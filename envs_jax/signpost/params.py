@@ -5,13 +5,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        corridor: Cells to walk before the gate; the sign has to be remembered for as many steps.
-    """
-
-    corridor: int
+    corridor: int  # cells to walk before the gate; the sign has to be remembered for as many steps
 
     @property
     def cells(self) -> int:

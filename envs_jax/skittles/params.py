@@ -9,15 +9,10 @@ COLOURS = 7  # blocks take turns through as many colours
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty: the lane, where blocks fall and the agent may stand.
+    """One difficulty: the lane, where blocks fall and the agent may stand."""
 
-    Attributes:
-        width: Columns of the lane.
-        first: Its leftmost column.
-    """
-
-    width: int
-    first: int
+    width: int  # columns of the lane
+    first: int  # its leftmost column
 
     @property
     def last(self) -> int:

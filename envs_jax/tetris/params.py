@@ -42,17 +42,11 @@ SHAPES = _shapes()
 
 @dataclass(frozen=True)
 class Params:
-    """One difficulty.
+    """One difficulty."""
 
-    Attributes:
-        previews: Coming pieces that are shown.
-        fall: Cells a piece falls by itself at every step.
-        drop: Cells it goes down by a soft drop.
-    """
-
-    previews: int
-    fall: int
-    drop: int
+    previews: int  # coming pieces that are shown
+    fall: int  # cells a piece falls by itself at every step
+    drop: int  # cells it goes down by a soft drop
 
 
 LEVELS = {"TetrisEasy": Params(3, 1, 2), "TetrisMedium": Params(2, 1, 2), "TetrisHard": Params(1, 2, 3)}

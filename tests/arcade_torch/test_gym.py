@@ -53,11 +53,17 @@ def random_actions(steps: int, envs: int) -> np.ndarray:
         "import gymnasium, arcade_torch",
         "import arcade_torch, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",
         "import arcade_torch, importlib; importlib.reload(arcade_torch); import gymnasium",
+        "import arcade_torch; from gymnasium.envs.registration import registry; import gymnasium",
     ],
 )
 def test_the_games_are_registered_whoever_is_imported_first(imports: str) -> None:
     code = f"{imports}\nimport sys\nn = sum(id.startswith('arcade_torch/') for id in gymnasium.registry)"
     assert output_of(f"{code}\nprint(n, sorted({{'jax', 'torch'}} & set(sys.modules)))") == "30 []"
+
+
+def test_the_package_alone_loads_no_gymnasium_which_takes_longer_than_all_else() -> None:
+    loaded = "sorted({'gymnasium', 'jax', 'numpy', 'torch'} & set(sys.modules))"
+    assert output_of(f"import arcade_torch, sys; print({loaded})") == "[]"
 
 
 def test_the_registered_ids_are_those_of_the_games() -> None:

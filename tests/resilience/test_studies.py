@@ -199,7 +199,7 @@ def test_kills_at_random_moments_cost_nothing(place: Place) -> None:
     assert place.carry_out(root) == 0
     assert {name: finished(root)[name] for name in seen} == seen
     assert fingerprint(root) == expected
-    litter = [path for path in (root / "runs").rglob(".*") if re.fullmatch(r"\..*\.\d+", path.name)]
+    litter = [path for path in (root / "runs").rglob(".*") if re.fullmatch(r"\..*\.\d+-[0-9a-f]{8}", path.name)]
     assert not litter
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.tools import gap_and_bias
-from arcade_torch.tools.analysis.bootstrap import measured_coverage, percentile_interval, resampled_means
+from arcade_torch.tools.analysis.bootstrap import mean_over_tasks, measured_coverage, percentile_interval, resampled
 from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
 from arcade_torch.tools.runs import Score, read_scores
 
@@ -126,7 +126,7 @@ def test_the_order_of_the_runs_does_not_matter() -> None:
 
 def test_bootstrap_spread_is_that_of_the_mean_of_resampled_seeds() -> None:
     cells = [np.array([0.0, 1.0, 4.0]), np.array([2.0, 2.0, 5.0, 7.0])]
-    draws = resampled_means(cells, 40_000, np.random.default_rng(0))
+    draws = mean_over_tasks(resampled(cells, 40_000, np.random.default_rng(0)))
     variance = sum(cell.var() / len(cell) for cell in cells) / len(cells) ** 2
     assert draws.mean() == pytest.approx(np.mean([cell.mean() for cell in cells]), abs=0.02)
     assert draws.var() == pytest.approx(variance, rel=0.03)
@@ -143,7 +143,7 @@ def test_coverage_of_a_single_cell_of_five_is_the_known_84_percent() -> None:
     inside = []
     for _ in range(1500):
         seeds = rng.standard_normal(5)
-        interval = percentile_interval(float(seeds.mean()), resampled_means([seeds], 400, rng), 0.95)
+        interval = percentile_interval(float(seeds.mean()), mean_over_tasks(resampled([seeds], 400, rng)), 0.95)
         inside.append(interval.low <= 0 <= interval.high)
     assert np.mean(inside) == pytest.approx(0.84, abs=0.03)
 

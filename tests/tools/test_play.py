@@ -406,7 +406,7 @@ def test_bad_input_is_one_line(
 def test_a_table_of_something_else_is_left_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     write_csv(tmp_path / "results.csv", [{"a": 1}], ["a"])
     assert cli.main(["play", GAME, "--scores", str(tmp_path / "results.csv")]) == cli.EXIT_BAD_INPUT
-    assert "is no table of human scores: its columns are a" in capsys.readouterr().err
+    assert "is no table of human scores" in capsys.readouterr().err
     assert (tmp_path / "results.csv").read_text() == "a\n1\n"
 
 

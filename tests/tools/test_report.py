@@ -32,7 +32,7 @@ def no_oracles(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def page(tmp_path: Path, no_oracles: None) -> str:
     write_study(tmp_path / "s", small_study(question="Is 1 < 2 & true?"))
-    return report(tmp_path / "s", saliency=False).read_text()
+    return report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
 class Checker(HTMLParser):
@@ -97,12 +97,12 @@ def test_an_unfinished_study_is_reported_as_such(tmp_path: Path, no_oracles: Non
     run = what.runs()[0]
     (folder.run(run).path / "eval.json").unlink()
     write_run(folder.run(run).path, run, 0.5, status="interrupted")
-    assert "1 of 8 runs have not finished" in report(tmp_path / "s", saliency=False).read_text()
+    assert "1 of 8 runs have not finished" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
 def test_a_study_without_the_control_still_has_a_page(tmp_path: Path, no_oracles: None) -> None:
     write_study(tmp_path / "s", small_study(memories=["mingru"]))
-    assert "no scores for the memory-free agent" in report(tmp_path / "s", saliency=False).read_text()
+    assert "no scores for the memory-free agent" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
 def test_nothing_finished_is_an_error(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
     same = {player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")}
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: same)
     write_study(tmp_path / "s", small_study())
-    assert "random policy" in report(tmp_path / "s", saliency=False).read_text()
+    assert "random policy" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
 def test_reference_lines_follow_the_options_of_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,7 +167,7 @@ def test_reference_lines_follow_the_options_of_the_study(tmp_path: Path, monkeyp
         record = json.loads(file.read_text())
         record["config"] |= {"env_options": {"mine_reward": -1.0}, "rules": "reference"}
         file.write_text(json.dumps(record))
-    report(tmp_path / "s", saliency=False)
+    report(tmp_path / "s", skip=("saliency",))
     assert asked == [("MineSweeperEasy", folder.analysis, "reference", {"mine_reward": -1.0})]
 
 

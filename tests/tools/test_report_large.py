@@ -43,7 +43,7 @@ def check(page: str) -> Checker:
 def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
-    page = report(folder.root, saliency=False, recall=False, contamination=False).read_text()
+    page = report(folder.root, skip=("saliency", "recall", "contamination")).read_text()
     assert len(page) < 400_000
     count = check(page).count
     assert count["svg"] == 2 * len(GAMES) + 4  # no training curves, which would double it
@@ -81,7 +81,7 @@ def test_representatives_without_a_control_are_the_best_agent() -> None:
 
 def test_runs_without_checkpoints_are_left_out_and_counted(tmp_path: Path) -> None:
     folder, _ = large_study(tmp_path / "s", games=GAMES[:1], seeds=1)
-    page = report(folder.root, references=False).read_text()
+    page = report(folder.root, skip=("references",)).read_text()
     assert "6 runs without a checkpoint cannot be looked into" in page
     check(page)
 
@@ -112,7 +112,7 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[str, int, int]] = []
-    page = report(trained, saliency=False, references=False, progress=lambda *step: told.append(step)).read_text()
+    page = report(trained, skip=("saliency", "references"), progress=lambda *step: told.append(step)).read_text()
     check(page)
     assert ("recall density, mlp on SignpostEasy-v0", 16, 16) in told
     assert ("contamination, lru on SignpostEasy-v0", panels.NOISE["starts"], panels.NOISE["starts"]) in told
@@ -124,18 +124,18 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     free = [row.split("<td>")[1:] for row in noise.split("<tr>")[2:]][1]
     assert free[3].startswith("0.0 %") and free[4].startswith("0.0 %")
     told.clear()
-    report(trained, saliency=False, references=False, progress=lambda *step: told.append(step))
+    report(trained, skip=("saliency", "references"), progress=lambda *step: told.append(step))
     assert told == []  # kept in the run folders
 
 
 def test_each_analysis_can_be_skipped_from_the_command_line(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ask = ["report", str(trained), "--out", str(tmp_path / "r.html"), "--no-saliency", "--no-references"]
-    assert cli.main([*ask, "--no-recall"]) == cli.EXIT_OK
+    ask = ["report", str(trained), "--out", str(tmp_path / "r.html"), "--skip", "saliency", "references"]
+    assert cli.main([*ask, "recall"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
     assert 'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
-    assert cli.main([*ask, "--no-contamination"]) == cli.EXIT_OK
+    assert cli.main([*ask, "contamination"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
     assert 'id="contamination"' not in page and 'id="recall"' in page
     assert not (tmp_path / "analysis").exists() and read_csv(trained / "results.csv")

@@ -7,7 +7,6 @@ import pytest
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.figures.logs import NEEDED
 from arcade_torch.tools.files import write_csv
 
 RATES = {"step+draw": 100.0, "step": 1000.0, "env": 60.0, "collector": 80.0, "fill": 5000.0, "copy": 4000.0}
@@ -49,13 +48,14 @@ def test_rates_are_those_with_every_frame_consumed(tmp_path: Path, capsys: pytes
 def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_bench(tmp_path / "b.csv")
     (tmp_path / "x.csv").write_text("a,b\n1,2\n")
-    (tmp_path / "e.csv").write_text(",".join(NEEDED) + "\n")
+    write_bench(tmp_path / "e.csv", measure="fill")
+    write_bench(tmp_path / "n.csv", num_envs=0)
     wrong = {
         "throughput is drawn from one file": [],
         "b.csv does not exist": ["--runs", str(tmp_path / "nowhere" / "b.csv")],
-        "is a folder: give the CSV file": ["--runs", str(tmp_path)],
-        "x.csv has no column game": ["--runs", str(tmp_path / "x.csv")],
-        "e.csv has no column game": ["--runs", str(tmp_path / "e.csv")],
+        "x.csv is no table with columns game, measure": ["--runs", str(tmp_path / "x.csv")],
+        "e.csv has no row with the measure step+draw": ["--runs", str(tmp_path / "e.csv")],
+        "num_envs and rates must be numbers above 0": ["--runs", str(tmp_path / "n.csv")],
         "Unrecognized options: --paper": ["--paper"],
     }
     for message, words in wrong.items():

@@ -28,11 +28,6 @@ def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> l
     return [cell[rng.integers(len(cell), size=(draws, len(cell)))] for cell in cells]
 
 
-def resampled_means(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> Array:
-    """Means over tasks of resampled seeds, float64 [draws]."""
-    return mean_over_tasks(resampled(cells, draws, rng))
-
-
 def mean_over_tasks(cells: Sequence[Array]) -> Array:
     """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...]."""
     return np.asarray(sum(cell.mean(axis=-1) for cell in cells) / len(cells))
@@ -56,8 +51,17 @@ def percentile_interval(value: Any, draws: Array, confidence: float, known: bool
     return Interval(float(value), float(low), float(high))
 
 
-def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> tuple[Array, Array, Array]:
-    """Mean over seeds, and both ends of its percentile interval, cell by cell: [n_seeds, ...] to three arrays [...].
+class Pooled(NamedTuple):
+    """Values of every seed [n_seeds, ...], their mean and the ends of its percentile interval, each [...]."""
+
+    seeds: Array
+    mean: Array
+    low: Array
+    high: Array
+
+
+def pooled(values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> Pooled:
+    """Pool the arrays of some seeds, cell by cell.
 
     NaN is a seed without a value. The ends are NaN where fewer than two seeds have one, the mean where none has.
     """
@@ -66,30 +70,15 @@ def over_seeds(values: Array, confidence: float = 0.95, draws: int = 2000, seed:
         known = seeds[np.isfinite(seeds)]
         if known.size < 2:
             return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
-        drawn = resampled_means([known], draws, np.random.default_rng(seed))
+        drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
         return np.array(percentile_interval(known.mean(), drawn, confidence))
 
-    mean, low, high = np.apply_along_axis(cell, 0, values)
-    return mean, low, high
-
-
-class Pooled(NamedTuple):
-    """Values of every seed [n_seeds, ...], their mean and its interval, each [...]."""
-
-    seeds: Array
-    mean: Array
-    low: Array
-    high: Array
-
-
-def pooled(values: Sequence[Array], confidence: float = 0.95) -> Pooled:
-    """Pool the arrays of some seeds; see `over_seeds`."""
-    seeds = np.array(values)
-    return Pooled(seeds, *over_seeds(seeds, confidence))
+    every = np.array(values, dtype=np.float64)
+    return Pooled(every, *np.apply_along_axis(cell, 0, every))
 
 
 def seed_coverage(seeds: int, confidence: float = 0.95) -> float:
-    """Measured coverage of `over_seeds` with so many seeds; NaN below two."""
+    """Measured coverage of `pooled` with so many seeds; NaN below two."""
     return measured_coverage((seeds,), (), confidence) if seeds > 1 else float("nan")
 
 

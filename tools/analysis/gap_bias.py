@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
 from arcade_torch.tools.runs import Score, Source, find_baseline, read_scores
@@ -23,7 +24,6 @@ NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "po
 """Columns of the table that have an interval."""
 SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
 """Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already."""
-DIFFICULTIES = ("Easy", "Medium", "Hard")
 
 
 def game_of(env_id: str) -> str:

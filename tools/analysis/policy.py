@@ -38,22 +38,18 @@ def read_plain(out: Tensor, what: str) -> Tensor:
 class Policy:
     """A policy in two functions.
 
-    Attributes:
-        encode: frames, float or uint8 0..255 [N, H, W, C], to features [N, E]; each frame on its own.
-        remember: ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T], state) -> (out [B, T, A],
-            state)``, causal in time.
-        initial_state: batch size to the state before the first frame: a TensorDict [B], a tensor [B, ...] or None.
-        read: what its outputs mean: ``(out, one of TARGETS) -> [..., A or 1]``.
-        offers: which of `TARGETS` its outputs can be read as.
-        module: put into evaluation mode while an analysis runs.
+    ``encode`` turns frames, float or uint8 0..255 [N, H, W, C], into features [N, E], each frame on its own.
+    ``remember`` is ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T], state) -> (out [B, T, A],
+    state)``, causal in time; ``initial_state`` gives, for a batch size, the state before the first frame: a TensorDict
+    [B], a tensor [B, ...] or None.
     """
 
     encode: Callable[[Tensor], Tensor]
     remember: Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
     initial_state: Callable[[int], Any] = lambda batch_size: None
-    read: Callable[[Tensor, str], Tensor] = read_plain
-    offers: tuple[str, ...] = TARGETS
-    module: nn.Module | None = None
+    read: Callable[[Tensor, str], Tensor] = read_plain  # what its outputs mean: (out, one of TARGETS) -> [..., A or 1]
+    offers: tuple[str, ...] = TARGETS  # which of `TARGETS` its outputs can be read as
+    module: nn.Module | None = None  # put into evaluation mode while an analysis runs
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""

@@ -20,6 +20,7 @@ from arcade_torch.envs_jax import make, registered_ids
 from arcade_torch.envs_jax.batch import BatchedGame, env_keys
 from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
+from arcade_torch.tools.options import at_least
 
 WINDOW_BYTES = 2**27
 """Pixels in a collector's window, at most, unless 4 steps need more."""
@@ -36,23 +37,17 @@ class Options(BenchOptions):
     Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
     """
 
-    games: tuple[str, ...] = ()
-    """Environment ids; every registered Easy game by default."""
-    sizes: tuple[int, ...] = (128,)
-    """Sides of the frames, 128 or 256."""
-    batches: tuple[int, ...] = (1, 16, 128, 512)
-    """Numbers of envs."""
-    seconds: float = 0.5
-    """For each measure in each repeat."""
-    repeats: int = 5
-    """Turns; medians are shown."""
+    games: tuple[str, ...] = ()  # Environment ids; every registered Easy game by default.
+    sizes: tuple[int, ...] = (128,)  # Sides of the frames, 128 or 256.
+    batches: tuple[int, ...] = (1, 16, 128, 512)  # Numbers of envs.
+    seconds: float = 0.5  # For each measure in each repeat.
+    repeats: int = 5  # Turns; medians are shown.
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
-    if (count := min(options.batches)) < 1:
-        raise ValueError(f"a batch holds at least 1 env, got {count}")
+    at_least(options, batches=1)
     for game, size in product(games, options.sizes):
         make(game, obs_size=size)  # refuse what does not exist before anything is measured
     for game, size, count in product(games, options.sizes, options.batches):

@@ -18,8 +18,7 @@ class Measure:
     """Does it once and returns the result; waits for JAX (the clock waits for torch's device)."""
     check: Callable[[Any], int] = lambda result: 0
     """Reads all of the result and returns a whole number; eager torch computes all anyway."""
-    units: int = 1
-    """How many one ``work`` makes."""
+    units: int = 1  # how many one ``work`` makes
 
 
 @dataclass
@@ -27,11 +26,9 @@ class Measured:
     """What one measure did over all repeats: units a second of each, and all units made and consumed."""
 
     rates: list[float] = field(default_factory=list)
-    rates_with_check: list[float] = field(default_factory=list)
-    """With the check of the results inside the clock."""
+    rates_with_check: list[float] = field(default_factory=list)  # with the check of the results inside the clock
     units: int = 0
-    checksum: int = 0
-    """Over everything that was made, modulo 2**64."""
+    checksum: int = 0  # over everything that was made, modulo 2**64
 
     @property
     def rate(self) -> float:

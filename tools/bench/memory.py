@@ -17,6 +17,7 @@ from arcade_torch.models.scan_triton import runs_triton
 from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads
+from arcade_torch.tools.options import at_least
 
 TORCH_GRU = "torch.nn.GRU"
 """It knows no starts and ignores them."""
@@ -72,33 +73,22 @@ class Options(BenchOptions):
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
 
-    memories: tuple[str, ...] = ()
-    """Memory models; all of them by default."""
-    steps: tuple[int, ...] = (132, 1024)
-    """Lengths of the sequences."""
-    layers: tuple[int, ...] = (1, 2)
-    """Cells one above the other."""
-    size: int = 512
-    """Width of input and output."""
-    batch: int = 16
-    """Sequences."""
-    frames: int = 64
-    """Of the episode whose last decision saliency explains."""
-    device: str = "cpu"
-    """Torch device."""
-    threads: int = 1
-    """Of torch."""
-    seconds: float = 0.3
-    """For each measure in each repeat, at least one pass."""
-    repeats: int = 3
-    """Turns."""
+    memories: tuple[str, ...] = ()  # Memory models; all of them by default.
+    steps: tuple[int, ...] = (132, 1024)  # Lengths of the sequences.
+    layers: tuple[int, ...] = (1, 2)  # Cells one above the other.
+    size: int = 512  # Width of input and output.
+    batch: int = 16  # Sequences.
+    frames: int = 64  # Of the episode whose last decision saliency explains.
+    device: str = "cpu"  # Torch device.
+    threads: int = 1  # Of torch.
+    seconds: float = 0.3  # For each measure in each repeat, at least one pass.
+    repeats: int = 3  # Turns.
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the tables ``models``, ``scans`` and ``saliency``."""
     batch, size = options.batch, options.size
-    if min((1, *options.steps, *options.layers, size, batch, options.threads, options.frames)) < 1:
-        raise ValueError("steps, layers, size, batch, frames and threads must be at least 1")
+    at_least(options, steps=1, layers=1, size=1, batch=1, frames=1, threads=1)
     if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
         raise ValueError(f"device must be cpu, or cuda where torch finds a card, got {options.device!r}")
     device, how = torch.device(options.device), (options.seconds, options.repeats)
@@ -233,8 +223,7 @@ class MemoryCost(NamedTuple):
     """What one cell needs, whatever the machine."""
 
     parameters: int
-    state_numbers: int
-    """Numbers in the recurrent state of one env."""
+    state_numbers: int  # numbers in the recurrent state of one env
     state_bytes: int
     products: int
     """Multiply-adds in matrix products of one acting step (forward, one env); elementwise work is left out."""

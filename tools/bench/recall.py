@@ -24,6 +24,7 @@ from arcade_torch.models import MemoryBlock, memory_names
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.files import markdown_table, measured_rows, write_between
 from arcade_torch.tools.machine import torch_threads
+from arcade_torch.tools.options import at_least
 
 SYMBOLS, DISTRACTORS = 4, 4
 ASK = SYMBOLS + DISTRACTORS
@@ -50,20 +51,14 @@ class Options(BenchOptions):
     """
 
     resumable: ClassVar[bool] = True
-    memories: tuple[str, ...] = ()
-    """Memory models; all of them by default."""
-    delays: tuple[int, ...] = (8, 32, 96)
-    """Steps between symbol and question."""
-    hidden_size: int = 64
-    """Width of the memory block."""
-    seconds: float = 60.0
-    """Budget of each training, processor time."""
-    seed: int = 0
-    """Of weights and data."""
+    memories: tuple[str, ...] = ()  # Memory models; all of them by default.
+    delays: tuple[int, ...] = (8, 32, 96)  # Steps between symbol and question.
+    hidden_size: int = 64  # Width of the memory block.
+    seconds: float = 60.0  # Budget of each training, processor time.
+    seed: int = 0  # Of weights and data.
     out: Path | None = Path("recall.csv")
     """Table; rows it holds are not measured again."""
-    page: Path | None = None
-    """Markdown page that gets the table between its marks."""
+    page: Path | None = None  # Markdown page that gets the table between its marks.
 
 
 class Recall(NamedTuple):
@@ -83,11 +78,7 @@ class Recall(NamedTuple):
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``recall``; those that the file holds already are not measured again."""
-    if options.seconds <= 0 or options.hidden_size < 1 or not options.delays or min(options.delays) < 1:
-        raise ValueError(
-            "need seconds above 0, a hidden size of at least 1 and delays of at least 1 step, got "
-            f"{options.seconds}, {options.hidden_size} and {options.delays}"
-        )
+    at_least(options, seconds=0.01, hidden_size=1, delays=1)
     sizes, asked = (options.hidden_size, options.seed), []
 
     def measure(memory: str, delay: int, hidden_size: int, seed: int) -> Recall:

@@ -30,22 +30,15 @@ class Options(BenchOptions):
     Example: arcade-torch bench train --networks small --memories lru gru --threads 1 --out runs/train.csv
     """
 
-    networks: tuple[str, ...] = ("paper", "small")
-    """Presets of network and learner: paper, small."""
-    memories: tuple[str, ...] = ("lru", "gru")
-    """Memory models, see arcade-torch list."""
-    env: str = "MineSweeperEasy"
-    """The game; its POMDP twin is played."""
-    device: str = "cpu"
-    """Torch device of the network."""
+    networks: tuple[str, ...] = ("paper", "small")  # Presets of network and learner: paper, small.
+    memories: tuple[str, ...] = ("lru", "gru")  # Memory models, see arcade-torch list.
+    env: str = "MineSweeperEasy"  # The game; its POMDP twin is played.
+    device: str = "cpu"  # Torch device of the network.
     forms: tuple[str, ...] = ("eager",)
     """How networks are run: eager, amp, compiled, graphs (CUDA graphs while acting), or several joined by "+"."""
-    threads: int = 0
-    """Torch threads; 0 leaves the setting alone."""
-    grad_steps: int = 4
-    """Gradient steps in each timed pass; those of an update are all alike."""
-    repeats: int = 3
-    """Passes; the median counts."""
+    threads: int = 0  # Torch threads; 0 leaves the setting alone.
+    grad_steps: int = 4  # Gradient steps in each timed pass; those of an update are all alike.
+    repeats: int = 3  # Passes; the median counts.
     keep_memory: bool = True
     """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
 

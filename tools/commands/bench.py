@@ -68,10 +68,8 @@ class BenchAll(Command):
     """How much: tiny takes half a minute and proves nothing, quick about ten minutes, full an hour or more."""
     benches: tuple[Literal["envs", "train", "memory", "recall"], ...] = ("envs", "train", "memory", "recall")
     """Which of them."""
-    out: Path = Path("results/bench.json")
-    """The file; overwritten."""
-    page: Path | None = None
-    """Markdown page of the tables; beside the file by default."""
+    out: Path = Path("results/bench.json")  # The file; overwritten.
+    page: Path | None = None  # Markdown page of the tables; beside the file by default.
 
     def run(self) -> int:
         """Measure and save."""
@@ -94,12 +92,9 @@ class BenchCompare(Command):
     Example: arcade-torch bench compare results/bench.json runs/bench.json --tolerance 0.2
     """
 
-    old: tyro.conf.Positional[Path]
-    """The file to compare with."""
-    new: tyro.conf.Positional[Path]
-    """The file to judge."""
-    tolerance: float = 0.2
-    """Share by which a number may be worse; machines that are not quiet need more."""
+    old: tyro.conf.Positional[Path]  # The file to compare with.
+    new: tyro.conf.Positional[Path]  # The file to judge.
+    tolerance: float = 0.2  # Share by which a number may be worse; machines that are not quiet need more.
 
     def run(self) -> int:
         """Compare and print."""
@@ -131,9 +126,5 @@ def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
     paths = []
     for name, table in results["tables"].items():
         path = out if len(results["tables"]) == 1 else out.with_name(f"{out.stem}_{name}.csv")
-        rows = [{**row, **results["machine"]} for row in table["rows"]]
-        paths.append(write_csv(path, rows, list(rows[0])))
+        paths.append(write_csv(path, [{**row, **results["machine"]} for row in table["rows"]]))
     return paths
-
-
-COMMANDS: dict[str, Any] = {"bench": Bench, "bench all": BenchAll, "bench compare": BenchCompare}

@@ -50,14 +50,10 @@ class Figure(Command):
         with Bars() as bars:
             made = make_figure(self.name, self.options, bars.update)
         if self.options.csv:
-            rows = [row for picture in made.pictures for row in picture.rows]
-            print(csv_text(rows, list(dict.fromkeys(name for row in rows for name in row))), end="")
+            print(csv_text([row for picture in made.pictures for row in picture.rows]), end="")
             return 0
         for table in made.tables:
             table.show()
         for line in [*made.notes, *map(str, made.files)]:
             print(line)
         return 0
-
-
-COMMANDS = {"figure": Figure}

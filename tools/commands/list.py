@@ -7,6 +7,7 @@ from typing import Literal
 
 import tyro
 
+from arcade_torch.envs_jax import make, registered_ids, resolve_id
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.options import at_least
@@ -29,20 +30,13 @@ class List(Command):
     """What to show; all: envs and memories."""
     games: tyro.conf.Positional[tuple[str, ...]] = ()
     """For baselines and sheet: ids; all, or the ten games of one level, by default."""
-    measure: bool = False
-    """Also time the memory models on this machine, on one thread (about a minute)."""
-    episodes: int = 1000
-    """For baselines: of each player in each game, at most."""
-    seconds: float = 60.0
-    """For baselines: for each player in each game; what is begun is finished."""
-    page: Path | None = None
-    """For baselines: Markdown page that gets the table between its marks."""
-    level: Literal["Easy", "Medium", "Hard"] = "Easy"
-    """For sheet, when no games are named."""
-    steps: tuple[int, ...] = ()
-    """For sheet: after these steps of the scripted player in one game."""
-    out: Path | None = None
-    """File for baselines (baselines.csv by default) or sheet (games.png)."""
+    measure: bool = False  # Also time the memory models on this machine, on one thread (about a minute).
+    episodes: int = 1000  # For baselines: of each player in each game, at most.
+    seconds: float = 60.0  # For baselines: for each player in each game; what is begun is finished.
+    page: Path | None = None  # For baselines: Markdown page that gets the table between its marks.
+    level: Literal["Easy", "Medium", "Hard"] = "Easy"  # For sheet, when no games are named.
+    steps: tuple[int, ...] = ()  # For sheet: after these steps of the scripted player in one game.
+    out: Path | None = None  # File for baselines (baselines.csv by default) or sheet (games.png).
 
     def run(self) -> int:
         """Print the tables, or draw."""
@@ -57,7 +51,6 @@ class List(Command):
         return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
 
     def _baselines(self) -> None:
-        from arcade_torch.envs_jax import registered_ids, resolve_id
         from arcade_torch.tools import players
         from arcade_torch.tools.files import write_between
         from arcade_torch.tools.progress import Bars
@@ -75,7 +68,6 @@ class List(Command):
             print(f"\nwritten into {write_between(self.page, players.BEGIN, players.END, table)}")
 
     def _sheet(self) -> None:
-        from arcade_torch.envs_jax import registered_ids, resolve_id
         from arcade_torch.tools.play.recording import sheet, strip, write_png
 
         ids = [resolve_id(name) for name in self.games]
@@ -86,8 +78,6 @@ class List(Command):
         print(write_png(self.out or Path("games.png"), picture).resolve())
 
     def _envs(self) -> None:
-        from arcade_torch.envs_jax import make, registered_ids
-
         games = [make(env_id) for env_id in registered_ids()]
         rows = [(game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games]
         Table("environments", ("id", "time limit", "return"), rows).show()
@@ -119,6 +109,3 @@ class List(Command):
         print("multiply-adds: in matrix products, one step of one env, acting")
         if self.measure:
             print("us: microseconds for one step of one env; acting: 16 envs; learning: both passes, 16 x 132 steps")
-
-
-COMMANDS = {"list": List}

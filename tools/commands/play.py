@@ -17,10 +17,8 @@ class Shown(Command):
 
     game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
     """Environment id."""
-    both: bool = False
-    """Show both twins, the MDP on the left."""
-    scale: int = 2
-    """Width of a frame's pixel in the picture."""
+    both: bool = False  # Show both twins, the MDP on the left.
+    scale: int = 2  # Width of a frame's pixel in the picture.
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
 
@@ -37,22 +35,14 @@ class Play(Shown):
 
     seed: int | None = None
     """Of the first episode, each further one has the next; 0 by default, with --scores the first the file lacks."""
-    partial: bool = False
-    """Begin with the POMDP twin."""
-    episodes: int = 0
-    """Stop after so many finished episodes; 0 for never."""
-    obs_size: Literal[128, 256] = 256
-    """Side of the frame in pixels."""
-    key_repeat: int = 0
-    """A held key repeats every so many milliseconds; 0 for not at all."""
-    rules: Literal["default", "reference"] = "default"
-    """Rules of the game."""
-    terminal: bool = False
-    """Play in the terminal."""
-    scores: Path | None = None
-    """CSV file that every episode is added to: return, seed, actions."""
-    player: str = ""
-    """Your name in that file."""
+    partial: bool = False  # Begin with the POMDP twin.
+    episodes: int = 0  # Stop after so many finished episodes; 0 for never.
+    obs_size: Literal[128, 256] = 256  # Side of the frame in pixels.
+    key_repeat: int = 0  # A held key repeats every so many milliseconds; 0 for not at all.
+    rules: Literal["default", "reference"] = "default"  # Rules of the game.
+    terminal: bool = False  # Play in the terminal.
+    scores: Path | None = None  # CSV file that every episode is added to: return, seed, actions.
+    player: str = ""  # Your name in that file.
 
     def run(self) -> int:
         """Play."""
@@ -100,24 +90,16 @@ class Record(Shown):
     Example: arcade-torch record MineSweeperEasy --player frames-oracle --both --out sweep.gif
     """
 
-    out: Path
-    """File, .gif or .mp4; replaced if it exists."""
-    player: str = "random"
-    """random, state-oracle, frames-oracle, or a run folder."""
+    out: Path  # File, .gif or .mp4; replaced if it exists.
+    player: str = "random"  # random, state-oracle, frames-oracle, or a run folder.
     observability: Literal["full", "partial"] | None = None
     """Twin that is shown, and that an agent sees; by default its own, partial for the frames-oracle, otherwise full."""
-    seed: int = 0
-    """Of the first episode, each further one has the next."""
-    episodes: int = 1
-    """How many."""
-    max_steps: int = 1000
-    """The recording stops when an episode gets longer."""
-    fps: float = 10.0
-    """Frames a second."""
-    obs_size: Literal[128, 256] | None = None
-    """Side of the frame; the agent's, else 128."""
-    rules: Literal["default", "reference"] | None = None
-    """Rules of the game; the agent's, else default."""
+    seed: int = 0  # Of the first episode, each further one has the next.
+    episodes: int = 1  # How many.
+    max_steps: int = 1000  # The recording stops when an episode gets longer.
+    fps: float = 10.0  # Frames a second.
+    obs_size: Literal[128, 256] | None = None  # Side of the frame; the agent's, else 128.
+    rules: Literal["default", "reference"] | None = None  # Rules of the game; the agent's, else default.
 
     def run(self) -> int:
         """Record."""
@@ -172,6 +154,3 @@ class Record(Shown):
             write(self.out, counted(), self.fps)
         print(f"recording: {self.out}")
         return 0
-
-
-COMMANDS = {"play": Play, "record": Record}

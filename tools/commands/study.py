@@ -3,16 +3,15 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.studies.engines import Engine, RayOptions
-
-if TYPE_CHECKING:
-    from arcade_torch.tools.studies.grid import Study
+from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
+from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
 
 
 class Resumable(Command):
@@ -25,10 +24,8 @@ class Resumable(Command):
         line = command_line([self.word, *self.argv])
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
 
-    def carry_out(self, what: "Study", out: Path, engine: Engine, shard: str = "", report: bool = True) -> int:
+    def carry_out(self, what: Study, out: Path, engine: Engine, shard: str = "", report: bool = True) -> int:
         """Run a study, say how each run ended, and write the report; exit code 1 if a run failed."""
-        from arcade_torch.tools.studies.runner import DiskFullError, study
-
         pairs = zip(self.argv, ("", *self.argv), strict=False)
         argv = [word for word, before in pairs if not word.startswith("--shard") and before != "--shard"]
         try:
@@ -55,29 +52,21 @@ class StudyCommand(Resumable):
     """
 
     word = "study"
-    file: tyro.conf.Positional[Path | None] = None
-    """The study."""
+    file: tyro.conf.Positional[Path | None] = None  # The study.
     preset: Literal["demo", "paper-easy", "paper", "size-sweep"] | None = None
     """A ready-made study in the place of a file."""
-    out: Path | None = None
-    """Folder of the study; runs/NAME by default."""
+    out: Path | None = None  # Folder of the study; runs/NAME by default.
     engine: Literal["auto", "inline", "processes", "ray"] = "auto"
     """Where the runs are carried out; auto takes processes where there is more than one core."""
-    workers: int = 0
-    """Runs at once; 0 for one a core, or for what the Ray cluster has room for."""
+    workers: int = 0  # Runs at once; 0 for one a core, or for what the Ray cluster has room for.
     ray: Annotated[RayOptions, tyro.conf.arg(name="")] = field(default_factory=RayOptions)
     shard: str = ""
     """3/10 carries out the third tenth of the runs, for the array jobs of a scheduler; all write into one folder."""
-    dry_run: bool = False
-    """Only print every run with its frames, and the frames of all together."""
-    report: bool = True
-    """Write the HTML report at the end; of shards, the one that finishes the study writes it."""
+    dry_run: bool = False  # Only print every run with its frames, and the frames of all together.
+    report: bool = True  # Write the HTML report at the end; of shards, the one that finishes the study writes it.
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""
-        from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
-        from arcade_torch.tools.studies.runner import make_engine, planned
-
         if (self.file is None) == (self.preset is None):
             raise ValueError(f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the two")
         what = study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
@@ -104,22 +93,14 @@ class Demo(Resumable):
     """
 
     word = "demo"
-    games: tuple[str, ...] = ("SignpostEasy", "MineSweeperEasy")
-    """Games to play."""
-    frames: int = 100_000
-    """Environment steps of each run."""
-    seeds: int = 3
-    """Runs of each agent and twin."""
-    out: Path = Path("runs/demo")
-    """Folder of the study."""
-    workers: int = 0
-    """Runs at once; 0 for one a core."""
+    games: tuple[str, ...] = ("SignpostEasy", "MineSweeperEasy")  # Games to play.
+    frames: int = 100_000  # Environment steps of each run.
+    seeds: int = 3  # Runs of each agent and twin.
+    out: Path = Path("runs/demo")  # Folder of the study.
+    workers: int = 0  # Runs at once; 0 for one a core.
 
     def run(self) -> int:
         """Run the study and write its report."""
-        from arcade_torch.tools.studies.grid import demo_study
-        from arcade_torch.tools.studies.runner import make_engine
-
         what = demo_study(self.games, self.frames, self.seeds)
         return self.carry_out(what, self.out, make_engine("auto", self.workers))
 
@@ -131,25 +112,15 @@ class Report(Command):
     Example: arcade-torch report runs/demo
     """
 
-    study: tyro.conf.Positional[Path]
-    """Folder of the study."""
-    out: Path | None = None
-    """The page; report.html in that folder by default."""
-    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"
-    """Score of a run that the headline is based on."""
-    saliency: bool = True
-    """Draw saliency strips."""
-    recall: bool = True
-    """Measure recall density: how decisions spread over the past."""
-    contamination: bool = True
-    """Measure state contamination: what one noisy past frame changes."""
-    references: bool = True
-    """Draw the returns of the random policy and of the oracles."""
+    study: tyro.conf.Positional[Path]  # Folder of the study.
+    out: Path | None = None  # The page; report.html in that folder by default.
+    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"  # Score of a run that the headline is based on.
+    skip: tuple[Literal["saliency", "recall", "contamination", "references"], ...] = ()
+    """Parts to leave out: strips, densities, what one noisy frame changes, returns of the random policy and oracles."""
 
     def run(self) -> int:
         """Write the page."""
-        sections = {name: getattr(self, name) for name in ("saliency", "recall", "contamination", "references")}
-        write_page(self.study, self.out, metric=self.metric, **sections)
+        write_page(self.study, self.out, metric=self.metric, skip=self.skip)
         return 0
 
 
@@ -160,6 +131,3 @@ def write_page(study: Path, out: Path | None = None, **how: Any) -> None:
 
     with Bars() as bars:
         print(f"report: {report(study, out, progress=bars.update, **how).resolve()}")
-
-
-COMMANDS = {"study": StudyCommand, "demo": Demo, "report": Report}

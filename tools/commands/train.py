@@ -26,20 +26,16 @@ class Train(Command):
     """
 
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
-    preset: str = "paper"
-    """Settings to start from."""
+    preset: str = "paper"  # Settings to start from.
     config: Path | None = None
     """JSON file to start from in the place of a preset: a run's config.json, or one that a study wrote."""
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
     network_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the network; may be given several times."""
-    out: Path | None = None
-    """Run folder; runs/ENV__OBSERVABILITY__MEMORY__ALGORITHM__seedN by default, as in a study."""
-    resume: bool = False
-    """Go on with the run in that folder."""
-    wait: float = 0.0
-    """Seconds to wait until another process that trains in that folder has stopped."""
+    out: Path | None = None  # Run folder; runs/ENV__OBSERVABILITY__MEMORY__ALGORITHM__seedN by default, as in a study.
+    resume: bool = False  # Go on with the run in that folder.
+    wait: float = 0.0  # Seconds to wait until another process that trains in that folder has stopped.
     videos: Literal["none", "gif", "mp4"] = "none"
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
 
@@ -107,14 +103,10 @@ class Evaluate(Command):
     Example: arcade-torch evaluate runs/one --episodes 256 --observability full
     """
 
-    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]
-    """Run folder or checkpoint."""
-    episodes: int = 128
-    """Number of episodes, each in an environment of its own."""
-    observability: Literal["full", "partial"] | None = None
-    """Another twin than the agent was trained on."""
-    json: Path | None = None
-    """File for the numbers; not overwritten."""
+    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]  # Run folder or checkpoint.
+    episodes: int = 128  # Number of episodes, each in an environment of its own.
+    observability: Literal["full", "partial"] | None = None  # Another twin than the agent was trained on.
+    json: Path | None = None  # File for the numbers; not overwritten.
 
     def run(self) -> int:
         """Evaluate and print."""
@@ -152,6 +144,3 @@ def _flags(argv: Sequence[str]) -> dict[str, str]:
         if name.startswith("--"):
             found[name[2:].replace("-", "_")] = value if equals else following
     return found
-
-
-COMMANDS = {"train": Train, "evaluate": Evaluate}

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis.bootstrap import Interval, seed_coverage
-from arcade_torch.tools.analysis.gap_bias import DIFFICULTIES, AgentRow, GapBias, gap_and_bias
+from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
 from arcade_torch.tools.files import Table, read_csv
-from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, is_baseline, read_scores
+from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, is_baseline, read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),
@@ -165,11 +166,9 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
         return Made(notes=[paper.text()]), paper.table, note
     if not options.runs:
         raise ValueError("name at least one study folder, run folder or CSV file")
-    bare = [path for path in options.runs if (path / "results.csv").is_file() and not any(path.rglob("config.json"))]
-    tables = [path for path in options.runs if path.is_file() or path in bare]  # bare: a study that has lost its runs
-    folders = [path for path in options.runs if path not in tables]
+    folders = [path for path in options.runs if table_of(path) is None]
     found = find_runs(folders) if folders else Runs(())
-    table = _computed(read_scores([*tables, *(run.path for run in found.runs)], options.metric), options)
+    table = _computed(read_scores(options.runs, options.metric), options)
     notes = found.notes + found.single_seeds()
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")

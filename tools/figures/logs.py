@@ -2,23 +2,21 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
 from arcade_torch.agents import preset
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, flatten
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
-from arcade_torch.tools.files import markdown_table, read_csv
-from arcade_torch.tools.runs import Run, find_runs, flatten
+from arcade_torch.tools.files import markdown_table, read_csv, read_rows
+from arcade_torch.tools.runs import Run, find_runs
 
 POINTS = 120  # of a curve of training returns
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
 
-NEEDED = ("game", "obs_size", "num_envs", "measure", "frames", "frames_per_s", "frames_per_s_with_check")
 OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
 LIMIT = "writing the same bytes"
 
@@ -116,6 +114,16 @@ def _history(run: Run, kind: str) -> tuple[Array, Array]:
         raise ValueError(f"{run.path / name} is damaged: {error}") from None
 
 
+class Rate(NamedTuple):
+    """What is read of a row of ``bench envs``."""
+
+    game: str
+    measure: str
+    obs_size: int
+    num_envs: int
+    frames_per_s_with_check: float
+
+
 def throughput(options: Options, progress: Progress | None) -> Made:
     """The figure ``throughput``: our games with and without drawing, and their mean by layer.
 
@@ -126,11 +134,15 @@ def throughput(options: Options, progress: Progress | None) -> Made:
             f"throughput is drawn from one file of `arcade-torch bench envs --out FILE.csv`, got {len(options.runs)}: "
             "give --runs FILE.csv"
         )
-    rows = read_rows(options.runs[0])
-    sizes = sorted({int(row["obs_size"]) for row in rows})
-    here = [row for row in rows if int(row["obs_size"]) == sizes[0]]
+    rows = read_rows(options.runs[0], Rate)
+    if not all(0 < number < 10**12 for row in rows for number in row[2:]):
+        raise ValueError(f"{options.runs[0]}: obs_size, num_envs and rates must be numbers above 0")
+    if not any(row.measure == "step+draw" for row in rows):
+        raise ValueError(f"{options.runs[0]} has no row with the measure step+draw: nothing to draw")
+    sizes = sorted({row.obs_size for row in rows})
+    here = [row for row in rows if row.obs_size == sizes[0]]
     notes = [f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"] * (len(sizes) > 1)
-    games, counts = list(dict.fromkeys(row["game"] for row in here)), sorted({int(row["num_envs"]) for row in here})
+    games, counts = list(dict.fromkeys(row.game for row in here)), sorted({row.num_envs for row in here})
     drawn, bare = ({game: series(here, game, kind) for game in games} for kind in ("step+draw", "step"))
     rest = {name: mean_series(here, games, kind) for name, kind in (OURS | {LIMIT: "fill"}).items()}
     figure, ((left, right),) = style.panels(1, 2, (11.5, 5.4), sharey=True)
@@ -153,11 +165,11 @@ def throughput(options: Options, progress: Progress | None) -> Made:
         columns = 2 if len(axis.lines) < 9 else 3
         axis.legend(fontsize="small", ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     left.set_ylabel("frames/s")
-    first, numbers = here[0], list[dict[str, Any]]()
+    made, numbers = read_csv(options.runs[0])[0], list[dict[str, Any]]()
     note = (
         f"{sizes[0]} px, every frame consumed by a checksum inside the clock; median of repeats, no interval; "
-        f"{first.get('jax_device', 'unknown device')}, {first.get('cores', '?')} cores, "
-        f"arcade-torch {first.get('arcade-torch', '?')} ({first.get('commit') or 'no commit'})"
+        f"{made.get('jax_device', 'unknown device')}, {made.get('cores', '?')} cores, "
+        f"arcade-torch {made.get('arcade_torch', '?')} ({made.get('commit') or 'no commit'})"
     )
     for kind, lines in {"drawing": drawn, "no drawing": bare, "mean": rest}.items():
         for name, line in lines.items():
@@ -165,34 +177,13 @@ def throughput(options: Options, progress: Progress | None) -> Made:
     return Made([Picture("throughput", figure, note, numbers)], notes)
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a benchmark's file."""
-    wanted = "the CSV file that `arcade-torch bench envs --out` wrote"
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder: give {wanted}")
-    rows = read_csv(path)
-    for name in NEEDED:
-        if not rows or name not in rows[0]:
-            raise ValueError(f"{path} has no column {name}: give {wanted}")
-    for row in rows:
-        for name, kind in (("obs_size", int), ("num_envs", int), ("frames_per_s_with_check", float)):
-            try:
-                if not 0 < kind(row[name]) < 10**12:
-                    raise ValueError
-            except ValueError:
-                raise ValueError(f"{path}: {name} is {row[name]!r}, expected a number above 0") from None
-    if not any(row["measure"] == "step+draw" for row in rows):
-        raise ValueError(f"{path} has no row with the measure step+draw: nothing to draw")
-    return rows
-
-
-def series(rows: Sequence[Mapping[str, str]], game: str, measure: str) -> dict[int, float]:
+def series(rows: Sequence[Rate], game: str, measure: str) -> dict[int, float]:
     """Number of envs -> frames consumed per second, of one game."""
-    here = [row for row in rows if (row["game"], row["measure"]) == (game, measure)]
-    return dict(sorted((int(row["num_envs"]), float(row["frames_per_s_with_check"])) for row in here))
+    here = [row for row in rows if (row.game, row.measure) == (game, measure)]
+    return dict(sorted((row.num_envs, row.frames_per_s_with_check) for row in here))
 
 
-def mean_series(rows: Sequence[Mapping[str, str]], games: Sequence[str], measure: str) -> dict[int, float]:
+def mean_series(rows: Sequence[Rate], games: Sequence[str], measure: str) -> dict[int, float]:
     """Mean rate over games, at the numbers of envs that all of them were measured with."""
     every = [series(rows, game, measure) for game in games]
     shared = sorted(set.intersection(*map(set, every)))

@@ -12,6 +12,7 @@ from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.options import at_least
 from arcade_torch.tools.runs import is_baseline, listed
 
 BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
@@ -25,8 +26,7 @@ Masses = Mapping[tuple[str, str, str], Pooled]  # (agent, game, twin) -> mass in
 
 def densities(options: DensityOptions, progress: Progress | None) -> Made:
     """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
-    if not options.bins or min(options.bins) < 1 or options.episodes < 1:
-        raise ValueError(f"--bins and --episodes must be at least 1, got {list(options.bins)} and {options.episodes}")
+    at_least(options, bins=1, episodes=1)
     measured, notes = _measure(options, progress)
     made = Made([], notes)
     frames = np.concatenate([density.lengths for _, density in measured])

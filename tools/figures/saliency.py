@@ -12,6 +12,7 @@ from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, SaliencyOptions
 from arcade_torch.tools.figures.style import TWIN_NAMES, rows_of
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.options import at_least
 from arcade_torch.tools.runs import find_runs
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
@@ -21,8 +22,7 @@ Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]  # title, frames [T, H,
 
 def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
     """The figure ``saliency``: every run that is named, and of studies the first seed of every agent and task."""
-    if options.show < 1 or options.max_steps < 1:
-        raise ValueError(f"--show and --max-steps must be at least 1, got {options.show} and {options.max_steps}")
+    at_least(options, show=1, max_steps=1)
     paths, notes = checkpoints_of(options.runs)
     if len(paths) > 1 and all((path / "eval.json").is_file() for path in paths):
         first = [runs[0].path for runs in find_runs(paths).groups().values()]

@@ -156,8 +156,7 @@ def save(options: Options, picture: Picture) -> list[Path]:
         figure.savefig(buffer, format=ending[1:])
         written.append(write_atomic(base.with_name(base.name + ending), buffer.getvalue()))
     if picture.rows:
-        columns = list(dict.fromkeys(name for row in picture.rows for name in row))
-        written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows, columns))
+        written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows))
     if picture.arrays and endings != NUMBERS:
         written.append(write_npz(base.with_name(base.name + ".npz"), picture.arrays))
     return written

@@ -13,6 +13,7 @@ from typing import Any
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
+from arcade_torch.tools.analysis.gap_bias import game_of
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.session import QUIT, Attempt, Session
@@ -21,19 +22,18 @@ COLUMNS = (
     *("model", "env", "difficulty", "observability", "return", "steps", "end", "attempt"),
     *("seed", "actions", "game", "obs_size", "rules", "options", "player"),
 )
-_ID = re.compile(r"(?P<env>\w+?)(?P<difficulty>Easy|Medium|Hard)?-v\d+")
 _WHOLE = re.compile(r"[0-9]{1,10}")
 
 
 def score_row(attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = "") -> dict[str, Any]:
     """One line of the table."""
-    match = _ID.fullmatch(game.id)
+    env = game_of(game.id)
     return {
         **{name: getattr(attempt, name) for name in ("observability", "steps", "end", "attempt", "seed", "actions")},
         **{name: getattr(game, name) for name in ("obs_size", "rules")},
         "model": "human",
-        "env": match["env"] if match else game.id,
-        "difficulty": (match["difficulty"] or "").lower() if match else "",
+        "env": env,
+        "difficulty": game.id.removeprefix(env).partition("-")[0].lower(),
         "return": None if attempt.end == "abandoned" else attempt.total,
         "game": game.id,
         "options": json.dumps(dict(options), sort_keys=True),
@@ -46,9 +46,7 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
     if not path.exists():
         return []
     rows = read_csv(path)
-    if rows and tuple(rows[0]) != COLUMNS:
-        raise ValueError(f"{path} is no table of human scores: its columns are {', '.join(rows[0])}")
-    if not rows and path.read_text(encoding="utf-8").strip() != ",".join(COLUMNS):
+    if path.read_text(encoding="utf-8").partition("\n")[0].strip() != ",".join(COLUMNS):
         raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
     for row in rows:
         if not _WHOLE.fullmatch(row["seed"]):

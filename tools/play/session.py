@@ -24,23 +24,14 @@ LEGEND = "arrows and space play, P changes the twin, R restarts, Enter goes on a
 
 @dataclass(frozen=True)
 class Attempt:
-    """One episode, enough to play it again.
+    """One episode, enough to play it again."""
 
-    Attributes:
-        seed: the episode is that of env 0 of an ``ArcadeEnv`` with this seed.
-        attempt: 1, or more after restarts of the same episode.
-        observability: ``full``, ``partial``, ``both`` (side by side) or ``mixed`` (changed in mid-episode).
-        actions: one digit a step, 0 to 4.
-        total: undiscounted return so far.
-        end: ``terminated`` by the game, ``truncated`` by the time limit, or ``abandoned`` by the player.
-    """
-
-    seed: int
-    attempt: int
-    observability: str
-    actions: str
-    total: float
-    end: End
+    seed: int  # the episode is that of env 0 of an ``ArcadeEnv`` with this seed
+    attempt: int  # 1, or more after restarts of the same episode
+    observability: str  # ``full``, ``partial``, ``both`` (side by side) or ``mixed`` (changed in mid-episode)
+    actions: str  # one digit a step, 0 to 4
+    total: float  # undiscounted return so far
+    end: End  # ``terminated`` by the game, ``truncated`` by the time limit, or ``abandoned`` by the player
 
     @property
     def steps(self) -> int:

@@ -6,21 +6,21 @@ Its sentences are computed from numbers: they claim a difference only where its 
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-
+from arcade_torch.agents.config import flatten
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import over_seeds
+from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.figures import Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
-from arcade_torch.tools.reports.panels import Finals, Progress, select_cells
-from arcade_torch.tools.runs import METRICS, Runs, flatten, open_run
+from arcade_torch.tools.reports.panels import Finals, select_cells
+from arcade_torch.tools.runs import METRICS, Runs, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
@@ -60,10 +60,7 @@ def report(
     out: str | Path | None = None,
     *,
     metric: str = "eval_final",
-    saliency: bool = True,
-    recall: bool = True,
-    contamination: bool = True,
-    references: bool = True,
+    skip: Sequence[Literal["saliency", "recall", "contamination", "references"]] = (),
     progress: Progress | None = None,
 ) -> Path:
     """Write the page of a study, one HTML file that loads nothing, and return its path.
@@ -75,10 +72,8 @@ def report(
         root: folder of the study.
         out: the page; ``report.html`` in the folder by default.
         metric: score of a run that headline and table rest on, ``eval_final`` or ``train_max_ewm``.
-        saliency: whether to draw saliency strips.
-        recall: whether to measure recall density.
-        contamination: whether to measure state contamination.
-        references: whether to draw the returns of the random policy and the oracles.
+        skip: parts to leave out: saliency strips, recall density, state contamination, returns of random policy and
+            oracles.
         progress: called with (what, done, total).
 
     Raises:
@@ -102,13 +97,13 @@ def report(
             "study": study,
             "made": time.strftime("%Y-%m-%d %H:%M"),
             "rows": rows,
-            **_learning(runs, finals, agents, _players(folder, runs, progress) if references else {}),
+            **_learning(runs, finals, agents, _players(folder, runs, progress) if "references" not in skip else {}),
             **_scores(folder, study, runs, metric),
             **_repeat(folder, study, rows),
             "note": note,
-            "strips": panels.saliency_strips(cells, progress) if saliency else [],
-            "recall": panels.recall_section(cells, agents, progress) if recall else None,
-            "contamination": panels.contamination_section(cells, agents, progress) if contamination else None,
+            "strips": panels.saliency_strips(cells, progress) if "saliency" not in skip else [],
+            "recall": panels.recall_section(cells, agents, progress) if "recall" not in skip else None,
+            "contamination": None if "contamination" in skip else panels.contamination_section(cells, agents, progress),
             "panels": panels,
             "colours": {agent: f"c{place}" for place, agent in enumerate(agents)},
             "palette": list(agent_colours(agents).values()),
@@ -141,7 +136,7 @@ def _learning(runs: Runs, finals: Finals, agents: Sequence[str], players: Player
         sentences.append(learning_sentence(game, twin, by_agent, level))
         cells: dict[str, Any] = dict.fromkeys(agents)
         for agent, values in by_agent.items():
-            mean, low, high = map(float, over_seeds(np.array(values, dtype=np.float64)))
+            mean, low, high = map(float, pooled(values)[1:])
             row = {"agent": agent, "mean": mean, "low": low, "high": high, "way": way(mean, level)}
             rows.append(task | row | {"seeds": "  ".join(f"{value:.3f}" for value in values)})
             cells[agent] = {"value": mean, "heat": round(100 * min(1.0, max(0.0, normalise(game, mean))))}
@@ -165,8 +160,7 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
     for place, name in zip(("table", "second"), sorted(METRICS, key=lambda name: name != metric), strict=True):
         try:
             table = found[place] = gap_and_bias(runs.scores(name), metric=name, baseline=baseline)
-            rows = table.table()
-            write_csv(folder.analysis / f"gap_bias_{name}.csv", rows, list(rows[0]))
+            write_csv(folder.analysis / f"gap_bias_{name}.csv", table.table())
         except ValueError as error:
             found["trouble"] = found["trouble"] or str(error)
     if (table := found["table"]) is not None:

@@ -20,7 +20,7 @@ from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.analysis.recall_density import RecallDensity
 from arcade_torch.tools.analysis.recall_density import recall_density as density_of
-from arcade_torch.tools.figures import contamination, gap_bias, logs, recall_density, saliency, style
+from arcade_torch.tools.figures import Progress, contamination, gap_bias, logs, recall_density, saliency, style
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.runs import Runs, is_baseline
 
@@ -36,7 +36,6 @@ MOST_GAMES = MOST_SEEDS = 3
 
 Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]  # (game, twin) -> agent -> final returns of its seeds
 Levels = Mapping[str, Mapping[str, float]]  # game -> player -> mean return
-Progress = Callable[[str, int, int], None]
 Cells = Mapping[tuple[str, str, str], Sequence[Path]]  # (agent, game, twin) -> folders of its finished runs
 
 

@@ -194,14 +194,10 @@ class ClusterLostError(RuntimeError):
 class RayOptions:
     """How a Ray cluster is used."""
 
-    address: str = ""
-    """Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this machine."""
-    cpus_per_run: float = 1.0
-    """Ray: cores that a run keeps busy."""
-    gpus_per_run: float = 0.0
-    """Ray: GPUs, or the part of one, that a run keeps busy."""
-    retries: int = 2
-    """Ray: further attempts at a run whose process or machine was lost."""
+    address: str = ""  # Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this machine.
+    cpus_per_run: float = 1.0  # Ray: cores that a run keeps busy.
+    gpus_per_run: float = 0.0  # Ray: GPUs, or the part of one, that a run keeps busy.
+    retries: int = 2  # Ray: further attempts at a run whose process or machine was lost.
 
 
 @dataclass
@@ -218,10 +214,8 @@ class Ray(RayOptions):
         MissingPackage: ray is not installed.
     """
 
-    workers: int = 0
-    """Runs at once; 0 for as many as the cluster has room for."""
-    module: Any = None
-    """The ray package, imported if it is not given."""
+    workers: int = 0  # Runs at once; 0 for as many as the cluster has room for.
+    module: Any = None  # The ray package, imported if it is not given.
 
     def __post_init__(self) -> None:
         if self.cpus_per_run <= 0:

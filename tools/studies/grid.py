@@ -6,27 +6,34 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-from arcade_torch.tools.runs import flatten
-
-if TYPE_CHECKING:
-    from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
 """``seeds = N`` beyond this is a slip."""
-_NAME = re.compile(r"[\w.\-]{1,80}")
-_FOLDER = (str, _NAME, "names of folders, of letters, digits, dots and dashes")
-_AXES: dict[str, tuple[type, re.Pattern[str], str]] = {
-    "games": _FOLDER,
-    "observability": (str, re.compile("full|partial"), "full, partial or both"),
-    "memories": _FOLDER,
-    "algorithms": _FOLDER,
-    "seeds": (int, re.compile(r"\d{1,10}"), "0 or more and below 2**32"),
-    "sizes": (str, re.compile(r"[1-9]\d{0,8}x[1-9]\d{0,8}"), "layers x width, such as '2x512'"),
+_FOLDERS = "names of folders, of letters, digits, dots and dashes"
+_FOLDER = r"(?!\.*$)[\w.\-]{1,80}"
+
+
+def _text(allowed: str, form: str) -> Any:
+    return Annotated[str, Range(allowed, lambda text: re.fullmatch(form, text) is not None)]
+
+
+_AXES: dict[str, Any] = {
+    **dict.fromkeys(("games", "memories", "algorithms"), _text(_FOLDERS, _FOLDER)),
+    "observability": _text("full, partial or both", "full|partial"),
+    "seeds": Annotated[int, Range("0 or more and below 2**32", lambda seed: 0 <= seed < 2**32)],
+    "sizes": _text("layers x width, such as '2x512'", r"[1-9]\d{0,8}x[1-9]\d{0,8}"),
 }
-"""Axis -> type, form and description of its values."""
+"""Axis -> what its values may be."""
+_OTHERS = {
+    **{"name": _text("made of letters, digits, dots and dashes", _FOLDER), "settings": Options},
+    **dict.fromkeys(("preset", "baseline", "question"), str),
+}
+"""The same of what is no axis."""
+_FRAMES = Annotated[int, Range("from 1 to 10**15", lambda frames: 1 <= frames <= 10**15)]
 _GRID = {"name", "env", "observability", "memory", "algorithm", "seed", "total_frames", "out"}
 
 
@@ -57,55 +64,34 @@ class RunSpec:
 class Study:
     """A grid of trainings: games x observability x memories x algorithms x seeds.
 
-    Attributes:
-        name: of the study; letters, digits, dots, dashes.
-        games: environment ids.
-        memories: memory models; the memory-free control is one of them.
-        seeds: one run a seed.
-        observability: the twins, ``full`` and/or ``partial``.
-        algorithms: learners.
-        preset: settings that all runs start from.
-        total_frames: environment steps of each run; None keeps the preset's.
-        settings: further fields of ``TrainConfig``, for example ``{"pqn": {"gamma": 0.9}}``.
-        baseline: the memory-free agent, against which Bias is measured.
-        sizes: of the memory block, ``LAYERSxWIDTH`` such as ``2x512``; the memory-free agent keeps the preset's.
-        question: what the study asks, a sentence for its report.
-
     Raises:
         ValueError: an axis is empty or repeats itself, or a value is not allowed.
-        TypeError: a value is of the wrong type.
     """
 
-    name: str
-    games: tuple[str, ...]
-    memories: tuple[str, ...]
-    seeds: tuple[int, ...]
-    observability: tuple[str, ...] = ("full", "partial")
-    algorithms: tuple[str, ...] = ("pqn",)
-    preset: str = "paper"
-    total_frames: int | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    baseline: str = "mlp"
-    sizes: tuple[str, ...] = ()
-    question: str = ""
+    name: str  # letters, digits, dots, dashes
+    games: tuple[str, ...]  # environment ids
+    memories: tuple[str, ...]  # memory models; the memory-free control is one of them
+    seeds: tuple[int, ...]  # one run a seed
+    observability: tuple[str, ...] = ("full", "partial")  # the twins
+    algorithms: tuple[str, ...] = ("pqn",)  # learners
+    preset: str = "paper"  # settings that all runs start from
+    total_frames: int | None = None  # environment steps of each run; None keeps the preset's
+    settings: Mapping[str, Any] = field(default_factory=dict)  # fields of ``TrainConfig``: ``{"pqn": {"gamma": 0.9}}``
+    baseline: str = "mlp"  # the memory-free agent, against which Bias is measured
+    sizes: tuple[str, ...] = ()  # of the memory block, ``2x512``; the memory-free agent keeps the preset's
+    question: str = ""  # what the study asks, a sentence for its report
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name) or set(self.name) == {"."}:
-            raise ValueError(f"a study's name is made of letters, digits, dots and dashes, got {self.name!r}")
+        for name, kind in _OTHERS.items():
+            object.__setattr__(self, name, coerce(name, getattr(self, name), kind))
         for axis in _AXES:
             object.__setattr__(self, axis, _axis(axis, getattr(self, axis)))
-        for name in ("preset", "baseline", "question"):
-            if not isinstance(getattr(self, name), str):
-                raise TypeError(f"{name} must be text, got {getattr(self, name)!r}")
-        if not isinstance(self.settings, Mapping):
-            raise TypeError(f"settings must be a table of options, got {self.settings!r}")
         if wrong := [name for name in self.settings if name in _GRID]:
             raise ValueError(f"settings may not hold {wrong[0]!r}: the grid decides it")
         for name in ("env_options", "network_options"):
-            if not isinstance(value := self.settings.get(name, {}), Mapping):
-                raise TypeError(f"settings: {name} must be a table of options, got {value!r}")
-        if self.total_frames is not None and not (type(self.total_frames) is int and 1 <= self.total_frames <= 10**15):
-            raise ValueError(f"total_frames must be a whole number of at least 1, got {self.total_frames!r}")
+            coerce(f"settings: {name}", self.settings.get(name, {}), Options)
+        if self.total_frames is not None:
+            object.__setattr__(self, "total_frames", coerce("total_frames", self.total_frames, _FRAMES))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
@@ -147,7 +133,7 @@ class Study:
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
         return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
 
-    def config(self, run: RunSpec) -> "TrainConfig":
+    def config(self, run: RunSpec) -> TrainConfig:
         """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
         from arcade_torch.agents.presets import preset
 
@@ -177,10 +163,8 @@ def study_preset(name: str) -> Study:
 
 def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
     """The study behind ``arcade-torch demo``: games, both twins, one memory model and the memory-free control."""
-    if seeds < 1:
-        raise ValueError(f"seeds must be at least 1, got {seeds}")
     demo = study_preset("demo")
-    what = replace(demo, games=games, seeds=tuple(range(seeds)), total_frames=frames)
+    what = Study.from_dict(demo.to_dict() | {"games": games, "seeds": seeds, "total_frames": frames})
     question = f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and POMDPs (partial)?"
     return what if games == demo.games else replace(what, question=question)
 
@@ -194,12 +178,7 @@ def _axis(axis: str, value: Any) -> tuple[Any, ...]:
     values = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, Sequence) else None
     if values is None or not (values or axis == "sizes"):
         raise ValueError(f"{axis} is empty: a study needs at least one" if values == () else f"{axis} must be a list")
-    kind, form, allowed = _AXES[axis]
-    for value in values:
-        if type(value) is not kind:
-            raise TypeError(f"{axis} must hold {'whole numbers' if kind is int else 'names'}, got {value!r}")
-        if not form.fullmatch(str(value)) or (isinstance(value, int) and value >= 2**32):
-            raise ValueError(f"{axis} must be {allowed}, got {value!r}")
+    values = tuple(coerce(axis, value, _AXES[axis]) for value in values)
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
     return values

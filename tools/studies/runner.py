@@ -8,8 +8,9 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
@@ -17,9 +18,6 @@ from arcade_torch.tools.runs import Run
 from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
-
-if TYPE_CHECKING:
-    from arcade_torch.agents.config import TrainConfig
 
 LEAST_FREE_BYTES = 1 << 20
 """A run that fails with less space than this on the disk failed for want of space."""
@@ -34,10 +32,8 @@ class StudyResult:
     """Where a study stands after an invocation."""
 
     root: Path
-    rows: list[dict[str, Any]]
-    """of ``results.csv``"""
-    errors: dict[str, str]
-    """run name -> one line with the reason and the log, for runs that failed in this invocation"""
+    rows: list[dict[str, Any]]  # of ``results.csv``
+    errors: dict[str, str]  # run name -> one line with the reason and the log, for runs that failed in this invocation
 
     @property
     def finished(self) -> int:
@@ -110,7 +106,7 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes, ray")
 
 
-def planned(what: Study, shard: str = "") -> "dict[RunSpec, TrainConfig]":
+def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and all checked."""
     from arcade_torch.envs_jax import make
     from arcade_torch.models import make_memory, memory_names

@@ -151,7 +151,7 @@ def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path: Path, capsys: 
         (["figure", "returns", "--paper", "--confidence", "95"], "between 0 and 1"),
         (["analyze", "recall-density"], "name at least one run folder"),
         (["analyze", "recall-density", "empty"], "holds no run"),
-        (["analyze", "recall-density", "empty", "--bins", "0"], "--bins and --episodes must be at least 1"),
+        (["analyze", "recall-density", "empty", "--bins", "0"], "--bins must be at least 1"),
         (["analyze", "contamination"], "name at least one run folder"),
         (["analyze", "contamination", "slow"], "holds no checkpoint"),
     ],

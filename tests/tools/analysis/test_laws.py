@@ -13,7 +13,7 @@ from torch import Tensor
 
 from arcade_torch.models import memory_names
 from arcade_torch.tools import Policy, contamination, recall_density, saliency, shuffled_beginning
-from arcade_torch.tools.analysis.bootstrap import over_seeds, seed_coverage
+from arcade_torch.tools.analysis.bootstrap import pooled, seed_coverage
 from arcade_torch.tools.analysis.paper import paper_table
 from arcade_torch.tools.analysis.recall_density import density_of_windows
 from arcade_torch.tools.analysis.windows import greedy_windows
@@ -262,11 +262,11 @@ def test_law_11_the_quoted_differences_come_out() -> None:
 
 
 def test_law_12_identical_seeds_have_no_width_and_the_measured_coverage_stands_on_the_figure() -> None:
-    mean, low, high = over_seeds(np.full((5, 2, 3), 0.25))
+    _, mean, low, high = pooled(np.full((5, 2, 3), 0.25))
     assert (mean == 0.25).all() and (low == 0.25).all() and (high == 0.25).all()
     assert seed_coverage(5) == pytest.approx(0.84, abs=0.03)  # a nominal 95 % interval
     assert f"measured coverage with 5 seeds {100 * seed_coverage(5):.0f} %" in seeds_note([5, 5], 0.95)
-    assert np.isnan(seed_coverage(1)) and np.isnan(over_seeds(np.ones((1, 2)))[1]).all()
+    assert np.isnan(seed_coverage(1)) and np.isnan(pooled(np.ones((1, 2))).low).all()
     assert "no interval" in seeds_note([1], 0.95)
 
 
