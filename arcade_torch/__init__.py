@@ -3,10 +3,10 @@
 Public names are resolved on first use: importing the package costs little, ``arcade_torch.envs_jax`` loads no torch.
 """
 
-import sys
 from importlib import import_module
-from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING, Any
+
+import arcade_torch.gym  # noqa: F401  (puts the games into Gymnasium's registry)
 
 __version__ = "0.2.0"
 
@@ -38,22 +38,3 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
 def __dir__() -> list[str]:
     """Public names, for completion."""
     return sorted(__all__)
-
-
-class _GymnasiumFinder:
-    """Puts the games into Gymnasium's registry when somebody imports it; to import it here would triple the time."""
-
-    @staticmethod
-    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
-        """What is found without this, for Gymnasium with one more thing to do behind its import."""
-        spec: Any = PathFinder.find_spec(name, path, target) if name == "gymnasium" else None
-        if spec is not None:
-            run = spec.loader.exec_module
-            spec.loader.exec_module = lambda module: (run(module), import_module("arcade_torch.gym"))
-        return spec
-
-
-if "gymnasium" in sys.modules:
-    import_module("arcade_torch.gym")
-else:
-    sys.meta_path.insert(0, _GymnasiumFinder)

@@ -61,11 +61,6 @@ def test_the_games_are_registered_whoever_is_imported_first(imports: str) -> Non
     assert output_of(f"{code}\nprint(n, sorted({{'jax', 'torch'}} & set(sys.modules)))") == "30 []"
 
 
-def test_the_package_alone_loads_no_gymnasium_which_takes_longer_than_all_else() -> None:
-    loaded = "sorted({'gymnasium', 'jax', 'numpy', 'torch'} & set(sys.modules))"
-    assert output_of(f"import arcade_torch, sys; print({loaded})") == "[]"
-
-
 def test_the_registered_ids_are_those_of_the_games() -> None:
     theirs = {id.removeprefix("arcade_torch/") for id in gymnasium.registry if id.startswith("arcade_torch/")}
     assert theirs - set(probe_ids()) == set(arcade_torch.registered_ids())
