@@ -192,7 +192,7 @@ class PPOConfig(LearnerConfig):
     entropy_coeff: PositiveOrZero = 0.01
     """Weight of the entropy bonus at the start."""
     entropy_end: Fraction = 1.0
-    """Share of that weight which is left at the end of the run, reached linearly; 1 keeps it."""
+    """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
 

@@ -13,7 +13,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.learner import Learner, Training, linear
+from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.sequences import (
     NetworkInputs,
     as_steps,
@@ -281,7 +281,7 @@ class PPO(Learner):
         data = self.loss.value_estimator(batch)
         for _ in range(config.epochs):
             for minibatch in self.minibatches(data):
-                left = linear(1.0, config.entropy_end, frames, self.training.total_frames)
+                left = config.entropy_end ** (frames / self.training.total_frames)
                 self.loss.entropy_coeff.fill_(config.entropy_coeff * left)
                 self.gradient_step(minibatch, frames)
                 frames += self.frames_per_step

@@ -184,7 +184,7 @@ def test_the_entropy_bonus_fades_over_the_run():
     batch["action_log_prob"] = torch.full((3, 6), -1.6)
     learner.update(batch, 0)
     learner.update(batch.exclude(*ESTIMATES), 18)
-    assert seen == pytest.approx([0.4 - 0.2 * k / 12 for k in range(12)], abs=1e-4)
+    assert seen == pytest.approx([0.4 * 0.5 ** (k / 12) for k in range(12)], abs=1e-4)
 
 
 def test_it_is_a_torchrl_loss_with_its_keys():
