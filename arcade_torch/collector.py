@@ -121,8 +121,6 @@ class ArcadeCollector(BaseCollector):
         self._traj_ids = torch.arange(self._num_envs, device=self.env.device)
         self._next_traj_id = self._num_envs
 
-    # -- collecting -------------------------------------------------------------------------------------------------
-
     @property
     def frames(self) -> int:
         """Env steps collected so far, without those that filled the first overlap."""
@@ -208,16 +206,10 @@ class ArcadeCollector(BaseCollector):
             self._window_starts.clear()
         assert self._obs is not None
         if self._buffer is None:
-            self._buffer = RolloutBuffer(
-                self._num_envs,
-                self._overlap,
-                self._steps,
-                self._obs["pixels"].shape[1:],
-                self.env.device,
-                self._final_frames,
-                min(game.max_steps for game in self.env.games),
-                self.env.task if self.env.task_in_td else None,
-            )
+            sizes = self._num_envs, self._overlap, self._steps, self._obs["pixels"].shape[1:]
+            shortest = min(game.max_steps for game in self.env.games)
+            task = self.env.task if self.env.task_in_td else None
+            self._buffer = RolloutBuffer(*sizes, self.env.device, self._final_frames, shortest, task)
         return self._buffer, self._obs
 
     def _observe(self, root: TensorDictBase) -> None:
@@ -232,7 +224,7 @@ class ArcadeCollector(BaseCollector):
     def _advance(
         self, buffer: RolloutBuffer, obs: dict[str, torch.Tensor], step: int, random: bool
     ) -> dict[str, torch.Tensor]:
-        """Act, step and store; the frame is copied to the storage while JAX computes the step."""
+        """Act, step and store; what is not drawn into the storage is copied while JAX computes the step."""
         if self._acted % self._steps == 0:
             self._window_starts.append(self._runner.begin_anew(self._state, obs["is_init"]).clone())
         action, extras, self._state = self._runner(obs, self._state)
@@ -240,7 +232,8 @@ class ArcadeCollector(BaseCollector):
             num_actions, device = self.env.game.num_actions, self.env.device
             action = torch.randint(num_actions, (self._num_envs,), generator=self._generator, device=device)
         store_action = functools.partial(buffer.write_action, step, obs["pixels"], action)
-        raw = self.env.step_raw(action, while_computing=store_action)
+        into = buffer.place(step + 1) if self._compress is None else None
+        raw = self.env.step_raw(action, while_computing=store_action, into=into)
         buffer.write_outcome(step, raw.numbers)
         buffer.write_extras(step, extras)
         if self._final_frames != "none" and self._may_have_ended(raw.numbers):
@@ -268,8 +261,6 @@ class ArcadeCollector(BaseCollector):
         self._traj_ids = ids[-1].clone()
         self._next_traj_id += int(done.sum())
         return ids[:-1].T
-
-    # -- TorchRL's collector protocol -------------------------------------------------------------------------------
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed env and random actions, and start over with new episodes.

@@ -24,7 +24,6 @@ NUM_NUMBERS = 5
 
 # One compiled shape draws final observations: an eighth of the batch, at least 4 frames, of at most 8 different steps.
 _SHARE, _MIN_FRAMES, _MAX_STEPS = 8, 4, 8
-_Ids = str | tuple[str, ...]
 Spare = jax.Array | None
 
 
@@ -48,12 +47,15 @@ class CompiledGame:
         self.step = jax.jit(self._step, donate_argnums=2, keep_unused=True)
         self.reset_or_step = jax.jit(self._reset_or_step)
         self.step_only = jax.jit(self._step_only, donate_argnums=2, keep_unused=True)
+        self.draw = jax.jit(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
         draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
         self.draw_rows = tuple(jax.jit(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
 
-    def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
-        """Step, begin anew where an episode ended, draw once, and pack the numbers."""
+    def _step(self, batch: Batch, action: jax.Array, spare: Spare = None, at: Any = None) -> Step:
+        """Step, begin anew where an episode ended, draw once (into ``spare[:, at]``, if given), and pack."""
         root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
+        if at is not None:
+            pixels = jax.lax.dynamic_update_index_in_dim(spare, pixels, at, 1)
         return Step(root, stepped.state, pixels, _pack(stepped, outcome))
 
     def _step_only(self, batch: Batch, action: jax.Array, spare: Spare = None) -> tuple[Batch, jax.Array, jax.Array]:
@@ -96,7 +98,7 @@ class Reused:
 
     def take(self, make: Callable[[], Any]) -> Any:
         """A block that nobody can see, or else a new one. It is to be handed out."""
-        for place, (block, seen) in enumerate(self._blocks):
+        for place, (block, seen) in reversed(list(enumerate(self._blocks))):  # a cache still has the latest
             if seen() is None:
                 del self._blocks[place]
                 return block
@@ -127,6 +129,24 @@ class FrameMemory:
     def show(self, frames: jax.Array) -> jax.Array | npt.NDArray[np.uint8]:
         """What may be handed out of the frames that were drawn: a read-only view, on a GPU the frames themselves."""
         return self._reused.hand_out(frames, np.asarray(frames)) if self._reuses else frames
+
+
+class Canvas:
+    """Memory of JAX on the CPU that steps draw into part by part, while arrays of numpy lie over it.
+
+    JAX would not draw where it knows that somebody looks, so they are laid over the bare address. They keep the canvas
+    alive, and the canvas the memory. Who draws answers for the parts that were shown.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.memory = jnp.empty(shape, jnp.uint8, device=jax.devices("cpu")[0]).block_until_ready()
+        self.address = self.memory.unsafe_buffer_pointer()
+        self.__array_interface__ = {"shape": shape, "typestr": "|u1", "data": (self.address, False), "version": 3}
+
+    def wait(self) -> None:
+        """Wait until ``memory``, which a function gave back that it was donated to, has been drawn."""
+        if self.memory.block_until_ready().unsafe_buffer_pointer() != self.address:
+            raise RuntimeError("JAX did not draw where it was told to: report this, with the version of JAX")
 
 
 class FinalObservations:
@@ -207,13 +227,13 @@ def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: d
         TypeError: An option that one of the games does not have, or ids that are neither a string nor a list.
     """
     ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))  # what a bare name means may change
-    key = tuple((name, type(value), value) for name, value in sorted(options.items()))  # 1 == True, but means another
+    options = dict(sorted(options.items()))
     try:
-        return _cached(ids, obs_size, rules, key)
+        return _compile(ids, obs_size, rules, **options)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
-        return _compile(ids, obs_size, rules, options)
+        return _compile.__wrapped__(ids, obs_size, rules, **options)
 
 
 def _checked(ids: Any) -> Sequence[str]:
@@ -227,12 +247,8 @@ def _checked(ids: Any) -> Sequence[str]:
     return [resolve_id(id) for id in ids]
 
 
-@lru_cache(maxsize=64)
-def _cached(ids: _Ids, obs_size: int, rules: str, options: tuple[tuple[str, type, Any], ...]) -> CompiledGame:
-    return _compile(ids, obs_size, rules, {name: value for name, _, value in options})
-
-
-def _compile(ids: _Ids, obs_size: int, rules: str, options: dict[str, Any]) -> CompiledGame:
+@lru_cache(maxsize=64, typed=True)  # 1 == True, but means another
+def _compile(ids: str | tuple[str, ...], obs_size: int, rules: str, /, **options: Any) -> CompiledGame:
     if isinstance(ids, str):
         return CompiledGame(make_game(ids, obs_size=obs_size, rules=rules, **options))
     shares = Counter(ids)

@@ -33,7 +33,7 @@ share_gpu()
 
 import jax  # noqa: E402  (after share_gpu)
 
-from arcade_torch.compiled import Reused  # noqa: E402
+from arcade_torch.compiled import Canvas, Reused  # noqa: E402
 from arcade_torch.envs_jax.validation import format_value  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
@@ -167,14 +167,14 @@ class TensorMemory:
     def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
         self._shape, self._device = shape, device
         self._reused = Reused(most=2)  # what is in use, and the one before it
+        self.canvas: Canvas | None = None  # under the last tensor, on the CPU: steps may draw into it
 
     def take(self) -> torch.Tensor:
         """uint8 of the shape, with any content."""
-        new = functools.partial(torch.empty, self._shape, dtype=torch.uint8, device=self._device)
-        if not is_host(self._device):
-            return new()  # torch's allocator for GPUs keeps memory by itself
-        block = self._reused.take(new)
-        return torch.from_numpy(self._reused.hand_out(block, block.numpy()))
+        if not is_host(self._device):  # torch's allocator for GPUs keeps memory by itself
+            return torch.empty(self._shape, dtype=torch.uint8, device=self._device)
+        self.canvas = self._reused.take(functools.partial(Canvas, self._shape))
+        return torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
 
 
 def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.Device]:

@@ -16,12 +16,13 @@ from arcade_torch.compiled import (
     REWARD,
     STEP_COUNT,
     TERMINATED,
+    Canvas,
     CompiledGame,
     FinalObservations,
     FrameMemory,
     check_process,
 )
-from arcade_torch.dlpack import TensorMemory, int32_argument, is_host, pick_devices, to_torch, wait_for_torch, write
+from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, wait_for_torch
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
@@ -30,6 +31,8 @@ from arcade_torch.specs import make_specs
 
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
+Place = tuple[Canvas, int, torch.Tensor]
+_UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
 
 
 class RawStep(NamedTuple):
@@ -109,9 +112,8 @@ class ArcadeEnv(EnvBase):
         wait_for_torch(torch_device, jax_device)
         first = self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device))
         self._live = SimpleNamespace(batch=first, generation=0, view=0)  # assignment to an nn.Module is slow
-        self._finals = self.final_observations(1)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
-        self._memory, self._copies = FrameMemory(shape, jax_device), TensorMemory(shape, torch_device)
+        self._memory, self._ends = FrameMemory(shape, jax_device), FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
         made = make_specs(num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device)
@@ -141,8 +143,6 @@ class ArcadeEnv(EnvBase):
     def num_envs(self) -> int:
         """Number of envs in the batch."""
         return int(self.batch_size[0])
-
-    # -- observability and state ------------------------------------------------------------------------------------
 
     @property
     def observability(self) -> torch.Tensor:
@@ -210,14 +210,15 @@ class ArcadeEnv(EnvBase):
         """Load the env's part of a ``state_dict``."""
         self._go_on(self._snapshots.load(TensorDict(state, batch_size=self.batch_size)))
 
-    # -- the fast path ----------------------------------------------------------------------------------------------
-
-    def step_raw(self, action: torch.Tensor, while_computing: Callable[[], object] | None = None) -> RawStep:
+    def step_raw(
+        self, action: torch.Tensor, while_computing: Callable[[], object] | None = None, into: Place | None = None
+    ) -> RawStep:
         """Step, begin anew where an episode ended, and draw once: one compiled call and no tensordict.
 
         Args:
             action: Integers [N] in 0..4 (one-hot [N, 5] with ``categorical_actions=False``). Not read after the return.
             while_computing: Called while JAX computes, for work that needs no result of this step.
+            into: Where to draw: a canvas, the index on its second axis, and the frames there; None: memory of the env.
 
         Returns:
             The step; export from it what is needed.
@@ -227,11 +228,16 @@ class ArcadeEnv(EnvBase):
             ValueError: Actions of a wrong shape or out of range.
         """
         argument = int32_argument(self._check_action(action), self._jax_device)
-        step = self._compiled.step(self._live.batch, argument, self._memory.spare())
+        memory, at = (into[0].memory, into[1]) if into else (self._memory.spare(), None)
+        step = self._compiled.step(self._live.batch, argument, memory, at)
+        if into:
+            into[0].memory = step.pixels  # at once: were the step interrupted, what lies over it would hang in the air
         if while_computing is not None:
             while_computing()
-        frames = to_torch(self._memory.show(step.pixels), self.device)  # on the CPU it waits; argument lives until here
-        self._go_on(step.root)
+        if into:
+            into[0].wait()
+        frames = into[2] if into else to_torch(self._memory.show(step.pixels), self.device)
+        self._go_on(step.root)  # on the CPU the step is done; argument lives until here
         return RawStep(frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial))
 
     def root_numbers(self, raw: RawStep, keys: Collection[str]) -> dict[str, torch.Tensor]:
@@ -274,8 +280,6 @@ class ArcadeEnv(EnvBase):
             lowest, highest = int(action.min()), int(action.max())
             raise ValueError(f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}")
         return action
-
-    # -- TorchRL's methods ------------------------------------------------------------------------------------------
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
         plain = isinstance(tensordict, TensorDictBase) and tensordict.batch_size == self.batch_size
@@ -337,13 +341,11 @@ class ArcadeEnv(EnvBase):
             validation.tensor(tensordict, "action")
         raw = self.step_raw(action)
         last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
-        frames, done = raw.pixels, (raw.numbers[:, TERMINATED:] > 0).any(1).cpu().numpy()
-        if done.any():
-            self._finals.add(0, *raw.final)
-            frames = self._copies.take().copy_(raw.pixels)
-            for rows, _, final in self._finals.draw(done[:, None]):
-                write(frames, rows, to_torch(final, self.device)[: len(rows)])
-        following = self._next(frames, last_action, raw.numbers)
+        following = self._next(raw.pixels, last_action, raw.numbers)
+        if following["done"].any():  # all envs are drawn again, which is no dearer than to copy their frames
+            ended = self._live.batch._replace(state=raw.final[0])
+            drawn = self._ends.show(self._compiled.draw(ended, self._ends.spare()))
+            following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
         preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
         if preset is not None:
             following.update(preset.exclude(*following.keys(True, True)))
@@ -352,7 +354,7 @@ class ArcadeEnv(EnvBase):
         counts = self.root_numbers(raw, ("is_init", "step_count", "episode_reward"))
         ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
         for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
-            root.set(key, value)  # not update(), which would write into the nested state that root and next share
+            root._set_str(key, value, **_UNCHECKED)  # set() takes eight times as long
         return tensordict, root
 
     def _set_seed(self, seed: int | None) -> None:
@@ -362,8 +364,6 @@ class ArcadeEnv(EnvBase):
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
         self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]))
-
-    # -- exports ----------------------------------------------------------------------------------------------------
 
     def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""
@@ -383,7 +383,7 @@ class ArcadeEnv(EnvBase):
         counts = {"is_init": is_init, "step_count": step_count, "episode_reward": episode_reward}
         following = self._entries(frames, action, counts, numbers[:, TERMINATED:] > 0)
         following["reward"] = numbers[:, REWARD, None]
-        return TensorDict(following, batch_size=self.batch_size, device=self.device)
+        return TensorDict._new_unsafe(following, batch_size=self.batch_size, device=self.device)
 
     def _entries(
         self, frames: torch.Tensor, action: torch.Tensor, counts: dict[str, torch.Tensor], ends: torch.Tensor

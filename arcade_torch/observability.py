@@ -28,10 +28,6 @@ def partial_flags(
     Raises:
         ValueError: Both are given, or another word, type or shape.
         TypeError: ``partial_obs`` is no bool.
-
-    Example:
-        >>> partial_flags("partial", 2)
-        array([ True,  True])
     """
     if partial_obs is not None:
         if observability is not None:

@@ -1,14 +1,16 @@
 """The storage of a collector: one window of L = overlap + T steps, every frame written once."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+import jax
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict
 
 from arcade_torch.compiled import EPISODE_REWARD, NUM_NUMBERS, REWARD, STEP_COUNT, TERMINATED, TRUNCATED
 from arcade_torch.dlpack import TensorMemory, upload, write
+from arcade_torch.env import Place
 from arcade_torch.policies import path_of
 
 FinalFrames = Literal["all", "truncated", "none"]
@@ -74,14 +76,13 @@ class RolloutBuffer:
             for key, (shape, dtype) in self._extra_shapes.items()
         }
         self._dense: torch.Tensor | None = None  # the observation after every step, made when it is asked for
-        self._final = self._new_final.take().zero_()
+        self._final = self._new_final.take()
+        self._final[:, :-1].zero_()  # the last place is written in every window
 
     @property
     def done(self) -> torch.Tensor:
         """bool [N, L], where an episode ended."""
         return self._numbers[..., TERMINATED:].any(-1)  # no list of columns: it is copied to a GPU and waited for
-
-    # -- writing ----------------------------------------------------------------------------------------------------
 
     def begin(self, carry: bool, reuse: bool, dense: bool) -> int:
         """Make ready for new steps, and say which is the first.
@@ -116,9 +117,19 @@ class RolloutBuffer:
             self._final[row, to] = final[row, source]
         return self._first
 
+    def place(self, step: int) -> Place | None:
+        """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends before it."""
+        canvas, config = self._new_pixels.canvas, cast(Any, jax.config)
+        if canvas is None or step == self.length or config.jax_disable_jit or config.jax_debug_nans:
+            return None
+        moved = self.pixels.data_ptr() != canvas.address  # by share_memory_
+        return None if moved else (canvas, step, self.pixels[:, step])
+
     def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
-        """Write what was seen and done. This copies the frames, while a cache still holds them."""
-        self.pixels[:, step].copy_(frames)
+        """Write what was seen and done. This copies the frames, unless they were drawn where they belong."""
+        target = self.pixels[:, step]
+        if frames.data_ptr() != target.data_ptr():
+            target.copy_(frames)
         if self._dense is not None and self._fills_dense and step > self._first:
             self._dense[:, step - 1].copy_(frames)
         write(self._action, np.s_[:, step], action)
@@ -187,8 +198,6 @@ class RolloutBuffer:
         earlier = (np.cumsum(wanted, 1) - wanted)[rows, steps]
         return np.where(steps == self.length - 1, self._places - 1, earlier)
 
-    # -- reading ----------------------------------------------------------------------------------------------------
-
     def sequences(self, initial_state: TensorDict) -> TensorDict:
         """Everything as TensorDict [N] of entries [N, L, ...]; frames and extras are views of the storage."""
         out = self._entries(0, [self.num_envs])
@@ -246,8 +255,6 @@ class RolloutBuffer:
         for key, value in entries.items():
             out[key] = value
         return out
-
-    # -- resuming ---------------------------------------------------------------------------------------------------
 
     def _buffers(self) -> dict[NestedKey, torch.Tensor]:
         """All buffers with axes [N, L, ...]."""

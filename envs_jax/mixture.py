@@ -100,8 +100,6 @@ class MixedGames(Steps):
         self.wide = jax.jit(self._wide)
         self.narrow = jax.jit(self._narrow)
 
-    # -- who plays what ---------------------------------------------------------------------------------------------
-
     def rows(self, num_envs: int) -> tuple[slice, ...]:
         """The envs of each game: contiguous, as the weights say, what is left over going to the earlier games.
 
@@ -133,8 +131,6 @@ class MixedGames(Steps):
         """The states of each game's own envs, in the order of the games."""
         return tuple(state[game.id] for game in self.game.games)
 
-    # -- what Steps asks for -----------------------------------------------------------------------------------------
-
     def _init(self, keys: Array, partial: Array) -> Batch:
         pairs = zip(self.groups, self.rows(len(keys)), strict=True)
         return self._join([group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs])
@@ -151,8 +147,6 @@ class MixedGames(Steps):
     def _render(self, batch: Batch) -> Array:
         parts = self._split(batch, batch.partial)
         return jnp.concatenate([group.render(part) for group, (part, _) in zip(self.groups, parts, strict=True)])
-
-    # -- one shape for all envs -------------------------------------------------------------------------------------
 
     def _wide(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...]: states of a game are zero in the envs that play another."""

@@ -123,7 +123,7 @@ def test_frames_and_rewards_are_the_memory_that_jax_wrote(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
 def test_a_second_env_compiles_nothing_also_at_ends(game: CompiledGame) -> None:
     def compiled() -> list[int]:
-        return [function._cache_size() for function in (game.step, *game.draw_rows)]
+        return [function._cache_size() for function in (game.step, game.draw)]
 
     stub_env(game).rollout(20, scripted, break_when_any_done=False)
     before = compiled()

@@ -87,7 +87,7 @@ def places_of(monkeypatch: pytest.MonkeyPatch, memory: FrameMemory) -> list[int]
 def test_the_collector_goes_round_in_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     env = ArcadeEnv(GAME, N)
     places = places_of(monkeypatch, env._memory)
-    collector = ArcadeCollector(env, scripted, N * 8)
+    collector = ArcadeCollector(env, scripted, N * 8, compress=torch.clone)  # else it draws into the window
     for _ in range(5):
         collector.collect()
     assert len(places) == 40 and len(set(places)) <= 3
@@ -290,3 +290,109 @@ def test_a_game_whose_state_is_its_picture_keeps_both(path: type[Fused]) -> None
         assert torch.equal(step(), held[0])
     assert all(torch.equal(frames, held[0]) for frames in held)
     assert torch.equal(step.env.observe()["pixels"], held[0])
+
+
+# -- windows that are drawn into --------------------------------------------------------------------------------------
+
+
+def collector(game: CompiledGame = GAME, copies: bool = False, **options: Any) -> ArcadeCollector:
+    """A collector whose steps draw into the window, or one that copies frames there."""
+    compress = torch.clone if copies else None
+    return ArcadeCollector(ArcadeEnv(game, N, seed=3), scripted, N * 6, compress=compress, **options)
+
+
+@pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
+def test_steps_draw_straight_into_the_window(monkeypatch: pytest.MonkeyPatch, game: CompiledGame) -> None:
+    """All frames of a window but the first, which stood there when the window before it ended."""
+    one, twin = collector(game), collector(game, copies=True)
+    copied: list[int] = []
+    copy = torch.Tensor.copy_
+    for number in range(5):
+        expected = twin.collect()
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.Tensor, "copy_", lambda to, source: (copied.append(to.data_ptr()), copy(to, source))[1])
+            pixels = one.collect()["pixels"]
+        places = [pixels[:, step].data_ptr() for step in range(6)]
+        assert [copied.count(place) for place in places] == [1, 0, 0, 0, 0, 0], number
+        copied.clear()
+        assert torch.equal(pixels, expected["pixels"])
+        canvas = one._buffer._new_pixels.canvas
+        assert pixels.is_contiguous() and canvas.memory.unsafe_buffer_pointer() == pixels.data_ptr()
+
+
+@pytest.mark.parametrize("game", [GAME, MIXED])
+def test_xla_writes_one_frame_of_a_window_and_copies_none(game: CompiledGame) -> None:
+    batch = ArcadeEnv(game, N)._live.batch
+    window = jax.ShapeDtypeStruct((N, 5, 8, 8, 3), jnp.uint8)
+    text = game.step.lower(batch, jnp.zeros(N, jnp.int32), window, 2).compile().as_text()
+    number = len(jax.tree.leaves(batch)) + 1
+    assert re.search(rf"input_output_alias={{ {{\d+}}: \({number}, {{}}, m\w+-alias\) }}", text.splitlines()[0])
+    assert not re.search(rf"= u8\[{N},5,8,8,3\]\S* copy\(", text)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    orders=st.lists(
+        st.sampled_from(["collect", "iterate", "hold", "drop first", "drop last", "reset", "other"]), max_size=12
+    ),
+    holder=st.sampled_from(["tensor", "slice", "unbound", "detached", "numpy slice", "capsule", "tensordict", "cycle"]),
+    overlap=st.sampled_from([0, 2, 8]),
+    final=st.sampled_from(["all", "truncated", "none"]),
+)
+def test_whatever_is_held_and_dropped_windows_are_those_of_a_collector_that_copies(
+    orders: list[str], holder: str, overlap: int, final: Any
+) -> None:
+    one, twin = (collector(copies=copies, overlap=overlap, final_frames=final) for copies in (False, True))
+    held: list[tuple[Any, Any]] = []
+    for order in orders:
+        if order.startswith("drop") and held:
+            held.pop(0 if order == "drop first" else -1)
+        elif order in ("reset", "other"):
+            for each in (one, twin):
+                each.reset() if order == "reset" else each.env.step_raw(torch.arange(N) % 5)
+        elif order in ("collect", "iterate", "hold"):
+            ours, theirs = (next(each.iterator()) if order == "iterate" else each.collect() for each in (one, twin))
+            assert (ours == theirs).all()
+            if order == "hold":
+                held.append((HOLDERS[holder](ours["pixels"]), content(HOLDERS[holder](theirs["pixels"].clone()))))
+            del ours, theirs
+        for seen, copied in held:
+            np.testing.assert_array_equal(content(seen), copied)
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_a_policy_may_hold_the_frames_that_it_saw(same: bool) -> None:
+    """Within the window, whatever is drawn beside them; and beyond it, unless one storage was asked for."""
+    held: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        if len(windows) < 4:
+            held.append((td["pixels"][1:], td["pixels"][1:].clone()))
+        return scripted(td)
+
+    one = ArcadeCollector(ArcadeEnv(GAME, N), policy, N * 6, return_same_td=same)
+    windows: list[int] = []
+    for _ in range(4):
+        windows.append(one.collect()["pixels"].data_ptr())
+        assert all(torch.equal(seen, copied) for seen, copied in held)
+        if same:
+            held.clear()
+    assert len(set(windows)) == (1 if same else 4)
+    held.clear()
+    assert len({one.collect()["pixels"].data_ptr() for _ in range(8)}) <= 2, "memory that nobody sees is used again"
+
+
+@pytest.mark.parametrize("without", [jax.disable_jit, jax.debug_nans])
+def test_where_jax_donates_nothing_windows_are_the_same(without: Callable[[bool], Any]) -> None:
+    one, twin = (ArcadeCollector(ArcadeEnv(GAME, N), scripted, N * 2) for _ in range(2))
+    with without(True):
+        slow = one.collect()
+    assert (slow == twin.collect()).all()
+
+
+def test_a_window_whose_storage_was_moved_is_written_where_it_is_now() -> None:
+    one, twin = collector(return_same_td=True), collector()
+    for _ in range(3):
+        ours = one.collect()
+        assert (ours == twin.collect()).all()
+        ours["pixels"].share_memory_()

@@ -31,7 +31,8 @@ class Options(BenchOptions):
     """Frames per second of games at several batch sizes, every frame consumed by a checksum.
 
     Measured are the compiled step with auto-reset (step+draw; step: without drawing), ArcadeEnv.step_and_maybe_reset
-    (env), ArcadeCollector.collect with random actions (collector), and a plain fill and a plain copy of the same bytes.
+    (env), ArcadeCollector.collect with random actions, every frame stored once as in training (collector), and a plain
+    fill and a plain copy of the same bytes.
     Beside frames/s stand GB/s and the share of that fill and that copy in the same run.
 
     Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
@@ -117,7 +118,7 @@ def _bridge(game: str, size: int, count: int) -> dict[str, Measure]:
     """The TorchRL environment and our collector."""
     env, other = (arcade_torch.make(game, num_envs=count, obs_size=size) for _ in range(2))
     steps = window_steps(size, count)
-    collector = arcade_torch.ArcadeCollector(other, None, frames_per_batch=count * steps)
+    collector = arcade_torch.ArcadeCollector(other, None, frames_per_batch=count * steps, final_frames="truncated")
     generator = torch.Generator().manual_seed(0)
     actions = cycle([torch.randint(5, (count,), generator=generator).to(env.device) for _ in range(64)])
     now = [env.reset()]
