@@ -149,6 +149,14 @@ class Canvas:
             raise RuntimeError("JAX did not draw where it was told to: report this, with the version of JAX")
 
 
+@lru_cache(maxsize=1)
+def draws_in_place() -> bool:
+    """Whether this version of JAX writes into memory of the CPU that it was donated."""
+    canvas = Canvas((2, 2))
+    drawn = jax.jit(lambda memory: memory.at[1].set(1), donate_argnums=0)(canvas.memory)
+    return bool(drawn.unsafe_buffer_pointer() == canvas.address)
+
+
 class FinalObservations:
     """The true last observations of ended episodes: keeps the states that steps led to, and draws many at once.
 

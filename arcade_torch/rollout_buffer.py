@@ -8,7 +8,15 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict
 
-from arcade_torch.compiled import EPISODE_REWARD, NUM_NUMBERS, REWARD, STEP_COUNT, TERMINATED, TRUNCATED
+from arcade_torch.compiled import (
+    EPISODE_REWARD,
+    NUM_NUMBERS,
+    REWARD,
+    STEP_COUNT,
+    TERMINATED,
+    TRUNCATED,
+    draws_in_place,
+)
 from arcade_torch.dlpack import TensorMemory, upload, write
 from arcade_torch.env import Place
 from arcade_torch.policies import path_of
@@ -121,6 +129,8 @@ class RolloutBuffer:
         """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends before it."""
         canvas, config = self._new_pixels.canvas, cast(Any, jax.config)
         if canvas is None or step == self.length or config.jax_disable_jit or config.jax_debug_nans:
+            return None
+        if not draws_in_place():
             return None
         moved = self.pixels.data_ptr() != canvas.address  # by share_memory_
         return None if moved else (canvas, step, self.pixels[:, step])

@@ -18,7 +18,7 @@ from torchrl.envs.transforms import StepCounter
 
 from arcade_torch import make
 from arcade_torch.collector import ArcadeCollector
-from arcade_torch.compiled import CompiledGame, FrameMemory
+from arcade_torch.compiled import CompiledGame, FrameMemory, draws_in_place
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.gym.batch import NumpyBatch
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, State, StubGame
@@ -388,6 +388,20 @@ def test_where_jax_donates_nothing_windows_are_the_same(without: Callable[[bool]
     with without(True):
         slow = one.collect()
     assert (slow == twin.collect()).all()
+
+
+def test_a_jax_that_draws_elsewhere_has_its_frames_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    twin = collector()
+    monkeypatch.setattr("arcade_torch.rollout_buffer.draws_in_place", lambda: False)
+    one, places = collector(), []
+    step = one.env.step_raw
+    monkeypatch.setattr(one.env, "step_raw", lambda action, **how: (places.append(how["into"]), step(action, **how))[1])
+    assert all((one.collect() == twin.collect()).all() for _ in range(3))
+    assert places == [None] * 18
+
+
+def test_this_jax_draws_in_donated_memory() -> None:
+    assert draws_in_place()
 
 
 def test_a_window_whose_storage_was_moved_is_written_where_it_is_now() -> None:
