@@ -6,8 +6,8 @@ from typing import Any
 
 from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
 
-_SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "lr_decay_fraction": 1.0}
-_SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "time_limit": "terminal", "exploration_fraction": 0.4}
+_SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
+_SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
 _SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
 _SMALL_PPO = {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
 _SMALL_PPO |= {"entropy_coeff": 0.05, "entropy_end": 0.02, "critic_coeff": 4.0}  # rewards are small, the encoder shared
@@ -61,7 +61,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       memory, the games' law of the published numbers.
     * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core (results/small.md;
       results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
-      To them time limits are terminations; PPO unlearned CartPole by that, and reads the value of the last frame.
+      Time limits end like terminations: MineSweeper is learned faster so, CartPole better without (results/recipe.md).
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
