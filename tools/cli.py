@@ -28,7 +28,7 @@ With any command: --import FILE.py (or MODULE) first imports what registers your
 
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("study.Demo", "small study of one game: learning, gap, bias and saliency in one HTML page"),
+    "demo": ("study.Demo", "small study of two games: learning, gap, bias and saliency in one HTML page"),
     "list": ("list.List", "games, memory models, what scripted players earn, and pictures of the games"),
     "train": ("train.Train", "train one agent into a run folder"),
     "evaluate": ("train.Evaluate", "greedy returns of a trained agent"),

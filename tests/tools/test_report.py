@@ -105,6 +105,11 @@ def test_a_study_without_the_control_still_has_a_page(tmp_path: Path, no_oracles
     assert "no scores for the memory-free agent" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
+def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no part 'strips' to skip; parts: saliency, recall"):
+        report(tmp_path / "s", skip=("strips",))  # type: ignore[arg-type]
+
+
 def test_nothing_finished_is_an_error(tmp_path: Path) -> None:
     from arcade_torch.tools.studies.folder import StudyFolder
 

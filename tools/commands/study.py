@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from arcade_torch.tools.commands import Command
+from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.studies.engines import Engine, RayOptions
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
@@ -115,7 +116,7 @@ class Report(Command):
     study: tyro.conf.Positional[Path]  # Folder of the study.
     out: Path | None = None  # The page; report.html in that folder by default.
     metric: Literal["eval_final", "train_max_ewm"] = "eval_final"  # Score of a run that the headline is based on.
-    skip: tuple[Literal["saliency", "recall", "contamination", "references"], ...] = ()
+    skip: tuple[Part, ...] = ()
     """Parts to leave out: strips, densities, what one noisy frame changes, returns of the random policy and oracles."""
 
     def run(self) -> int:

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 from arcade_torch.tools.files import Table
 
 Progress = Callable[[str, int, int], None]
+Part = Literal["saliency", "recall", "contamination", "references"]  # of a report; what may be left out
 PICTURES, NUMBERS = (".pdf", ".png", ".svg"), (".csv",)
 
 # The comment behind an option is its help.

@@ -6,14 +6,14 @@ Its sentences are computed from numbers: they claim a difference only where its 
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 from arcade_torch.agents.config import flatten
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures import Progress
+from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import command_line
@@ -60,7 +60,7 @@ def report(
     out: str | Path | None = None,
     *,
     metric: str = "eval_final",
-    skip: Sequence[Literal["saliency", "recall", "contamination", "references"]] = (),
+    skip: Sequence[Part] = (),
     progress: Progress | None = None,
 ) -> Path:
     """Write the page of a study, one HTML file that loads nothing, and return its path.
@@ -78,9 +78,11 @@ def report(
 
     Raises:
         FileNotFoundError: ``root`` is no study.
-        ValueError: no run has finished yet.
+        ValueError: no run has finished yet, or there is no such part.
         MissingPackage: jinja2 is not installed.
     """
+    if unknown := sorted(set(skip) - set(get_args(Part))):
+        raise ValueError(f"a report has no part {unknown[0]!r} to skip; parts: {', '.join(get_args(Part))}")
     jinja2 = need("jinja2")
     folder = StudyFolder(Path(root))
     study = folder.load()
