@@ -14,15 +14,10 @@ from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
 
 @dataclass(frozen=True)
 class EvalResult:
-    """First finished episodes of fresh environments.
+    """First finished episodes of fresh environments."""
 
-    Attributes:
-        returns: float32 [E], undiscounted return of each episode.
-        lengths: int64 [E], steps of each episode.
-    """
-
-    returns: NDArray[np.float32]
-    lengths: NDArray[np.int64]
+    returns: NDArray[np.float32]  # [E], undiscounted return of each episode
+    lengths: NDArray[np.int64]  # [E], steps of each episode
 
     @property
     def mean(self) -> float:
