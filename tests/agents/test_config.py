@@ -6,7 +6,6 @@ import json
 import pytest
 
 import arcade_torch.envs_jax
-
 from arcade_torch.agents.config import GROUPS, DQNConfig, PQNConfig, TrainConfig, differing_fields
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
