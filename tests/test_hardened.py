@@ -303,11 +303,11 @@ def test_a_file_of_somebody_else_is_not_overwritten_by_a_score(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("cell", "value", "message"),
     [
-        ("actions", "0a", "actions are digits from 0 to 4"),
-        ("actions", "07", "actions are digits from 0 to 4"),
-        ("seed", "٣", "seed is '٣', expected a whole number"),
-        ("options", "[]", "expected a JSON object"),
-        ("options", "{", "expected a JSON object"),
+        ("actions", "0a", "actions must be digits from 0 to 4"),
+        ("actions", "07", "actions must be digits from 0 to 4"),
+        ("seed", "٣", "seed must be a whole number; got '٣'"),
+        ("options", "[]", "options must be a JSON object"),
+        ("options", "{", "options must be a JSON object"),
     ],
 )
 def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, message: str) -> None:

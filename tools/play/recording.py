@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, make
@@ -84,8 +85,7 @@ def recorded_frames(session: Session, choose: Chooser, *, max_steps: int, hold: 
 
 def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
     """The writer that a file's name asks for."""
-    if path.suffix not in FASTEST_FPS:
-        raise ValueError(f"the file must end in .gif or .mp4, got {path}")
+    require(path.suffix in FASTEST_FPS, "the film", str(path), "a file that ends in .gif or .mp4")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: choose a file")
     need("PIL" if path.suffix == ".gif" else "imageio_ffmpeg")
