@@ -242,7 +242,7 @@ def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[st
 
 
 def test_a_study_that_is_no_table_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a study is a table"):
+    with pytest.raises(ValueError, match="a study must be a table"):
         Study.from_dict([1])  # type: ignore[arg-type]
     (tmp_path / "x.toml").write_text("a = [")
     with pytest.raises(ValueError, match="is not TOML"):
