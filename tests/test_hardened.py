@@ -242,7 +242,7 @@ def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[st
 
 
 def test_a_study_that_is_no_table_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a study is a table"):
+    with pytest.raises(ValueError, match="a study must be a table"):
         Study.from_dict([1])  # type: ignore[arg-type]
     (tmp_path / "x.toml").write_text("a = [")
     with pytest.raises(ValueError, match="is not TOML"):
@@ -303,11 +303,11 @@ def test_a_file_of_somebody_else_is_not_overwritten_by_a_score(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("cell", "value", "message"),
     [
-        ("actions", "0a", "actions are digits from 0 to 4"),
-        ("actions", "07", "actions are digits from 0 to 4"),
-        ("seed", "٣", "seed is '٣', expected a whole number"),
-        ("options", "[]", "expected a JSON object"),
-        ("options", "{", "expected a JSON object"),
+        ("actions", "0a", "actions must be digits from 0 to 4"),
+        ("actions", "07", "actions must be digits from 0 to 4"),
+        ("seed", "٣", "seed must be a whole number; got '٣'"),
+        ("options", "[]", "options must be a JSON object"),
+        ("options", "{", "options must be a JSON object"),
     ],
 )
 def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, message: str) -> None:

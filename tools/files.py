@@ -107,13 +107,9 @@ def read_rows(path: Path, kind: type[Row]) -> list[Row]:
 def measured_rows(
     path: Path | None, kind: type[Row], keys: Iterable[tuple[Any, ...]], measure: Callable[..., Row]
 ) -> Iterator[Row]:
-    """Rows by their first cells, one after another: those that a file holds, the others measured and added to it.
+    """The row of every key, its first cells: those that a CSV file holds, the others measured and added to it.
 
-    Args:
-        path: CSV file; None keeps nothing.
-        kind: of the rows, a named tuple.
-        keys: first cells of the rows that are wanted.
-        measure: called with such cells, returns the row.
+    ``measure`` is called with the cells of a key; without a ``path`` nothing is kept.
     """
     known = read_rows(path, kind) if path is not None and path.exists() else []
     for key in keys:

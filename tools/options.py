@@ -25,17 +25,9 @@ _TITLES = ("Unrecognized options", "Value error", "Required options", "Invalid c
 
 
 def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> Any:
-    """Read options into a dataclass.
+    """Read options of a command into a dataclass; ``default`` is an instance with values where no option is given.
 
-    Args:
-        kind: the dataclass.
-        words: the options.
-        prog: the command, for messages.
-        default: instance whose values stand where no option is given.
-
-    Raises:
-        ValueError: an option is unknown, missing or malformed; one line.
-        SystemExit: help was asked for.
+    An option that is unknown, missing or malformed is a ``ValueError`` in one line; help is a ``SystemExit``.
     """
     tyro, constructors = need("tyro"), need("tyro.constructors")
     registry, captured = constructors.ConstructorRegistry(), StringIO()

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import flatten
+from arcade_torch.agents.config import flatten, require
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 
 METRICS = ("eval_final", "train_max_ewm")
@@ -166,7 +166,8 @@ class Run:
 
     def value(self, metric: str) -> float:
         """The score of the run."""
-        value = (self.final or {}).get("mean" if _known(metric) == "eval_final" else "train_max_ewm")
+        require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
+        value = (self.final or {}).get("mean" if metric == "eval_final" else metric)
         if value is None:
             raise ValueError(f"{self.path} has no {metric}: choose another metric")
         return float(value)
@@ -309,7 +310,7 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         ValueError: the metric is unknown, a folder holds no finished run, runs may not be compared, a table lacks a
             column, or a run appears twice.
     """
-    _known(metric)
+    require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
     parts = [runs] if isinstance(runs, str | Path) else list(runs)
     paths = [Path(part) for part in parts if not isinstance(part, Score)]
     tables = {path: table for path in paths if (table := table_of(path))}
@@ -339,12 +340,6 @@ def table_of(path: Path) -> Path | None:
     """The table of scores that a path is: a file, or the ``results.csv`` of a study that has lost its runs."""
     bare = (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
     return path if path.is_file() else path / "results.csv" if bare else None
-
-
-def _known(metric: str) -> str:
-    if metric not in METRICS:
-        raise ValueError(f"unknown metric {metric!r}: allowed are {', '.join(METRICS)}")
-    return metric
 
 
 def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:

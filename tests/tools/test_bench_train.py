@@ -39,11 +39,11 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--out", "x.txt"], "must end in .csv or .json"),
+        (["--out", "x.txt"], "must be a file that ends in .csv or .json"),
         (["--grad-steps", "0"], "--grad-steps must be at least 1, got 0"),
         (["--networks", "tiny"], "unknown preset 'tiny'"),
         (["--threads", "-1"], "--threads must be at least 0"),
-        (["--forms", "amp+fast"], "a form is eager, amp, compiled, graphs, or several of them joined by '+'; got"),
+        (["--forms", "amp+fast"], "a form must be eager, amp, compiled, graphs, or several of them joined by '+'; got"),
         (["--forms", "graphs"], "cuda_graphs must be false on device 'cpu'; it needs a CUDA device"),
     ],
 )

@@ -69,7 +69,7 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
         (["analyze", "gap-bias"], "name at least one"),
         (["analyze", "gap-bias", "no/such.csv"], "does not exist"),
         (["analyze", "gap-bias", "README.md", "--confidence", "2"], "between 0 and 1"),
-        (["bench", "envs", "--out", "x.txt"], "must end in .csv or .json"),
+        (["bench", "envs", "--out", "x.txt"], "--out must be a file that ends in .csv or .json; got 'x.txt'"),
         (["bench", "envs", "--batches", "0"], "--batches must be at least 1"),
         (["demo", "--seeds", "0"], "give the number of seeds (1 to 10000)"),
     ],

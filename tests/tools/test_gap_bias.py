@@ -195,5 +195,5 @@ def test_a_bare_name_and_its_version_are_one_game() -> None:
 
 
 def test_an_unknown_metric_is_refused() -> None:
-    with pytest.raises(ValueError, match="allowed are eval_final, train_max_ewm"):
+    with pytest.raises(ValueError, match="metric must be one of eval_final, train_max_ewm"):
         read_scores([], "best")

@@ -160,11 +160,11 @@ def test_the_caption_has_return_steps_and_last_reward() -> None:
 
 
 def test_bad_sessions_and_keys_are_refused() -> None:
-    with pytest.raises(ValueError, match="episodes is -1"):
+    with pytest.raises(ValueError, match="episodes must be 0"):
         session(episodes=-1)
     with pytest.raises(ValueError, match="seed is -1, allowed: 0 to 4294967295"):
         session(seed=-1)
-    with pytest.raises(ValueError, match="key is 'jump', allowed: up, down"):
+    with pytest.raises(ValueError, match="key must be one of up, down"):
         session()[0].press("jump")
 
 
@@ -384,10 +384,10 @@ def test_a_terminal_plays_and_is_left_as_it_was(tmp_path: Path) -> None:
         (["play", "MineSweperEasy"], "did you mean 'MineSweeperEasy'"),
         (["play", GAME, "--scale", "0"], "--scale must be at least 1, got 0"),
         (["play", GAME, "--key-repeat", "-1"], "--key-repeat must be at least 0"),
-        (["play", GAME, "--episodes", "-1"], "episodes is -1"),
+        (["play", GAME, "--episodes", "-1"], "episodes must be 0 (no end) or more; got -1"),
         (["play", GAME, "--obs-size", "64"], "64"),
         (["play", GAME, "--seed", "-1"], "seed is -1, allowed: 0 to 4294967295"),
-        (["play", GAME, "--scores", "x.txt"], "--scores must end in .csv, got x.txt"),
+        (["play", GAME, "--scores", "x.txt"], "--scores must be a file that ends in .csv; got 'x.txt'"),
         (["play", GAME, "--env-option", "wind"], "NAME=VALUE"),
         (["play", GAME, "--env-option", "wind=1"], "has no option 'wind'"),
         (["play", GAME, "--terminal"], "playing needs a window or a terminal"),

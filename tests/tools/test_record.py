@@ -195,13 +195,13 @@ def test_a_recording_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     [
         (["record", GAME], "Missing from arcade-torch record: --out"),
         (["record", "TetrisEsy", "--out", "x.gif"], "did you mean 'TetrisEasy'"),
-        (["record", GAME, "--out", "x.png"], "must end in .gif or .mp4, got x.png"),
-        (["record", GAME, "--out", "x.gif", "--player", "nobody"], "--player is 'nobody', allowed: random, state-"),
+        (["record", GAME, "--out", "x.png"], "a file that ends in .gif or .mp4; got 'x.png'"),
+        (["record", GAME, "--out", "x.gif", "--player", "nobody"], "--player must be random, state-"),
         (["record", GAME, "--out", "x.gif", "--player", "."], "holds no checkpoint"),
         (["record", GAME, "--out", "x.gif", "--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["record", GAME, "--out", "x.gif", "--max-steps", "0"], "--max-steps must be at least 1"),
         (["record", GAME, "--out", "x.gif", "--scale", "0"], "--scale must be at least 1"),
-        (["record", GAME, "--out", "x.gif", "--fps", "60"], "--fps must be above 0 and at most 50 for .gif, got 60"),
+        (["record", GAME, "--out", "x.gif", "--fps", "60"], "--fps must be above 0 and at most 50 for .gif; got 60"),
         (["record", GAME, "--out", "x.gif", "--fps", "nan"], "--fps must be above 0"),
         (["record", GAME, "--out", "x.gif", "--seed", "-1"], "seed is -1"),
         (["record", GAME, "--out", "x.gif", "--env-option", "wind=1"], "has no option 'wind'"),
@@ -248,5 +248,5 @@ def test_a_film_that_fails_is_the_last_and_stops_nothing(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="no more films, frames-000000007.gif: AttributeError"):
         film(type("Broken", (), {"frames": 7})())
     film(None)
-    with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4"):
+    with pytest.raises(ValueError, match=r"must be a file that ends in \.gif or \.mp4"):
         recording.EvaluationVideos(tmp_path, ".avi")

@@ -94,7 +94,7 @@ def test_of_several_episodes_the_first_that_is_long_enough_is_explained_else_the
         ({"target": "v"}, "target must be one of q, logits, probs, value"),
         ({"n": 3}, "outside a window of 3 frames"),
         ({"chunk": 0}, "chunk must be at least 1"),
-        ({"last_action": torch.zeros(2)}, "last_action must have one entry a frame"),
+        ({"last_action": torch.zeros(2)}, "the length of last_action must be that of frames"),
     ],
 )
 def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> None:

@@ -51,7 +51,7 @@ def test_what_is_no_benchmark_is_refused_in_one_line(tmp_path: Path, capsys: pyt
     write_bench(tmp_path / "e.csv", measure="fill")
     write_bench(tmp_path / "n.csv", num_envs=0)
     wrong = {
-        "throughput is drawn from one file": [],
+        "--runs must be one file of `arcade-torch bench envs --out FILE.csv`": [],
         "b.csv does not exist": ["--runs", str(tmp_path / "nowhere" / "b.csv")],
         "x.csv is no table with columns game, measure": ["--runs", str(tmp_path / "x.csv")],
         "e.csv has no row with the measure step+draw": ["--runs", str(tmp_path / "e.csv")],

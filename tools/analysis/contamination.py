@@ -21,9 +21,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.agents.config import require
+from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.tools.analysis.bootstrap import Array
 from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_windows, resolve_agent
+from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_windows, play, resolve_agent
 
 Ints = NDArray[np.int64]
 
@@ -96,12 +98,9 @@ def contamination(
     Raises:
         ValueError: an option is out of range, or no episode was long enough.
     """
-    if not sigmas or min(sigmas) < 0:
-        raise ValueError(f"sigmas must be numbers of at least 0, got {list(sigmas)}")
-    if not delays or min(delays) < 0:
-        raise ValueError(f"delays must be whole numbers of at least 0, got {list(delays)}")
-    if starts < 1:
-        raise ValueError(f"starts must be at least 1, got {starts}")
+    require(min(sigmas, default=-1) >= 0, "sigmas", list(sigmas), "numbers of at least 0")
+    require(min(delays, default=-1) >= 0, "delays", list(delays), "whole numbers of at least 0")
+    require(starts >= 1, "starts", starts, "at least 1")
     player, env = resolve_agent(agent, env, observability)
     if (what := resolve(player, target)) == "value":
         raise ValueError("contamination compares actions: target must be q, logits or probs, not value")
@@ -129,7 +128,7 @@ def contamination(
             again[middle] = policy.features(w.frames[middle : middle + 1])[0]
             raw = replayed(policy, w, torch.cat([clean[None], versions]), changed, feedback)
             error = max(error, float((replayed(policy, w, again[None], changed, feedback) - raw[:1]).abs().max()))
-            parts.append(_compare(player, what, raw, places[:, None, None] + steps, len(strengths)))
+            parts.append(_compare(player, what, raw, places[:, None, None] + steps))
             points += [(number, int(place)) for place in places]
             if progress is not None:
                 progress(len(points), starts)
@@ -159,14 +158,11 @@ def shuffled_beginning(agent: Any, env: Any = None, *, identity: bool = False, *
     return contamination(agent, env, shuffle=True, identity=identity, **options)
 
 
-def _compare(model: Any, what: str, raw: Tensor, decisions: Ints, sigmas: int) -> tuple[Array, ...]:
+def _compare(model: Any, what: str, raw: Tensor, decisions: Ints) -> tuple[Array, ...]:
     """Flip, relative change and KL of rows 1... against row 0 at steps [points, 1, K], each [points, S, K]."""
-    shape = len(decisions), sigmas, decisions.shape[-1]
-    steps = np.broadcast_to(decisions, shape)
-    known = torch.as_tensor(steps < raw.shape[1])
-    index = torch.as_tensor(np.minimum(steps, raw.shape[1] - 1)).reshape(-1)
-    rows = torch.arange(1, raw.shape[0]).reshape(shape[:2])[..., None].expand(shape).reshape(-1)
-    pairs, scalars = (raw[0, index], raw[rows, index]), outputs(model, what)
+    rows = torch.arange(1, len(raw)).reshape(len(decisions), -1, 1)
+    known, steps = torch.as_tensor(decisions < raw.shape[1]), torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
+    pairs, scalars = (raw[0, steps], raw[rows, steps]), outputs(model, what)
     a, b = (values - values.mean(-1, keepdim=True) for values in (scalars(out).double().cpu() for out in pairs))
     spread = a.amax(-1) - a.amin(-1)
     change = torch.where(spread > 0, (b - a).abs().amax(-1) / spread, torch.nan)
@@ -175,7 +171,62 @@ def _compare(model: Any, what: str, raw: Tensor, decisions: Ints, sigmas: int) -
     if what in ("logits", "probs"):
         p, q = (outputs(model, "logits")(out).double().cpu().log_softmax(-1) for out in pairs)
         kl = (p.exp() * (p - q)).sum(-1)
-    return tuple(torch.where(known, v.reshape(shape), torch.nan).numpy() for v in (flip, change, kl))
+    return tuple(torch.where(known, each, torch.nan).numpy() for each in (flip, change, kl))
+
+
+@dataclass(frozen=True)
+class Example:
+    """One decision: what an agent saw before it, as it was (row 0) and disturbed, and what it made of it."""
+
+    frames: NDArray[np.uint8]  # [R, T, H, W, 3], noise cut to the range of pixels; the decision is taken on the last
+    order: Ints  # [R, T], the step of the trajectory at which each frame was seen
+    hits: Ints  # [R], index of the noisy frame, -1 in rows without one
+    values: Array  # float64 [R, A], outputs on the last frame minus their mean; of probabilities as they are
+    target: str  # which outputs
+    sigma: float  # standard deviation of the noise
+
+
+@torch.no_grad()
+def contamination_example(
+    agent: Any,
+    env: Any = None,
+    *,
+    horizon: int = 10,
+    sigma: float = 1.0,
+    clip: bool = False,
+    feedback: bool = False,
+    shuffle: bool = False,
+    seed: int = 0,
+    observability: Twin | None = None,
+    target: Target = "auto",
+) -> Example:
+    """The paper's picture: the beginning of one episode, undisturbed and disturbed, and the decision at its end.
+
+    The decision comes ``horizon`` steps after the start, with ``shuffle`` after frame 10. Noise of strength ``sigma``
+    hits the first frame after the start, one in the middle, or the last before the decision, a row each. Everything
+    else is as for `contamination`; a ``ValueError`` if ``horizon`` is below 2, or no episode was long enough.
+    """
+    require(horizon >= 2, "horizon", horizon, "at least 2")
+    player, env = resolve_agent(agent, env, observability)
+    policy, what, n = policy_of(player), resolve(player, target), horizon + LAST * shuffle
+    windows, _ = play(player, env, seed=held_out_seed(seed), keep=n + 1, max_steps=n + 1)
+    w = next((window for window in windows if window.n == n), None)
+    if w is None:
+        raise ValueError(f"none of {len(windows)} episodes was long enough: {n + 1} frames are needed")
+    hits = np.array([-1] if shuffle else np.unique(np.linspace(1, n - 1, 3, dtype=np.int64)))
+    order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
+    if shuffle:
+        order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
+    versions = w.frames[torch.as_tensor(order)].float()
+    if not shuffle:
+        versions[range(1, len(order)), hits] = disturbed_frames(w.frames, hits, np.array([sigma]), clip, seed)
+    with policy.evaluating():
+        features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
+        raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
+        values = outputs(player, what)(raw).double().cpu().numpy()
+    values = values if what == "probs" else values - values.mean(1, keepdims=True)
+    pictures = versions.clamp(0, WHITE).round().byte().cpu().numpy()
+    return Example(pictures, order, np.array([-1, *hits]), values, what, sigma)
 
 
 def disturbed_frames(frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int) -> Tensor:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.config import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
@@ -139,10 +140,8 @@ def gap_and_bias(
     Raises:
         ValueError: no agent is complete on any task, the baseline is missing, or an argument is out of range.
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
-    if draws < 1:
-        raise ValueError(f"draws must be at least 1, got {draws}")
+    require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
+    require(draws >= 1, "draws", draws, "at least 1")
     cells = _cells(read_scores(runs, metric))
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
     base = find_baseline(agents, baseline)
@@ -169,8 +168,7 @@ Cells = dict[tuple[str, str, str], Array]
 def _cells(scores: Sequence[Score]) -> Cells:
     found: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for score in scores:
-        if score.observability not in TWINS:
-            raise ValueError(f"observability must be full or partial, got {score.observability!r}")
+        require(score.observability in TWINS, "observability", score.observability, "full or partial")
         if not np.isfinite(score.value):
             raise ValueError(f"the score of {score.agent} on {score.game}, seed {score.seed}, is {score.value}")
         found.setdefault((score.agent, score.game, score.observability), []).append((score.seed, score.value))

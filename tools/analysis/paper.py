@@ -9,7 +9,7 @@ import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import SIGNED_GAMES, TWINS, AgentRow, GapBias, game_of, gap_and_bias
-from arcade_torch.tools.files import read_csv
+from arcade_torch.tools.files import Table, read_csv
 
 PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
 """Mean and standard deviation of 9 agents on 30 tasks and both twins, raw, rounded to two decimals."""
@@ -33,18 +33,17 @@ class PaperTable:
     mdp: Mapping[str, Spread]
     pomdp: Mapping[str, Spread]
 
-    def text(self) -> str:
+    def printed(self) -> Table:
         """The table, three decimals; errors four."""
-        head = ("agent", "MDP", "POMDP", "Gap", "Bias", "POMDP*", "Gap*", "Bias*", "SEM", "95% half-width")
-        lines = ["{:<10}{:>7}{:>7}{:>8}{:>8}{:>8}{:>8}{:>8}  {:<14}  {}".format(*head)]
+        rows = []
         for row, rest in zip(self.table.rows, self.table.without["Tetris"], strict=True):
             shown = row.mdp, row.pomdp, row.gap, row.bias, rest.pomdp, rest.gap, rest.bias
-            numbers = "{:>7.3f}{:>7.3f}{:>+8.3f}{:>+8.3f}{:>8.3f}{:>+8.3f}{:>+8.3f}".format(*(x.value for x in shown))
-            mdp, pomdp = self.mdp[row.agent], self.pomdp[row.agent]
-            errors = f"{mdp.sem:.4f}/{pomdp.sem:.4f}   {mdp.half_width:.4f}/{pomdp.half_width:.4f}"
-            lines.append(f"{row.agent:<10}{numbers}  {errors}")
-        lines.append(f"* without Tetris; errors: MDP/POMDP; {len(self.table.tasks)} tasks, {SEEDS} seeds (people) each")
-        return "\n".join(lines)
+            errors = zip(self.mdp[row.agent], self.pomdp[row.agent], strict=True)
+            cells = *(f"{x.value:+.3f}" for x in shown), *(f"{mdp:.4f}/{pomdp:.4f}" for mdp, pomdp in errors)
+            rows.append((row.agent, *cells))
+        head = ("agent", "MDP", "POMDP", "gap", "bias", "POMDP*", "gap*", "bias*", "SEM", "95 % half-width")
+        about = f"* without Tetris; errors: MDP/POMDP; {len(self.table.tasks)} tasks, {SEEDS} seeds (people) each"
+        return Table("published returns, normalised", head, rows, about)
 
 
 def paper_table() -> PaperTable:

@@ -3,7 +3,7 @@
 ``S(o_t) = sum_a || d Q(s_n, a) / d o_t ||^2``, the norm taken over colour channels at each pixel.
 
 Computed in two stages of ``torch.autograd``, as the encoder works frame by frame: memory and head are differentiated
-once with respect to the features, which gives the Jacobian J [outputs, frames, features]; then J is multiplied with the
+with respect to the features, which gives the Jacobian J [outputs, frames, features]; then J is multiplied with the
 Jacobian of the encoder, some frames at a time. Memory use is that of one chunk; frames whose rows of J are exactly zero
 are skipped.
 
@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.agents.config import require
 from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
 from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_window
 
@@ -81,20 +82,16 @@ def saliency(
         TypeError: ``model`` has none of the forms above.
     """
     for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
-        if value not in get_args(kind):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {value!r}")
-    if chunk < 1:
-        raise ValueError(f"chunk must be at least 1, got {chunk}")
-    if frames.ndim != 4:
-        raise ValueError(f"frames must have shape [T, H, W, C], got {list(frames.shape)}")
+        require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
+    require(chunk >= 1, "chunk", chunk, "at least 1")
+    require(frames.ndim == 4, "the shape of frames", list(frames.shape), "[T, H, W, C]")
     total = frames.shape[0]
     if not -total <= n < total:
         raise ValueError(f"n = {n} is outside a window of {total} frames")
     zeros = torch.zeros(total, dtype=torch.int64, device=frames.device)
     actions, starts = (zeros if given is None else given.reshape(-1) for given in (last_action, is_init))
     for name, given in (("last_action", actions), ("is_init", starts)):
-        if given.shape[0] != total:
-            raise ValueError(f"{name} must have one entry a frame ({total}), got {given.shape[0]}")
+        require(len(given) == total, f"the length of {name}", len(given), f"that of frames, {total}")
     steps, policy, scalars = n % total + 1, policy_of(model), outputs(model, target)
     with policy.evaluating(), torch.enable_grad():
         leaf = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
@@ -110,16 +107,10 @@ def saliency(
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
     """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E]."""
     rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
-    found: Tensor | None = None
-    if values.requires_grad:
-        try:
-            (found,) = torch.autograd.grad(
-                values, leaf, rows, retain_graph=True, is_grads_batched=True, allow_unused=True
-            )
-        except RuntimeError:  # an operator without a batching rule
-            each = [torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True) for row in rows]
-            found = torch.stack([gradient for (gradient,) in each])
-    return leaf.new_zeros(len(rows), *leaf.shape) if found is None else found
+    if not values.requires_grad:
+        return leaf.new_zeros(len(rows), *leaf.shape)
+    each = [torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True) for row in rows]
+    return torch.stack([gradient for (gradient,) in each])
 
 
 def _frame_norms(

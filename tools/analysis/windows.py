@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents import load
-from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.agents.config import SEED_LIMIT, require
 from arcade_torch.agents.evaluation import held_out_seed, make_eval_env
 from arcade_torch.tools.analysis.policy import policy_of
 
@@ -71,10 +71,8 @@ def greedy_window(
     """
     seed = held_out_seed(seed) if env is None else seed
     player, env = resolve_agent(agent, env, observability, num_envs=1)
-    if tuple(env.batch_size) != (1,):
-        raise ValueError(f"a window is played in a batch of one environment, got batch size {list(env.batch_size)}")
-    if max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    require(tuple(env.batch_size) == (1,), "the batch size of env", list(env.batch_size), "[1], for one episode")
+    require(max_steps >= 1, "max_steps", max_steps, "at least 1")
     (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps)
     return window
 
@@ -97,10 +95,9 @@ def greedy_windows(
     Raises:
         ValueError: a number is below 1, or ``end`` is unknown.
     """
-    if end not in get_args(End):
-        raise ValueError(f"end must be one of {', '.join(get_args(End))}, got {end!r}")
-    if episodes < 1 or cap < MIN_STEPS:
-        raise ValueError(f"episodes must be at least 1 and the cap at least {MIN_STEPS}, got {episodes} and {cap}")
+    require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
+    require(episodes >= 1, "episodes", episodes, "at least 1")
+    require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
     size = int(env.batch_size[0])
     for group in range(-(-episodes // size)):
         rng, drawn = np.random.default_rng([seed, group]), np.random.SeedSequence([seed, group]).generate_state(1)

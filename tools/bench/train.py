@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.training import Trainer
 from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown
@@ -62,8 +62,7 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
     """The preset of that name without its random play, run in that form."""
     settings: dict[str, Any] = {}
     for name in form.split("+"):
-        if name not in FORMS:
-            raise ValueError(f"a form is {', '.join(FORMS)}, or several of them joined by '+'; got {form!r}")
+        require(name in FORMS, "a form", form, f"{', '.join(FORMS)}, or several of them joined by '+'")
         settings |= FORMS[name]
     settings |= {"algorithm": "pqn", "env": options.env, "memory": memory, "observability": "partial"}
     config = preset(network, device=options.device, **settings)

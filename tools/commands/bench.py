@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import tyro
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import write_atomic, write_json
 from arcade_torch.tools.bench import registry
 from arcade_torch.tools.commands import Command
@@ -33,8 +34,7 @@ class Bench(Command):
     def run(self) -> int:
         """Measure, print, save."""
         out, about = self.options.out, vars(self.options)
-        if out is not None and out.suffix not in (".csv", ".json"):
-            raise ValueError(f"--out must end in .csv or .json, got {out}")
+        require(out is None or out.suffix in (".csv", ".json"), "--out", str(out), "a file that ends in .csv or .json")
         results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():
@@ -73,8 +73,7 @@ class BenchAll(Command):
 
     def run(self) -> int:
         """Measure and save."""
-        if self.out.suffix != ".json":
-            raise ValueError(f"--out must end in .json, got {self.out}")
+        require(self.out.suffix == ".json", "--out", str(self.out), "a file that ends in .json")
         sizes = registry.SIZES[self.size]
         options: dict[str, Any] = {
             name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches
@@ -98,8 +97,7 @@ class BenchCompare(Command):
 
     def run(self) -> int:
         """Compare and print."""
-        if not 0 < self.tolerance < 1:
-            raise ValueError(f"--tolerance must lie between 0 and 1, got {self.tolerance}")
+        require(0 < self.tolerance < 1, "--tolerance", self.tolerance, "between 0 and 1")
         old, new = registry.read_results(self.old), registry.read_results(self.new)
         was, now = old["machine"], new["machine"]
         about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")

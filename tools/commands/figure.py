@@ -12,8 +12,12 @@ from typing import Any
 import tyro
 
 from arcade_torch.tools.commands import Command
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import FIGURES, Options, make_figure
+from arcade_torch.tools.files import csv_text
+from arcade_torch.tools.machine import keep_freed_memory
 from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.progress import Bars
 
 
 @dataclass
@@ -40,11 +44,6 @@ class Figure(Command):
 
     def run(self) -> int:
         """Measure, draw, save, print."""
-        from arcade_torch.tools.errors import need
-        from arcade_torch.tools.files import csv_text
-        from arcade_torch.tools.machine import keep_freed_memory
-        from arcade_torch.tools.progress import Bars
-
         keep_freed_memory()
         need("matplotlib")
         with Bars() as bars:

@@ -9,8 +9,9 @@ import tyro
 
 from arcade_torch.envs_jax import make, registered_ids, resolve_id
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.files import Table
+from arcade_torch.tools.files import Table, write_between
 from arcade_torch.tools.options import at_least
+from arcade_torch.tools.progress import Bars
 
 PAPER_SIZE = 512
 BASELINES = Path("baselines.csv")
@@ -52,8 +53,6 @@ class List(Command):
 
     def _baselines(self) -> None:
         from arcade_torch.tools import players
-        from arcade_torch.tools.files import write_between
-        from arcade_torch.tools.progress import Bars
 
         at_least(self, episodes=1)
         ids = [resolve_id(name) for name in self.games] or registered_ids()

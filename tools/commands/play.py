@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import tyro
 
+from arcade_torch.agents.config import require
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.options import at_least, name_and_value
 
@@ -51,8 +52,8 @@ class Play(Shown):
         from arcade_torch.tools.play.session import LEGEND, Session
 
         at_least(self, scale=1, key_repeat=0)
-        if self.scores is not None and self.scores.suffix != ".csv":
-            raise ValueError(f"--scores must end in .csv, got {self.scores}")
+        fits = self.scores is None or self.scores.suffix == ".csv"
+        require(fits, "--scores", str(self.scores), "a file that ends in .csv")
         options = dict(map(name_and_value, self.env_option))
         compiled = compiled_game(self.game, self.obs_size, self.rules, options)
         game: Any = compiled.batched.game
@@ -112,17 +113,15 @@ class Record(Shown):
         write = recording.writer_for(self.out)
         at_least(self, episodes=1, max_steps=1, scale=1)
         fastest = recording.FASTEST_FPS[self.out.suffix]
-        if not 0 < self.fps <= fastest:
-            raise ValueError(f"--fps must be above 0 and at most {fastest} for {self.out.suffix}, got {self.fps}")
+        require(0 < self.fps <= fastest, "--fps", self.fps, f"above 0 and at most {fastest} for {self.out.suffix}")
         game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
         obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
         agent: Any = None
         if self.player not in recording.SCRIPTED:
             from arcade_torch.agents import load
 
-            if not Path(self.player).is_dir():
-                allowed = ", ".join(recording.SCRIPTED)
-                raise ValueError(f"--player is {self.player!r}, allowed: {allowed}, or a run folder")
+            known = ", ".join(recording.SCRIPTED)
+            require(Path(self.player).is_dir(), "--player", self.player, f"{known}, or a run folder")
             agent = load(self.player)
             config = agent.config
             if self.obs_size not in (None, config.obs_size):

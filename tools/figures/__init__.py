@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from arcade_torch.agents.config import require
 from arcade_torch.tools.files import Table
 
 Progress = Callable[[str, int, int], None]
@@ -104,6 +105,7 @@ class ContaminationOptions(CheckpointOptions):
     sigmas: tuple[float, ...] = (0.1, 0.3, 1.0)  # Standard deviations of the noise; 1 is the range of a pixel.
     delays: tuple[int, ...] = (0, 1, 2, 5, 10, 20, 50, 100)
     """Steps from the noisy frame to the decision; 0 is the ceiling."""
+    horizon: int = 10  # Of the example: steps from the start, or from the shuffled frames, to the decision.
     starts: int = 200  # Start points of each checkpoint, at most four an episode.
     shuffle: bool = False  # Permute frames 2 to 10 in place of adding noise.
     clip: bool = False  # Keep noisy pixels in their range.
@@ -197,8 +199,7 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
     from arcade_torch.tools.figures.style import drawing, save
 
     confidence, entry = getattr(options, "confidence", 0.95), FIGURES[name]
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1, got {confidence}")
+    require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
     if isinstance(options, CheckpointOptions) and not options.runs:
         raise ValueError("name at least one run folder")
     if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):

@@ -1,15 +1,17 @@
-"""State contamination: flip rate and relative change by delay, with intervals over seeds."""
+"""State contamination: flip rate and relative change by delay, with intervals over seeds; and single examples."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.tools.analysis import contamination as measure
 from arcade_torch.tools.analysis.bootstrap import Pooled, pooled
-from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_runs
-from arcade_torch.tools.analysis.contamination import Contamination, contamination
+from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_run, measure_runs
 from arcade_torch.tools.figures import ContaminationOptions, Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.options import at_least
 
 MEASURES = {
     "flip": "share of changed decisions",
@@ -17,24 +19,26 @@ MEASURES = {
     "kl": "KL(pi || pi') in nats",
 }
 LEAST_SCALE = 0.1  # axes reach at least so far, so that small effects look small
+CLEAN_BEST, OTHER_BEST, REST = "#354e6a", "#a33a2f", "#b3b3b3"  # bars of an example, as in the paper
 
 Measures = Mapping[str, Pooled]  # of one agent on one task: for each of `MEASURES` values [S, K] over its seeds
 
 
 def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
-    """Figures ``contamination-KIND-GAME-TWIN``, one a task."""
+    """Figures ``contamination-KIND-GAME-TWIN``, one a task, and examples of each task's first agent."""
+    at_least(options, horizon=2)
     paths, notes = checkpoints_of(options.runs)
-    measured = measure_runs(paths, contamination, vars(options), progress)
+    measured = measure_runs(paths, measure.contamination, vars(options), progress)
     made = Made([], notes, [_table(label, item) for label, item in measured])
     first = measured[0][1]  # strengths and delays are those of all
     for (game, twin), agents in style.agents_by_task(pool(by_task(measured), options.confidence)).items():
         figure = _figure(agents, first, options)
         figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
         seeds = {agent: len(value["flip"].seeds) for agent, value in agents.items()}
-        points = next(len(item.points) for label, item in measured if label.task[1:] == (game, twin))
+        label, item = next(pair for pair in measured if pair[0].task[1:] == (game, twin))
         ceiling = "last shuffled frame" if options.shuffle else "decision's own frame"
         note = (
-            f"{style.seeds_note(list(seeds.values()), options.confidence)}; {points} start points each, "
+            f"{style.seeds_note(list(seeds.values()), options.confidence)}; {len(item.points)} start points each, "
             f"{'replay chooses its actions' if options.feedback else 'recorded actions'};\n"
             f"0 steps: the {ceiling}; dashed: without memory nothing changes after it"
         )
@@ -47,10 +51,46 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
             rows += style.rows_of(**what)
         kind = "shuffle" if options.shuffle else "noise"
         made.pictures.append(Picture(f"contamination-{kind}-{game}-{twin}", figure, note, rows))
+        try:
+            how = vars(options) | {"sigma": max(options.sigmas)}
+            _, example = measure_run(label.path, measure.contamination_example, how)
+        except ValueError as error:  # episodes too short
+            made.notes.append(f"no example of {label}: {error}")
+        else:
+            made.pictures.append(Picture(f"contamination-{kind}-example-{game}-{twin}", *_example(label, example)))
     return made
 
 
-def _table(label: Label, found: Contamination) -> Table:
+def _example(label: Label, found: measure.Example) -> tuple[Any, str, list[dict[str, Any]]]:
+    """Rows: an episode as it was, and disturbed; columns: some of its frames, and bars of the outputs on its last."""
+    n, best, shuffle = found.frames.shape[1] - 1, found.values.argmax(1), found.hits[1] < 0
+    names = ["clean", *("shuffled" if shuffle else f"noise on frame {hit}" for hit in found.hits[1:])]
+    columns = 6 if shuffle else 3
+    size, look = (1.6 * (columns + 1.7), 1.7 * len(names) + 0.8), {"width_ratios": [1.0] * columns + [1.7]}
+    figure, axes = style.panels(len(names), columns + 1, size, sharey="col", **look)
+    task, numbers = dict(zip(("agent", "game", "observability"), label.task, strict=True)), list[dict[str, Any]]()
+    for row, (*pictures, bars) in enumerate(axes):
+        early = range(measure.FIRST + 1, measure.FIRST + 4) if shuffle else (0, max(found.hits[row], found.hits[1]))
+        for axis, t in zip(pictures, (*early, *range(n - 2 * shuffle, n + 1)), strict=True):
+            axis.imshow(found.frames[row, t], interpolation="nearest")
+            axis.set(xticks=[], yticks=[], frame_on=False, title=f"$o_{{{found.order[row, t]}}}$")
+        pictures[0].set_ylabel(names[row], fontsize="small")
+        bars.bar(ACTION_NAMES, found.values[row], color=REST)
+        bars.patches[best[row]].set_facecolor(OTHER_BEST)
+        bars.patches[best[0]].set_facecolor(CLEAN_BEST)
+        bars.axhline(0.0, color=style.NEUTRAL, lw=0.8)
+        bars.tick_params(labelsize="small")
+        hit = None if found.hits[row] < 0 else found.hits[row]
+        numbers += style.rows_of(**task, row=names[row], hit=hit, action=ACTION_NAMES, value=found.values[row])
+    outputs = "probabilities" if found.target == "probs" else f"centred {found.target}"
+    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$")
+    figure.suptitle(f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}", x=0.01, ha="left")
+    noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {found.sigma:g}"
+    note = f"n = 1 episode, {noise}; blue: best action when clean, red: best if another"
+    return figure, note, numbers
+
+
+def _table(label: Label, found: measure.Contamination) -> Table:
     names = ["shuffled" if np.isnan(sigma) else f"{sigma:g}" for sigma in found.sigmas]
     rows = [[name, *(f"{100 * x:.1f}" for x in line)] for name, line in zip(names, found.mean("flip"), strict=True)]
     counts = f"{len(found.points)} start points ({', '.join(map(str, found.counts()[0]))} by delay)"
@@ -60,7 +100,7 @@ def _table(label: Label, found: Contamination) -> Table:
 
 
 def pool(
-    tasks: Mapping[tuple[str, str, str], Sequence[Contamination]], confidence: float = 0.95
+    tasks: Mapping[tuple[str, str, str], Sequence[measure.Contamination]], confidence: float = 0.95
 ) -> dict[tuple[str, str, str], Measures]:
     """(agent, game, twin) -> measures over its seeds."""
     return {
@@ -69,7 +109,7 @@ def pool(
     }
 
 
-def _figure(agents: Mapping[str, Measures], first: Contamination, options: ContaminationOptions) -> Any:
+def _figure(agents: Mapping[str, Measures], first: measure.Contamination, options: ContaminationOptions) -> Any:
     """One row a measure, one column a strength of the noise; the dashed line is an agent without memory."""
     shown = [name for name in MEASURES if any(np.isfinite(value[name].mean).any() for value in agents.values())]
     size = max(6.5, 3.6 * len(first.sigmas)), 1.3 + 2.5 * len(shown)

@@ -163,7 +163,7 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
             f"published returns, {len(paper.table.tasks)} tasks, n = {SEEDS} seeds; bars: normal 95 % interval, tasks "
             f"independent (a bootstrap over {SEEDS} seeds would cover {100 * seed_coverage(SEEDS):.0f} %)"
         )
-        return Made(notes=[paper.text()]), paper.table, note
+        return Made(tables=[paper.printed()]), paper.table, note
     if not options.runs:
         raise ValueError("name at least one study folder, run folder or CSV file")
     folders = [path for path in options.runs if table_of(path) is None]

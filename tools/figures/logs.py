@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 
 from arcade_torch.agents import preset
-from arcade_torch.agents.config import TrainConfig, flatten
+from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
@@ -129,11 +129,8 @@ def throughput(options: Options, progress: Progress | None) -> Made:
 
     ``options.runs`` is the one file of ``bench envs``; rates have the checksum over every frame inside the clock.
     """
-    if len(options.runs) != 1:
-        raise ValueError(
-            f"throughput is drawn from one file of `arcade-torch bench envs --out FILE.csv`, got {len(options.runs)}: "
-            "give --runs FILE.csv"
-        )
+    wanted, given = "one file of `arcade-torch bench envs --out FILE.csv`", list(map(str, options.runs))
+    require(len(given) == 1, "--runs", given, wanted)
     rows = read_rows(options.runs[0], Rate)
     if not all(0 < number < 10**12 for row in rows for number in row[2:]):
         raise ValueError(f"{options.runs[0]}: obs_size, num_envs and rates must be numbers above 0")

@@ -64,7 +64,7 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, sigma_px: float | Non
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
         peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0], sigma_px, alpha)
-        part.suptitle(f"{title}; brightest {peak:.1e}", fontsize=_font_size(), x=0.01, ha="left")
+        part.suptitle(f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left")
     return figure
 
 
@@ -92,9 +92,5 @@ def plot(
             axis.imshow(frames[t], interpolation="nearest")
             axis.imshow(heat[t], cmap="afmhot", vmin=0, vmax=1, alpha=alpha, interpolation="nearest")
             name, share = "n" if t == n else f"n-{n - t}", "" if below is None else f": {below[t]:.1f} %"
-            axis.set_title(f"$o_{{{name}}}${share}", fontsize=_font_size())
+            axis.set_title(f"$o_{{{name}}}${share}", fontsize="small")
     return peak
-
-
-def _font_size() -> float:
-    return 0.9 * float(need("matplotlib").rcParams["font.size"])

@@ -42,31 +42,8 @@ TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
 
-_STYLES = {  # light, print
-    "font.size": (10, 7.5),
-    "font.family": ("sans-serif", "serif"),
-    "mathtext.fontset": ("dejavusans", "stix"),
-    "lines.linewidth": (1.8, 1.2),
-    "lines.markersize": (5, 3.2),
-    "patch.linewidth": (1.6, 1.0),
-    "grid.linewidth": (0.8, 0.4),
-    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), (0.8, 0.6)),
-    "savefig.dpi": (160, 400),
-}
-_SHARED = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.grid.axis": "y",
-    "grid.color": "#e4e4e4",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "pdf.fonttype": 42,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "arcade-torch",
-    "figure.facecolor": "white",
-    "axes.titlesize": "medium",
-}
+STYLES = Path(__file__).resolve().parents[1] / "data"
+"""Folder of the style sheets, for `matplotlib.style.use`: light.mplstyle, and print.mplstyle for what differs."""
 _PRINT_SCALE = 0.62  # sizes of figures are given for a screen; on a page they are so much smaller
 
 
@@ -75,7 +52,7 @@ def drawing(style: str) -> Iterator[Any]:
     """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
     need("matplotlib").use("Agg")
     plt = need("matplotlib.pyplot")
-    with plt.rc_context(_SHARED | {name: values[style == "print"] for name, values in _STYLES.items()}):
+    with plt.style.context([STYLES / f"{name}.mplstyle" for name in dict.fromkeys(("light", style))]):
         try:
             yield plt
         finally:

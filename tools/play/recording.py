@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, make
@@ -84,8 +85,7 @@ def recorded_frames(session: Session, choose: Chooser, *, max_steps: int, hold: 
 
 def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
     """The writer that a file's name asks for."""
-    if path.suffix not in FASTEST_FPS:
-        raise ValueError(f"the file must end in .gif or .mp4, got {path}")
+    require(path.suffix in FASTEST_FPS, "the film", str(path), "a file that ends in .gif or .mp4")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: choose a file")
     need("PIL" if path.suffix == ".gif" else "imageio_ffmpeg")
@@ -146,33 +146,27 @@ def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]
 
 def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Frame:
     """Some moments of one episode side by side, the MDP twin above the POMDP twin."""
-    if not steps or steps[0] < 0 or any(a >= b for a, b in pairwise(steps)):
-        raise ValueError(f"steps must be whole numbers that rise from 0 or more, got {list(steps)}")
-    side = obs_size + GAP
-    canvas, count = np.full((2 * side - GAP, len(steps) * side - GAP, 3), PAPER, np.uint8), 0
+    rises = bool(steps) and steps[0] >= 0 and all(a < b for a, b in pairwise(steps))
+    require(rises, "steps", list(steps), "whole numbers that rise from 0 or more")
+    columns, count = list[Frame](), 0
     for count, twins in enumerate(_moments(id, obs_size, seed, steps[-1]), start=1):
         if count - 1 in steps:
-            for row, frame in enumerate(twins):
-                _paste(canvas, frame, row * side, steps.index(count - 1) * side)
+            columns.append(np.vstack([_padded(frame, obs_size) for frame in twins]))
     if count <= steps[-1]:
         raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {count} steps: stay below")
-    return canvas
+    return np.hstack(columns)[:-GAP, :-GAP]
 
 
 def sheet(ids: Sequence[str], columns: int = 2) -> Frame:
     """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
-    height, width = 256 + GAP, 2 * (256 + GAP) + 2 * (128 + GAP)
-    canvas = np.full((-(-len(ids) // columns) * height, columns * width, 3), PAPER, np.uint8)
-    for place, id in enumerate(ids):
-        left = place % columns * width
-        for frame in [frame for size in (256, 128) for frame in scene(id, size)]:
-            _paste(canvas, frame, place // columns * height, left)
-            left += len(frame) + GAP
-    return canvas
+    games = [np.hstack([_padded(frame, 256) for size in (256, 128) for frame in scene(id, size)]) for id in ids]
+    games += [np.full_like(games[0], PAPER)] * (-len(games) % columns)
+    return np.vstack([np.hstack(games[at : at + columns]) for at in range(0, len(games), columns)])
 
 
-def _paste(canvas: Frame, frame: Frame, top: int, left: int) -> None:
-    canvas[top : top + len(frame), left : left + len(frame)] = frame
+def _padded(frame: Frame, height: int) -> Frame:
+    """A frame with paper below it, to that height, and a gap behind."""
+    return np.pad(frame, ((0, height + GAP - len(frame)), (0, GAP), (0, 0)), constant_values=PAPER)
 
 
 class EvaluationVideos:

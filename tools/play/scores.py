@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
@@ -49,8 +50,7 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
     if path.read_text(encoding="utf-8").partition("\n")[0].strip() != ",".join(COLUMNS):
         raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
     for row in rows:
-        if not _WHOLE.fullmatch(row["seed"]):
-            raise ValueError(f"{path}: the seed {row['seed']!r} is no whole number")
+        require(_WHOLE.fullmatch(row["seed"]) is not None, f"{path}: the seed", row["seed"], "a whole number")
     return rows
 
 
@@ -71,20 +71,17 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     Raises:
         ValueError: the actions go on after the end, or the line is damaged.
     """
-    if not re.fullmatch(r"[0-4]+", row["actions"]):
-        raise ValueError(f"actions are digits from 0 to 4, one a step, got {row['actions']!r}")
+    found, actions = list[Attempt](), row["actions"]
+    require(re.fullmatch(r"[0-4]+", actions) is not None, "actions", actions, "digits from 0 to 4, one a step")
     for name in ("seed", "obs_size"):
-        if not _WHOLE.fullmatch(str(row[name])):
-            raise ValueError(f"{name} is {row[name]!r}, expected a whole number")
+        require(_WHOLE.fullmatch(str(row[name])) is not None, name, row[name], "a whole number")
     _, options = name_and_value(f"options={row['options']}")
-    if not isinstance(options, dict):
-        raise ValueError(f"options are {row['options']!r}, expected a JSON object")
-    found: list[Attempt] = []
+    require(isinstance(options, dict), "options", row["options"], "a JSON object")
     game = compiled_game(row["game"], int(row["obs_size"]), row["rules"], options)
     session = Session(game, seed=int(row["seed"]), partial=row["observability"] == "partial", on_attempt=found.append)
-    for number, action in enumerate(row["actions"]):
+    for number, action in enumerate(actions):
         if session.end is not None:
-            raise ValueError(f"{len(row['actions'])} actions, but the episode ends after {number}")
+            raise ValueError(f"{len(actions)} actions, but the episode ends after {number}")
         session.press(ACTION_NAMES[int(action)])
     session.press(QUIT)
     return found[0]

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from arcade_torch.agents.config import require
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.gym.batch import NumpyBatch, seed_keys
@@ -79,8 +80,7 @@ class Session:
         episodes: int = 0,
         on_attempt: Callable[[Attempt], None] = lambda attempt: None,
     ) -> None:
-        if episodes < 0:
-            raise ValueError(f"episodes is {episodes}, expected 0 (no end) or more")
+        require(episodes >= 0, "episodes", episodes, "0 (no end) or more")
         self._batch = NumpyBatch(game, np.zeros(1, bool))
         self.partial, self.both, self.seed, self.finished, self.closed = partial, both, seed, 0, False
         self._episodes, self._on_attempt, self._attempt = episodes, on_attempt, 0
@@ -127,8 +127,7 @@ class Session:
 
     def press(self, key: str) -> None:
         """React to one of ``KEYS``."""
-        if key not in KEYS:
-            raise ValueError(f"key is {key!r}, allowed: {', '.join(KEYS)}")
+        require(key in KEYS, "key", key, f"one of {', '.join(KEYS)}")
         if self.closed:
             return
         if key == TOGGLE:

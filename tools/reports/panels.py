@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.tools.analysis import contamination as noise
+from arcade_torch.tools.analysis import recall_density as recall
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
-from arcade_torch.tools.analysis.contamination import Contamination
-from arcade_torch.tools.analysis.contamination import contamination as noise
 from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
-from arcade_torch.tools.analysis.recall_density import RecallDensity
-from arcade_torch.tools.analysis.recall_density import recall_density as density_of
 from arcade_torch.tools.figures import Progress, contamination, gap_bias, logs, recall_density, saliency, style
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.runs import Runs, is_baseline
@@ -138,7 +136,7 @@ def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, A
 def recall_section(cells: Cells, agents: Sequence[str], progress: Progress | None) -> dict[str, Any]:
     """Recall density of every cell, a picture a task; numbers are kept in the run folders."""
 
-    def summary(measured: Sequence[tuple[Any, RecallDensity]]) -> tuple[Any, dict[str, Any]]:
+    def summary(measured: Sequence[tuple[Any, recall.RecallDensity]]) -> tuple[Any, dict[str, Any]]:
         found = [density for _, density in measured if density.shares]
         shares = [share for density in found for share in density.shares]
         if not found:
@@ -154,20 +152,19 @@ def recall_section(cells: Cells, agents: Sequence[str], progress: Progress | Non
         recall_density.plot({agent: (mass, colours[agent]) for agent, mass in masses.items()}, axis, bins)
         axis.set_xlabel("time in the episode (1: the decision)")
 
-    return _section("recall density", cells, (density_of, DENSITY), summary, plot, progress)
+    return _section("recall density", cells, (recall.recall_density, DENSITY), summary, plot, progress)
 
 
 def contamination_section(cells: Cells, agents: Sequence[str], progress: Progress | None) -> dict[str, Any]:
     """Share of decisions that one noisy frame changes, by delay; a picture a task."""
 
-    def summary(measured: Sequence[tuple[Any, Contamination]]) -> tuple[Any, dict[str, Any]]:
+    def summary(measured: Sequence[tuple[Any, noise.Contamination]]) -> tuple[Any, dict[str, Any]]:
         found = [one for _, one in measured]
         (every,) = contamination.pool(by_task(measured)).values()
-        flips = np.array([item.mean("flip")[0] for item in found])
-        later = np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
+        later = np.ma.masked_invalid(np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])).mean()
         row = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
-        means = {"at_once": _mean(flips[:, 0]), "one": _mean(flips[:, 1]), "later": _mean(later)}
-        return every, row | means | {"change": every["change"].mean[0, 1]}
+        row |= {"at_once": every["flip"].mean[0, 0], "one": every["flip"].mean[0, 1]}
+        return every, row | {"later": float(np.ma.filled(later, np.nan)), "change": every["change"].mean[0, 1]}
 
     def plot(here: Mapping[str, Any], axis: Any) -> None:
         delays = NOISE["delays"][: contamination.reached(here.values())]
@@ -175,7 +172,7 @@ def contamination_section(cells: Cells, agents: Sequence[str], progress: Progres
         contamination.from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    return _section("contamination", cells, (noise, NOISE), summary, plot, progress)
+    return _section("contamination", cells, (noise.contamination, NOISE), summary, plot, progress)
 
 
 def _section(
@@ -203,9 +200,3 @@ def _section(
         axis.set_title(title := f"{game}, {TWIN_NAMES[twin]}")
         pictures.append(style.svg(figure, f"{name} {title}"))
     return {"pictures": pictures, "rows": rows, "notes": notes}
-
-
-def _mean(values: Any) -> float:
-    """Mean of what is not NaN; NaN of nothing."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else float("nan")

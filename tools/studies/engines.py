@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_json, write_atomic
 from arcade_torch.tools.errors import need, one_line, reason
 from arcade_torch.tools.machine import available_cores
@@ -218,10 +219,9 @@ class Ray(RayOptions):
     module: Any = None  # The ray package, imported if it is not given.
 
     def __post_init__(self) -> None:
-        if self.cpus_per_run <= 0:
-            raise ValueError(f"cpus-per-run must be above 0, got {self.cpus_per_run}")
-        if self.gpus_per_run < 0 or self.retries < 0:
-            raise ValueError(f"gpus-per-run and retries must be at least 0, got {self.gpus_per_run}, {self.retries}")
+        require(self.cpus_per_run > 0, "cpus-per-run", self.cpus_per_run, "above 0")
+        least = min(self.gpus_per_run, self.retries)
+        require(least >= 0, "gpus-per-run and retries", least, "at least 0")
         self.module = self.module or need("ray")
 
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:

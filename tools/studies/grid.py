@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten
+from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten, require
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
@@ -96,8 +96,7 @@ class Study:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
         """A study from plain values, as they stand in a TOML or JSON file; refuses unknown and missing keys."""
-        if not isinstance(values, Mapping):
-            raise ValueError(f"a study is a table of names and values, got {values!r}")
+        require(isinstance(values, Mapping), "a study", values, "a table of names and values")
         known = [item.name for item in fields(cls)]
         if unknown := [key for key in values if key not in known]:
             raise ValueError(f"unknown key {unknown[0]!r} in a study; known are {', '.join(known)}")
@@ -156,8 +155,7 @@ def study_preset(name: str) -> Study:
         >>> len(study_preset("paper").runs())
         2400
     """
-    if name not in STUDY_PRESETS:
-        raise ValueError(f"unknown study preset {name!r}; presets: {', '.join(STUDY_PRESETS)}")
+    require(name in STUDY_PRESETS, "the preset of a study", name, f"one of {', '.join(STUDY_PRESETS)}")
     return replace(Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name)
 
 

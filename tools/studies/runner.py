@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
@@ -92,8 +92,7 @@ def study(
 
 def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> Engine:
     """An engine by its name; ``auto`` takes processes where there is more than one core."""
-    if workers < 0:
-        raise ValueError(f"workers must be at least 1 (or 0 for as many as there is room for), got {workers}")
+    require(workers >= 0, "workers", workers, "at least 1, or 0 for as many as there is room for")
     of_ray = vars(ray or RayOptions())
     if name == "ray":
         return Ray(**of_ray, workers=workers)

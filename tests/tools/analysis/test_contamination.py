@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from arcade_torch.agents import Agent, preset
+from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination, shuffled_beginning
-from arcade_torch.tools.analysis.contamination import disturbed_frames, replayed, shuffle_order
+from arcade_torch.tools.analysis.contamination import contamination_example, disturbed_frames, replayed, shuffle_order
+from arcade_torch.tools.analysis.windows import greedy_window
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
@@ -115,6 +117,49 @@ def test_a_policy_has_a_divergence_that_is_zero_where_nothing_changes() -> None:
     assert np.nanmax(np.abs(found.kl[:, 0])) < 1e-9 < found.mean("kl")[1, 0]
     with pytest.raises(ValueError, match="target must be q, logits or probs, not value"):
         contamination(agent, target="value", starts=1)
+
+
+def test_an_example_holds_the_clean_outputs_and_differs_in_the_hit_frames_alone() -> None:
+    policy = linear_policy(0.9, dtype=torch.float32)
+    found = contamination_example(policy, ToyEnv([30]), horizon=10, seed=3)
+    w = greedy_window(policy, ToyEnv([30]), seed=held_out_seed(3), max_steps=11)
+    clean = replayed(policy, w, policy.features(w.frames)[None], 10, False)[0, -1].double().numpy()
+    np.testing.assert_allclose(found.values[0], clean - clean.mean(), rtol=1e-5)
+    np.testing.assert_array_equal(found.frames[0], w.frames)
+    assert found.hits.tolist() == [-1, 1, 5, 9] and found.sigma == 1
+    changed = (found.frames != found.frames[0]).any((2, 3, 4))
+    assert [np.flatnonzero(row).tolist() for row in changed] == [[], [1], [5], [9]]
+    assert (abs(found.values[1:] - found.values[0]).max(1) > 1e-3).all()
+
+
+def test_the_shuffled_example_shows_the_same_frames_in_another_order() -> None:
+    sums, fades = (linear_policy(rho, dtype=torch.float32) for rho in (1.0, 0.9))
+    same, moved = (contamination_example(policy, ToyEnv([30]), shuffle=True, horizon=4) for policy in (sums, fades))
+    for found in (same, moved):
+        assert found.hits.tolist() == [-1, -1] and found.order[0].tolist() == list(range(15))
+        assert found.order[1, [0, 1, 11, 12, 13, 14]].tolist() == [0, 1, 11, 12, 13, 14]
+        assert sorted(found.order[1]) == list(range(15)) and (found.order[1] != found.order[0]).any()
+        np.testing.assert_array_equal(found.frames[1], found.frames[0][found.order[1]])
+    np.testing.assert_allclose(same.values[1], same.values[0], rtol=1e-4)
+    assert abs(moved.values[1] - moved.values[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_no_noise_and_no_memory_leave_every_row_of_an_example_as_the_clean_one(feedback: bool) -> None:
+    for net, how in ((Net("gru", torch.float32), {"sigma": 0.0}), (Net("mlp", torch.float32), {"sigma": 1.0})):
+        policy = Policy(net.encode, net.remember, net.initial_state)
+        found = contamination_example(policy, ToyEnv([12]), horizon=5, feedback=feedback, **how)  # type: ignore[arg-type]
+        np.testing.assert_allclose(found.values, np.tile(found.values[0], (4, 1)), atol=1e-5)
+        assert (found.frames[1:] != found.frames[0]).any() == (how["sigma"] > 0)
+
+
+def test_an_example_wants_two_steps_and_an_episode_that_has_them() -> None:
+    policy = linear_policy(0.9, dtype=torch.float32)
+    assert contamination_example(policy, ToyEnv([2, 3]), horizon=2).hits.tolist() == [-1, 1]
+    with pytest.raises(ValueError, match="horizon must be at least 2; got 1"):
+        contamination_example(policy, ToyEnv([30]), horizon=1)
+    with pytest.raises(ValueError, match="none of 2 episodes was long enough: 4 frames are needed"):
+        contamination_example(policy, ToyEnv([2, 3]), horizon=3)
 
 
 @pytest.mark.parametrize(

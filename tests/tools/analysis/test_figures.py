@@ -8,12 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from arcade_torch.agents import preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.figures import FIGURES
-from arcade_torch.tools.figures.style import AGENT_COLOURS
+from arcade_torch.tools.analysis.checkpoints import Label
+from arcade_torch.tools.analysis.contamination import Example
+from arcade_torch.tools.figures import FIGURES, contamination
+from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing
+from arcade_torch.tools.runs import AgentKey
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import write_run
 
@@ -66,7 +70,10 @@ def test_the_papers_numbers_make_pictures_and_tables(
         assert (tmp_path / f"{name}{ending}").read_bytes().startswith(magic)
     assert len(read_csv(tmp_path / f"{name}.csv")) >= 9
     if name == "returns":
-        assert "GDN         0.522  0.469  +0.054  -0.150" in text and (tmp_path / "returns-without.png").exists()
+        assert (
+            "GDN │ +0.522 │ +0.469 │ +0.054 │ -0.150" in " ".join(text.split())
+            and (tmp_path / "returns-without.png").exists()
+        )
 
 
 @pytest.mark.parametrize("name", ["returns", "gap-bias", "curves", "hyperparameters"])
@@ -252,17 +259,41 @@ def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
         assert read_csv(tmp_path / "recall-density-16.csv") == rows  # made anew
 
 
-def test_contamination_of_checkpoints_is_drawn(
+def test_contamination_of_checkpoints_is_drawn_with_an_example(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["analyze", "contamination", *map(str, sorted(trained.iterdir())), "--starts", "6", "--delays", "0", "1"]
-    assert cli.main([*words, "--sigmas", "0", "1", "--out", str(tmp_path)]) == 0
+    words += ["--sigmas", "0", "1", "--out", str(tmp_path)]
+    assert cli.main([*words, "--horizon", "3"]) == 0
     text = capsys.readouterr().out
     assert "changed decisions in %" in text and "6 start points" in text
     rows = read_csv(tmp_path / "contamination-noise-MineSweeperEasy-v0-full.csv")
     assert [(row["sigma"], row["delay"]) for row in rows] == [("0.0", "0"), ("0.0", "1"), ("1.0", "0"), ("1.0", "1")]
     assert float(rows[0]["change"]) < 1e-5 < float(rows[2]["change"])
     assert (tmp_path / "contamination-noise-MineSweeperEasy-v0-full.png").exists()
+    example = tmp_path / "contamination-noise-example-MineSweeperEasy-v0-full"
+    assert example.with_suffix(".png").exists() and example.with_suffix(".pdf").exists()
+    rows = read_csv(example.with_suffix(".csv"))
+    versions = [(row["row"], row["hit"]) for row in rows[::5]]
+    assert versions == [("clean", ""), ("noise on frame 1", "1"), ("noise on frame 2", "2")]
+    assert [row["action"] for row in rows[:5]] == ["up", "down", "left", "right", "fire"] and len(rows) == 15
+    assert cli.main([*words, "--horizon", "5000"]) == 0
+    assert "no example of" in (text := capsys.readouterr().out) and "5001 frames are needed" in text
+    assert "--horizon must be at least 2" in refused(capsys, *words, "--horizon", "1")
+
+
+def test_the_bars_of_an_example_say_where_the_best_action_changed() -> None:
+    values, hits = np.array([[0, 1, 0, 0, -1], [0, 2, 0, 0, -2], [3, 1, 0, 0, -4]], np.float64), np.array([-1, 1, 2])
+    pictures, order = np.zeros((3, 4, 8, 8, 3), np.uint8), np.tile(np.arange(4), (3, 1))
+    label = Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", 0, Path("run"), "lru")
+    with drawing("light"):
+        figure, note, rows = contamination._example(label, Example(pictures, order, hits, values, "q", 0.3))
+        bars = [axis for axis in figure.axes if axis.patches]
+        colours = [[to_hex(bar.get_facecolor()) for bar in axis.patches] for axis in bars]
+        assert len({axis.get_ylim() for axis in bars}) == 1 and bars[0].get_ylim()[0] < -4 and bars[0].get_ylim()[1] > 3
+    grey, blue, red = contamination.REST, contamination.CLEAN_BEST, contamination.OTHER_BEST
+    assert colours == [[grey, blue, grey, grey, grey]] * 2 + [[red, blue, grey, grey, grey]]
+    assert "sigma = 0.3" in note and [row["value"] for row in rows] == values.ravel().tolist()
 
 
 def test_two_checkpoints_of_one_seed_are_not_pooled_as_two_seeds(

@@ -250,7 +250,7 @@ def test_law_11_the_published_table_comes_out_to_three_decimals(agent: str) -> N
     errors = [paper.mdp[agent].sem, paper.pomdp[agent].sem]
     errors += [paper.mdp[agent].half_width, paper.pomdp[agent].half_width]
     assert errors == pytest.approx(TABLE[agent][7:], abs=6e-5)
-    assert f"{row.gap.value:+.3f}" in paper.text()
+    assert f"{row.gap.value:+.3f}" in str(paper.printed().rows)
 
 
 def test_law_11_the_quoted_differences_come_out() -> None:

@@ -106,7 +106,7 @@ def test_agents_of_every_algorithm_have_a_density(algorithm: str, target: str) -
     [
         ({"end": "first"}, "end must be one of last, random"),
         ({"episodes": 0}, "episodes must be at least 1"),
-        ({"cap": 2}, "the cap at least 3"),
+        ({"cap": 2}, "cap must be at least 3"),
         ({"norm": "l0"}, "norm must be one of"),
         ({"observability": "full"}, "leave env out"),
     ],
