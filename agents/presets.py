@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
-from arcade_torch.envs_jax.registry import make
 
-_SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150}
-_SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "time_limit": "terminal"}
+_SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
+_SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
 _SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
 _SMALL_PPO = {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
 _SMALL_PPO |= {"entropy_coeff": 0.05, "entropy_end": 0.002, "critic_coeff": 4.0}  # for small rewards
@@ -61,8 +60,8 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       window is trained in the next (PQN), targets are stored (DQN), no last action (PPO), no skip connection around the
       memory, the games' law of the published numbers.
     * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core (results/small.md;
-      results/recipe.md says how it was chosen). PPO's discount follows from the game's time limit T: 1 - 2 / T, at most
-      .99. PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
+      results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
+      Time limits end like terminations, which is better for MineSweeper and worse for CartPole (results/recipe.md).
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -85,14 +84,11 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     if name not in _PRESETS:
         raise ValueError(f"unknown preset {name!r}; presets: {', '.join(preset_names())}")
     values = dict(_PRESETS[name])
-    asked = {"algorithm": TrainConfig.algorithm, "env": TrainConfig.env} | values | changes
-    algorithm, env = (coerce(key, asked[key], str) for key in ("algorithm", "env"))
+    algorithm, env = (str(changes.get(key, values.get(key, getattr(TrainConfig, key)))) for key in ("algorithm", "env"))
     if name == "reference" and algorithm == "ppo":
         values["network_options"] = {"skip": "none", "use_last_action": False}
     if name in ("paper", "reference"):
         values |= _paper_budget(values, env)
-    elif algorithm == "ppo":
-        values["ppo"] = values["ppo"] | {"gamma": min(0.99, 1 - 2 / make(env).max_steps)}
     for group, kind in GROUPS.items():
         if group in changes:
             given = changes[group]

@@ -5,7 +5,6 @@ import json
 
 import pytest
 
-import arcade_torch.envs_jax
 from arcade_torch.agents.config import GROUPS, DQNConfig, PQNConfig, TrainConfig, differing_fields
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
@@ -59,14 +58,6 @@ def test_the_small_preset_is_the_recipe_and_every_learner_has_numbers_in_it():
     assert preset("small", algorithm="pqn", pqn={"lam": 0.5}).pqn.lam == 0.5
     with pytest.raises(ValueError, match="the algorithm is 'ppo'"):
         preset("small", pqn={"lam": 0.5})
-
-
-@pytest.mark.parametrize("game", ["SignpostEasy", "MineSweeperEasy", "MineSweeperHard", "CartPoleEasy", "TetrisEasy"])
-def test_the_small_presets_discount_reaches_over_half_of_the_longest_episode_or_100_steps(game):
-    horizon = min(arcade_torch.envs_jax.make(game).max_steps / 2, 100)
-    assert 1 / (1 - preset("small", env=game).ppo.gamma) == pytest.approx(horizon)
-    assert preset("small", env=game, ppo={"gamma": 0.5}).ppo.gamma == 0.5
-    assert preset("small", env=game, algorithm="pqn").pqn.gamma == 0.99
 
 
 @pytest.mark.parametrize("name", preset_names())
