@@ -39,8 +39,8 @@ class PaperTable:
         for row, rest in zip(self.table.rows, self.table.without["Tetris"], strict=True):
             shown = row.mdp, row.pomdp, row.gap, row.bias, rest.pomdp, rest.gap, rest.bias
             errors = zip(self.mdp[row.agent], self.pomdp[row.agent], strict=True)
-            cells = *(f"{x.value:+.3f}" for x in shown), *(f"{mdp:.4f}/{pomdp:.4f}" for mdp, pomdp in errors)
-            rows.append((row.agent, *cells))
+            numbers = (f"{x.value:{sign}.3f}" for x, sign in zip(shown, "--++-++", strict=True))
+            rows.append((row.agent, *numbers, *(f"{mdp:.4f}/{pomdp:.4f}" for mdp, pomdp in errors)))
         head = ("agent", "MDP", "POMDP", "gap", "bias", "POMDP*", "gap*", "bias*", "SEM", "95 % half-width")
         about = f"* without Tetris; errors: MDP/POMDP; {len(self.table.tasks)} tasks, {SEEDS} seeds (people) each"
         return Table("published returns, normalised", head, rows, about)
