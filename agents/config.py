@@ -195,6 +195,8 @@ class PPOConfig(LearnerConfig):
     """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
+    prediction_coeff: PositiveOrZero = 0.0
+    """Weight of an auxiliary loss: the memory learns to expect the next frame's features (arXiv 2401.08898)."""
 
 
 @dataclass(frozen=True)

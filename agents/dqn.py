@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate
@@ -98,6 +98,5 @@ class DQN(Learner):
         super().load_state_dict(state)
         self.updates = state["learner_updates"]
         if self.config.target_every:
-            target = self.loss.target_value_network_params.flatten_keys(".")
-            for key, value in state["target"].items():
-                target[key].data.copy_(value)
+            target = TensorDict(state["target"]).unflatten_keys(".")
+            self.loss.target_value_network_params.data.update_(target)

@@ -106,15 +106,12 @@ class SequenceGAE(nn.Module):
 
     @torch.no_grad()
     def forward(self, batch: TensorDictBase, params: Any = None, target_params: Any = None) -> TensorDictBase:
-        """Estimate advantages.
+        """Estimate advantages; gives the same object, with the three entries.
 
         Args:
             batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [B, T] with dense next observations.
             params: parameters of the critic; default those it has.
             target_params: not looked at.
-
-        Returns:
-            The same object, with the three entries.
         """
         data = insert_final_observations(batch, self.inputs, self.time_limit, **self.reads)
         value_key = self.writes["value"]
@@ -137,13 +134,14 @@ class PPOLoss(ClipPPOLoss):
     Differences: advantages come from :class:`SequenceGAE` before the first gradient step and are normalised in each
     minibatch by the population deviation plus 1e-8; the value loss is half the squared error, clipped like the ratio;
     the entropy is not checked for NaN in every call, which would wait for the device. In keys and out keys are those of
-    ``ClipPPOLoss``.
+    ``ClipPPOLoss``, and ``loss_prediction`` where that has a weight.
 
     Args:
         actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
         critic_network: any TensorDict module that writes ``state_value`` [*, 1].
         time_limit: see :class:`SequenceGAE`.
         critic_coeff: weight of the value loss.
+        prediction_coeff: weight of ``prediction_error``, which the actor has to write then (``predicts=True``).
         **kwargs: ``clip_epsilon`` (0.2), ``entropy_coeff`` (0.01) and the others of ``ClipPPOLoss``.
 
     Source: Schulman et al., arXiv 1707.06347, equations 7 and 9; value clipping as in the published implementation.
@@ -156,13 +154,15 @@ class PPOLoss(ClipPPOLoss):
         *,
         time_limit: TimeLimit = "bootstrap",
         critic_coeff: float = 0.5,
+        prediction_coeff: float = 0.0,
         **kwargs: Any,
     ) -> None:
         options = {"loss_critic_type": "l2", "clip_value": True, "log_explained_variance": False} | kwargs
         super().__init__(actor_network, critic_network, critic_coeff=0.5 * critic_coeff, **options)
-        self.time_limit = time_limit
+        self.time_limit, self.prediction_coeff = time_limit, prediction_coeff
         self.normalize_advantage = True
         self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
+        self.out_keys = [*self.out_keys, *["loss_prediction"] * bool(prediction_coeff)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The parts of the loss.
@@ -178,7 +178,10 @@ class PPOLoss(ClipPPOLoss):
         if tensordict.get(keys.advantage, None) is None:
             tensordict = self.value_estimator(tensordict.copy())
         read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
-        return super().forward(as_steps(tensordict, self.inputs, *read))
+        losses = super().forward(as_steps(tensordict, self.inputs, *read))
+        if self.prediction_coeff:
+            losses["loss_prediction"] = self.prediction_coeff * self._reduce_loss(self.__dict__.pop("_error"))
+        return losses
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Choose how advantages are made.
@@ -202,6 +205,8 @@ class PPOLoss(ClipPPOLoss):
 
     def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
         log_weight, dist, _, correction = super()._log_weight(tensordict, adv_shape)
+        if self.prediction_coeff:  # the actor has just written it
+            self.__dict__["_error"] = tensordict["prediction_error"]
         kl = log_weight.exp() - 1 - log_weight  # never negative, unlike the plain difference
         return log_weight, dist, kl, correction
 
@@ -269,6 +274,7 @@ class PPO(Learner):
             clip_epsilon=config.clip,
             entropy_coeff=config.entropy_coeff,
             critic_coeff=config.critic_coeff,
+            prediction_coeff=config.prediction_coeff,
         )
         loss.make_value_estimator(
             gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches, critic=network.estimator

@@ -34,7 +34,7 @@ from arcade_torch.models.memory import Memory, MemoryContract, MemoryModule, Rep
 from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
 from arcade_torch.models.presets import make_network
 from arcade_torch.models.registry import make_memory, memory_names, register_memory
-from arcade_torch.models.scan import linear_scan, linear_scan_loop
+from arcade_torch.models.scan import linear_scan
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_loop
 
 __all__ = [
@@ -52,7 +52,6 @@ __all__ = [
     "SmallEncoder",
     "check_memory",
     "linear_scan",
-    "linear_scan_loop",
     "make_actor_critic",
     "make_memory",
     "make_network",

@@ -156,4 +156,5 @@ def make_actor_critic(
         both = make(num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both"))
         return ActorCriticNetwork(both)
     actor = make(num_outputs=num_actions, out_key="logits", state_key=("memory", "actor"))
-    return ActorCriticNetwork(actor, make(num_outputs=1, out_key="state_value", state_key=("memory", "critic")))
+    critic = make(num_outputs=1, out_key="state_value", state_key=("memory", "critic"), predicts=False)
+    return ActorCriticNetwork(actor, critic)

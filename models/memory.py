@@ -62,17 +62,7 @@ class ReplayableMemory(MemoryContract, Protocol):
 
 
 def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-    """Read stored sequences with any memory: by its own ``replay`` method, or step by step where it has none.
-
-    Args:
-        memory: a memory model.
-        x: float [B, T, D].
-        stored: TensorDict [B, T], see :class:`ReplayableMemory`.
-        is_init: bool [B, T].
-
-    Returns:
-        (y float [B, T, H], states TensorDict [B, T] after each step).
-    """
+    """:meth:`ReplayableMemory.replay` of any memory: by its own method, or step by step where it has none."""
     if isinstance(memory, ReplayableMemory):
         return memory.replay(x, stored, is_init)
     return replay_by_steps(memory, x, stored, is_init)
@@ -361,14 +351,11 @@ class MemoryModule(TensorDictModuleBase):
 
     def stored_state(self, tensordict: TensorDictBase, rows: tuple[int, ...]) -> TensorDict:
         """The states at hand, with the batch shape of ``rows``; where one is missing, the initial state."""
-        initial = None
         state = TensorDict({}, batch_size=rows)
         for key, leaf in self._state_keys.items():
             value = tensordict.get(key, None)
             if value is None:
-                if initial is None:
-                    initial = self.memory.initial_state(rows[0])  # type: ignore[operator]
-                value = initial.get(leaf)
+                value = self.memory.initial_state(rows[0]).get(leaf)  # type: ignore[operator]
                 value = value if len(rows) == 1 else value.unsqueeze(1).expand(*rows, *value.shape[1:])
             else:
                 value = value.reshape(*rows, *value.shape[tensordict.ndim :])

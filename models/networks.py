@@ -109,7 +109,8 @@ class MemoryNetwork(TensorDictModuleBase):
     """From frames, last actions and start flags to one number per action; a TensorDict module with a recurrent state.
 
     It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next", *state keys)]``; a
-    network whose block has no state has no state keys. Modes and states are those of :class:`MemoryModule`: one step by
+    network whose block has no state has no state keys. With a predictor it also writes ``prediction_error`` in recurrent
+    mode, float [*batch, T, 1], for losses to add (:meth:`prediction_error`). Modes and states are those of :class:`MemoryModule`: one step by
     default, sequences in recurrent mode. :meth:`encode` and :meth:`remember` do the same on plain tensors.
 
     Args:
@@ -123,6 +124,7 @@ class MemoryNetwork(TensorDictModuleBase):
         out_key: where the output is written.
         state_key: where the recurrent state stands; give actor and critic different ones.
         store: which states a stored sequence holds, see :class:`MemoryModule`.
+        predictor: what is remembered and the next one-hot action, [..., H + num_actions], to features [..., E].
 
     Raises:
         ValueError: ``zero_action_on_reset`` with ``store="step"``.
@@ -159,11 +161,12 @@ class MemoryNetwork(TensorDictModuleBase):
         out_key: Key = "action_value",
         state_key: Key = "memory",
         store: Store = "sequence",
+        predictor: nn.Module | None = None,
     ) -> None:
         super().__init__()
         if zero_action_on_reset and store == "step":
             raise ValueError("zero_action_on_reset needs store='sequence': with 'step', is_init also marks cuts")
-        self.encoder, self.block, self.head = encoder, block, head
+        self.encoder, self.block, self.head, self.predictor = encoder, block, head, predictor
         self.obs_size, self.num_actions, self.zero_action_on_reset = encoder.obs_size, num_actions, zero_action_on_reset
         self.register_buffer("actions", torch.arange(num_actions), persistent=False)
         self.actions: Tensor
@@ -211,7 +214,10 @@ class MemoryNetwork(TensorDictModuleBase):
         recurrent = self._recurrent[0]
         if self.num_actions:
             x = self._append(x, tensordict["last_action"], recurrent.start_flags(tensordict))
-        tensordict.set(recurrent.out_key, self.head(recurrent.read(tensordict, x)))
+        y = recurrent.read(tensordict, x)
+        if self.predictor is not None and recurrent.recurrent_mode:
+            tensordict.set("prediction_error", self.prediction_error(x, y, recurrent.start_flags(tensordict)))
+        tensordict.set(recurrent.out_key, self.head(y))
         return tensordict
 
     def compress(self, pixels: Tensor) -> Tensor:
@@ -267,6 +273,27 @@ class MemoryNetwork(TensorDictModuleBase):
         last_action = sequences["last_action"] if self.num_actions else is_init
         first = recurrent.stored_state(TensorDict({}, rows) if state is None else state, rows)
         return self.remember(features, last_action, is_init, first)[0]
+
+    def prediction_error(self, x: Tensor, y: Tensor, is_init: Tensor) -> Tensor:
+        """How far each next frame's features, as deviations from the batch's, are from those expected before it.
+
+        Args:
+            x: float [..., T, E + num_actions], what the block read.
+            y: float [..., T, H], what it gave.
+            is_init: bool [..., T], True where an episode begins.
+
+        Returns:
+            float [..., T, 1], mean square; 0 where no frame of the episode follows. Targets get no gradient.
+
+        Source: self-prediction with stopped gradient, Ni et al. (2024), arXiv 2401.08898.
+        """
+        size = self.encoder.feature_size
+        following, action = x[..., 1:, :size].detach(), x[..., 1:, size:]
+        seen = following.flatten(0, -2)
+        target = (following - seen.mean(0)) / (seen.std(0, correction=0) + 0.01)  # some features hardly ever change
+        expected = self.predictor(torch.cat([y[..., :-1, :], action], dim=-1))  # type: ignore[misc]
+        error = (expected - target).square().mean(-1, keepdim=True)
+        return F.pad(error.masked_fill(is_init[..., 1:, None], 0.0), (0, 0, 0, 1))
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""

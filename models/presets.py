@@ -44,6 +44,8 @@ class NetworkPreset:
     """append the one-hot last action to the features"""
     zero_action_on_reset: bool = False
     """no last action at the first step of an episode; False shows the last action of the episode before"""
+    predicts: bool = False
+    """learn to expect the next frame's features, see :meth:`MemoryNetwork.prediction_error` (of two towers the actor)"""
     memory_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """options of the cells, by name of the memory"""
 
@@ -108,7 +110,7 @@ def make_network(
         store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at every ``is_init``;
             "step": every step has a stored state, see :class:`MemoryModule`; without ``zero_action_on_reset``.
         **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``, ``head``,
-            ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``encoder``.
+            ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``predicts``, ``encoder``.
 
     Returns:
         a :class:`MemoryNetwork`.
@@ -144,18 +146,21 @@ def make_network(
         block = FeedForward(encoder.feature_size, hidden_size)
         head = make_head("linear" if chosen.head == "linear" else "plain", hidden_size, num_outputs)
     else:
-        actions = num_actions if chosen.use_last_action else 0
+        actions, hidden_size = num_actions if chosen.use_last_action else 0, chosen.hidden_size
         of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
         block = MemoryBlock(
             encoder.feature_size + actions,
-            chosen.hidden_size,
+            hidden_size,
             memory,
             layers=chosen.layers,
             skip=chosen.skip,  # type: ignore[arg-type]
             memory_options=of_preset | (memory_options or {}),
         )
-        head = make_head(chosen.head, chosen.hidden_size, num_outputs)
+        head = make_head(chosen.head, hidden_size, num_outputs)
     keys: dict[str, Any] = {"out_key": out_key, "state_key": state_key, "store": store}
+    if chosen.predicts:
+        known, size = hidden_size + actions, encoder.feature_size
+        keys["predictor"] = nn.Sequential(nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size))
     zero_action = chosen.zero_action_on_reset
     if store == "step" and "zero_action_on_reset" not in options:
         zero_action = False  # a start flag may stand where a sampler cut an episode

@@ -1,10 +1,9 @@
 """The first-order linear scan h_t = a_t h_{t-1} + b_t: everything a linear recurrent memory does over time.
 
-:func:`linear_scan` is the function to use; :func:`linear_scan_loop` beside it is the same thing as a loop that can be
-read at a glance, and the oracle of the tests. Below stand the operators that do the work, forward and backward,
-registered with torch (autograd, vmap, compile), with back ends by device: a serial loop, in place over time and
-vectorised over batch and features; on CUDA the kernels of ``scan_triton``, or, without Triton or for other dtypes, the
-doubling form, ``log2(T)`` passes over the whole tensor. The backward pass is the same recurrence run the other way on
+:func:`linear_scan` is the function to use. Below stand the operators that do the work, forward and backward, registered
+with torch (autograd, vmap, compile), with back ends by device: a serial loop, in place over time and vectorised over
+batch and features; on CUDA the kernels of ``scan_triton``, or, without Triton or for other dtypes, the doubling form,
+``log2(T)`` passes over the whole tensor. The backward pass is the same recurrence run the other way on
 conj(a) shifted by one; its own derivative is again a scan, so gradients of any order exist.
 
 Inside the operators conj() is spelled conj_physical(): compiled code (torch 2.13, aot and inductor) calls them in a way
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from arcade_torch.models.scan_triton import runs_triton, scan_backward_triton, scan_triton
 
-__all__ = ["back_end", "linear_scan", "linear_scan_loop", "scan", "scan_backward"]
+__all__ = ["back_end", "linear_scan", "scan", "scan_backward"]
 
 
 def linear_scan(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
@@ -66,25 +65,6 @@ def linear_scan(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | 
     if h0 is None:
         h0 = b.new_zeros(b.shape[:1] + b.shape[2:])
     return scan(a.expand(b.shape), b, start, h0)  # type: ignore[no-any-return]
-
-
-def linear_scan_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
-    """The same function as :func:`linear_scan`, step by step (slow)."""
-    a = a.expand(b.shape)
-    begins = torch.zeros(b.shape[:2], dtype=torch.bool) if start is None else start.clone()
-    stored = torch.zeros_like(b)
-    h = torch.zeros_like(b[:, 0])
-    if h0 is not None and h0.ndim == b.ndim:
-        stored = h0
-        begins[:, 0] = True
-    elif h0 is not None:
-        h = h0
-    states = []
-    for t in range(b.shape[1]):
-        h = torch.where(begins[:, t].reshape(-1, *[1] * (h.ndim - 1)), stored[:, t], h)
-        h = a[:, t] * h + b[:, t]
-        states.append(h)
-    return torch.stack(states, dim=1)
 
 
 def _check(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor | None) -> None:

@@ -133,6 +133,7 @@ BAD = [
     ("ppo", "entropy_coeff", -0.1),
     ("ppo", "entropy_end", 1.5),
     ("ppo", "critic_coeff", -0.1),
+    ("ppo", "prediction_coeff", -0.1),
     ("dqn", "batch_sequences", 0),
     ("dqn", "learning_starts", 0),
     ("dqn", "burn_in", -1),

@@ -6,15 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
 from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
 from arcade_torch.agents.ppo import PPO, normalise
+from arcade_torch.agents.sequences import as_steps
 from arcade_torch.models import ActorCriticNetwork
 from tests.agents.fakes import (
+    ACTIONS,
     GAMMA,
     LAM,
+    WIDTH,
     chosen,
     play,
     stream,
@@ -185,6 +190,26 @@ def test_the_entropy_bonus_fades_over_the_run():
     learner.update(batch, 0)
     learner.update(batch.exclude(*ESTIMATES), 18)
     assert seen == pytest.approx([0.4 * 0.5 ** (k / 12) for k in range(12)], abs=1e-4)
+
+
+@pytest.mark.parametrize("form", ["sequences", "stock"])
+def test_prediction_is_one_more_part_of_the_loss(form):
+    network, batch, plain = acted(with_two_states(stream(3, 7, seed=11)), form, shift=0.4)
+    batch = plain.value_estimator(batch)
+    without, actor = plain(batch), network.actor
+    with pytest.raises(KeyError, match="prediction_error"):
+        PPOLoss(make_actor(actor), network.critic, prediction_coeff=0.5)(batch)
+    actor.predictor = nn.Linear(WIDTH + ACTIONS, WIDTH)
+    loss = PPOLoss(make_actor(actor), network.critic, clip_epsilon=CLIP, prediction_coeff=0.5)
+    out = loss(batch)
+    assert loss.out_keys[-1] == "loss_prediction"
+    assert all(torch.equal(out[key], value) for key, value in without.items())
+    with set_recurrent_mode(True):
+        error = actor(as_steps(batch, loss.inputs))["prediction_error"]
+    torch.testing.assert_close(out["loss_prediction"], 0.5 * error.mean())
+    out["loss_prediction"].backward()
+    parts = (actor.encoder, actor.block, actor.predictor, actor.head, network.critic)
+    assert [any(p.grad is not None and p.grad.any() for p in m.parameters()) for m in parts] == [True] * 3 + [False] * 2
 
 
 def test_it_is_a_torchrl_loss_with_its_keys():

@@ -5,10 +5,29 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from arcade_torch.models.scan import linear_scan, linear_scan_loop
+from arcade_torch.models.scan import linear_scan
 
 TOLERANCE = {torch.float32: 1e-5, torch.complex64: 1e-5, torch.float64: 1e-12, torch.complex128: 1e-12}
 LENGTHS = [1, 2, 3, 7, 31, 32, 33, 128, 132, 300]
+
+
+def linear_scan_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
+    """The same function as ``linear_scan``, step by step: the oracle."""
+    a = a.expand(b.shape)
+    begins = torch.zeros(b.shape[:2], dtype=torch.bool) if start is None else start.clone()
+    stored = torch.zeros_like(b)
+    h = torch.zeros_like(b[:, 0])
+    if h0 is not None and h0.ndim == b.ndim:
+        stored = h0
+        begins[:, 0] = True
+    elif h0 is not None:
+        h = h0
+    states = []
+    for t in range(b.shape[1]):
+        h = torch.where(begins[:, t].reshape(-1, *[1] * (h.ndim - 1)), stored[:, t], h)
+        h = a[:, t] * h + b[:, t]
+        states.append(h)
+    return torch.stack(states, dim=1)
 
 
 def problem(

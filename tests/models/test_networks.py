@@ -4,8 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.nn import functional as F
+from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.models import MemoryBlock, check_memory, make_network
+from arcade_torch.models import MemoryBlock, check_memory, make_actor_critic, make_network
 from arcade_torch.models.presets import HEADS, make_head
 
 CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
@@ -96,6 +98,57 @@ def test_the_last_action_is_seen_and_zeroed_at_a_start_only_where_asked():
     assert last_action_matters(make_network(**small, zero_action_on_reset=False), is_init=True)
     assert not last_action_matters(make_network(**small, use_last_action=False), is_init=False)
     assert not make_network("paper", "mlp").zero_action_on_reset
+
+
+def predicting(memory, **options):
+    torch.manual_seed(0)
+    return make_network("small", memory, obs_size=32, **options)
+
+
+@pytest.mark.parametrize("memory", ["lru", "feedforward"])
+def test_the_error_of_prediction_is_the_one_written_out_and_changes_nothing_else(memory):
+    network = predicting(memory, predicts=True)
+    pixels, last_action, is_init = inputs(3, 6)
+    batch = TensorDict({"pixels": pixels, "last_action": last_action, "is_init": is_init.unsqueeze(-1)}, [3, 6])
+    with torch.no_grad(), set_recurrent_mode(True):
+        found, plain = network(batch.clone()), predicting(memory)(batch.clone())
+    assert "prediction_error" not in plain
+    assert torch.equal(found["action_value"], plain["action_value"])
+    with torch.no_grad():
+        features = network.encode(pixels)
+        one_hot = F.one_hot(last_action, 5).float()
+        seen = torch.cat([features, one_hot * ~is_init.unsqueeze(-1)], -1) if memory == "lru" else features
+        y, _ = network.block(seen, network.initial_state(3), is_init)
+        nexts = features[:, 1:].reshape(-1, 128)
+        mean, deviation = nexts.mean(0), nexts.var(0, correction=0).sqrt()
+        for b in range(3):
+            for t in range(6):
+                wanted = torch.zeros(())
+                if t < 5 and not is_init[b, t + 1]:
+                    known = torch.cat([y[b, t], one_hot[b, t + 1]]) if memory == "lru" else y[b, t]
+                    target = (features[b, t + 1] - mean) / (deviation + 0.01)
+                    wanted = ((network.predictor(known) - target) ** 2).mean()
+                torch.testing.assert_close(found["prediction_error"][b, t, 0], wanted)
+
+
+def test_the_frame_that_is_predicted_gets_no_gradient_and_those_before_it_do():
+    network = predicting("lru", predicts=True)
+    pixels, last_action, _ = inputs(1, 5)
+    frames, flags = pixels.float().requires_grad_(), torch.zeros(1, 5, 1, dtype=torch.bool)
+    batch = TensorDict({"pixels": frames, "last_action": last_action, "is_init": flags}, [1, 5])
+    with set_recurrent_mode(True):
+        network(batch)["prediction_error"][0, 3].backward()
+    reached = frames.grad[0].flatten(1).abs().sum(1)
+    assert reached[4] == 0 and (reached[:4] > 0).all()
+
+
+def test_a_step_predicts_nothing_and_of_two_towers_the_actor_does():
+    network = predicting("lru", predicts=True)
+    flags, frame = torch.ones(2, 1, dtype=torch.bool), torch.zeros(2, 32, 32, 3, dtype=torch.uint8)
+    step = {"pixels": frame, "last_action": torch.zeros(2, dtype=torch.int64), "is_init": flags}
+    assert "prediction_error" not in network(TensorDict(step, [2]))
+    two = make_actor_critic("small", "lru", towers=2, predicts=True, obs_size=32)
+    assert two.actor.predictor is not None and two.critic.predictor is None
 
 
 def test_saliency_reaches_every_earlier_frame_through_the_memory():

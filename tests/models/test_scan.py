@@ -12,12 +12,12 @@ from arcade_torch.models import scan_triton
 from arcade_torch.models.scan import (
     back_end,
     linear_scan,
-    linear_scan_loop,
     scan,
     scan_backward,
     scan_backward_doubling,
     scan_doubling,
 )
+from tests.models.scan_cases import linear_scan_loop
 
 DTYPES = [torch.float64, torch.complex128]
 

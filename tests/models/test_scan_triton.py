@@ -21,12 +21,13 @@ from hypothesis import strategies as st
 
 from arcade_torch.models import check_memory, make_memory, scan_triton
 from arcade_torch.models import scan as scan_ops
-from arcade_torch.models.scan import back_end, linear_scan, linear_scan_loop, scan, scan_backward
+from arcade_torch.models.scan import back_end, linear_scan, scan, scan_backward
 from tests.models.scan_cases import (
     LENGTHS,
     assert_close,
     assert_equals_the_loop,
     assert_nothing_crosses_a_start,
+    linear_scan_loop,
     problem,
 )
 
