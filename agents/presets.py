@@ -9,7 +9,7 @@ from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
 _SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
 _SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
 _SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
-_SMALL_PPO = {"epochs": 4, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
+_SMALL_PPO = {"epochs": 3, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
 _SMALL_PPO |= {"entropy_coeff": 0.05, "entropy_end": 0.002, "critic_coeff": 4.0, "prediction_coeff": 1.0}
 _TINY = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
 _TINY_REPLAY = {"replay_frames": 192, "batch_sequences": 8, "learning_starts": 16, "burn_in": 2}
@@ -25,9 +25,9 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "small": {
         "algorithm": "ppo",
         "network": "small",
-        "total_frames": 1_500_000,
+        "total_frames": 2_200_000,
         "threads": 1,
-        "eval_every": 150_000,
+        "eval_every": 200_000,
         "checkpoint_every": 50_000,
         "pqn": _SMALL | _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6},
         "ppo": _SMALL | _SMALL_PPO,

@@ -47,7 +47,7 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
 
-@pytest.mark.parametrize(("algorithm", "steps"), [("pqn", 3104), ("ppo", 1552)])
+@pytest.mark.parametrize(("algorithm", "steps"), [("pqn", 3104), ("ppo", 1164)])
 def test_gradient_steps_of_the_small_preset_in_200k_frames(algorithm, steps):
     c = preset("small", algorithm=algorithm, total_frames=200_000)
     assert c.num_updates * c.learner.grad_steps_per_update == steps
