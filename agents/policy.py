@@ -126,7 +126,7 @@ def build_network(config: TrainConfig) -> Network:
     draw moves.
     """
     make: Any = make_actor_critic if config.algorithm == "ppo" else make_network
-    options = {"predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0} | config.network_options
+    options = {"predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0, **config.network_options}
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(config.seed)
         network: Network = make(config.network, memory=config.memory, obs_size=config.obs_size, **options)

@@ -162,7 +162,7 @@ class PPOLoss(ClipPPOLoss):
         self.time_limit, self.prediction_coeff = time_limit, prediction_coeff
         self.normalize_advantage = True
         self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
-        self.out_keys = [*self.out_keys, *["loss_prediction"] * bool(prediction_coeff)]
+        self.out_keys = [*self.out_keys, *["loss_prediction"] * bool(prediction_coeff)]  # type: ignore[has-type]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The parts of the loss.

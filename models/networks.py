@@ -109,9 +109,9 @@ class MemoryNetwork(TensorDictModuleBase):
     """From frames, last actions and start flags to one number per action; a TensorDict module with a recurrent state.
 
     It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next", *state keys)]``; a
-    network whose block has no state has no state keys. With a predictor it also writes ``prediction_error`` in recurrent
-    mode, float [*batch, T, 1], for losses to add (:meth:`prediction_error`). Modes and states are those of :class:`MemoryModule`: one step by
-    default, sequences in recurrent mode. :meth:`encode` and :meth:`remember` do the same on plain tensors.
+    network whose block has no state has no state keys. Modes and states are those of :class:`MemoryModule`: one step by
+    default, sequences in recurrent mode. With a predictor it then also writes ``prediction_error`` for losses to add,
+    see the method of that name. :meth:`encode` and :meth:`remember` do the same on plain tensors.
 
     Args:
         encoder: frames to features [..., E].

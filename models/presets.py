@@ -45,7 +45,7 @@ class NetworkPreset:
     zero_action_on_reset: bool = False
     """no last action at the first step of an episode; False shows the last action of the episode before"""
     predicts: bool = False
-    """learn to expect the next frame's features, see :meth:`MemoryNetwork.prediction_error` (of two towers the actor)"""
+    """the memory (of two towers the actor) learns to expect the next frame, see ``MemoryNetwork.prediction_error``"""
     memory_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """options of the cells, by name of the memory"""
 
