@@ -61,7 +61,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       memory, the games' law of the published numbers.
     * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core (results/small.md;
       results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
-      Time limits end like terminations, which is better for MineSweeper and worse for CartPole (results/recipe.md).
+      Time limits end like terminations; PPO's memory also learns to expect the next frame's features.
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
