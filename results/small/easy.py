@@ -1,0 +1,124 @@
+"""Keeps easy.csv, and makes of it the table of small.md and easy-curves.png.
+
+    python results/small/easy.py [COMMIT STUDY_FOLDER ...]
+
+Finished runs of the study folders are added to easy.csv, where the run is not there yet; COMMIT trained them.
+"""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).parent
+PAPER = HERE.parents[1] / "tools" / "data" / "paper_returns.csv"
+TABLE = HERE / "easy.csv"
+TWINS = {"full": "MDP", "partial": "POMDP"}
+MEMORIES = {"lru": "LRU", "mlp": "none"}
+PUBLISHED = ("AutoEncodeEasy", "NavigatorEasy")  # the games that count under the published rules
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A return without the zero in front."""
+    return f"{value:.{digits}f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{digits}f}"
+
+
+def add(rows: list[dict[str, str]], commit: str, folder: Path) -> None:
+    """Append the finished runs of a study that are not there yet."""
+    known = {(row["study"], row["game"], row["twin"], row["memory"], row["seed"]) for row in rows}
+    for run in sorted((folder / "runs").iterdir()):
+        if not (run / "eval.json").exists():
+            continue
+        result = json.loads((run / "eval.json").read_text())
+        config = json.loads((run / "config.json").read_text())["config"]
+        twin = TWINS[config["observability"]]
+        key = (folder.name, config["env"].removesuffix("-v0"), twin, config["memory"], str(config["seed"]))
+        if result["status"] != "finished" or key in known:
+            continue
+        with open(run / "eval.csv") as file:
+            curve = [float(row["mean"]) for row in csv.DictReader(file)]
+        rules = "published" if config["rules"] == "reference" else "ours"
+        values = [*key[:3], rules, *key[3:], commit, result["frames"], f"{result['mean']:.3f}", f"{result['std']:.3f}"]
+        values += [f"{result['train_max_ewm']:.3f}", round(result["seconds"]), " ".join(f"{v:.2f}" for v in curve)]
+        rows.append(dict(zip(rows[0], map(str, values), strict=True)))
+
+
+def paper() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
+    """The paper's returns of Easy games: game and twin -> model -> mean and deviation."""
+    found: dict[tuple[str, str], dict[str, tuple[float, float]]] = {}
+    with open(PAPER) as file:
+        for row in csv.DictReader(file):
+            if row["difficulty"] == "easy" and row["model"] != "human":
+                for twin in ("MDP", "POMDP"):
+                    value = float(row[f"{twin.lower()}_mean"]), float(row[f"{twin.lower()}_std"])
+                    found.setdefault((row["env"].replace("NoisyPole", "NoisyCartPole") + "Easy", twin), {})[
+                        row["model"]
+                    ] = value
+    return found
+
+
+def table(rows: list[dict[str, str]]) -> None:
+    """Print the cells, one a line, seeds in order."""
+    print("| game | twin | rules | memory | seeds | greedy | training | paper: best | LRU / none | reached |")
+    print("|" + "---|" * 10)
+    cells: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in sorted(rows, key=lambda row: (row["game"], row["twin"], row["memory"], row["seed"])):
+        cells.setdefault((row["game"], row["twin"], row["rules"], row["memory"]), []).append(row)
+    for (game, twin, rules, memory), runs in cells.items():
+        models = paper()[game, twin]
+        best = max(models, key=lambda model: models[model])
+        means = [sum(float(run[key]) for run in runs) / len(runs) for key in ("eval_mean", "train_max_ewm")]
+        enough = [round(mean, 2) >= models[best][0] for mean in means]
+        reached = {(True, True): "yes", (True, False): "greedy only", (False, True): "training only"}
+        columns = [game.removesuffix("Easy"), twin, rules, MEMORIES[memory], ", ".join(run["seed"] for run in runs)]
+        columns += [" ".join(number(float(run[key])) for run in runs) for key in ("eval_mean", "train_max_ewm")]
+        columns.append(f"{number(models[best][0], 2)} ± {number(models[best][1], 2)} ({best})")
+        columns.append(f"{number(models['LRU'][0], 2)} / {number(models['MLP'][0], 2)}")
+        print("| " + " | ".join([*columns, reached.get((enough[0], enough[1]), "no")]) + " |")
+
+
+def draw(rows: list[dict[str, str]]) -> None:
+    """Greedy returns over frames, a panel a cell and a line a run; dashed, the paper's best."""
+    plt.style.use(PAPER.parent / "light.mplstyle")
+    games = sorted({game for game, _ in paper()})
+    figure, axes = plt.subplots(4, 5, figsize=(11, 8), sharex=True)
+    colours = dict(zip(MEMORIES, plt.rcParams["axes.prop_cycle"].by_key()["color"], strict=False))
+    for place, game in enumerate(games):
+        for line, twin in enumerate(TWINS.values()):
+            axis = axes[2 * (place // 5) + line][place % 5]
+            axis.axhline(max(paper()[game, twin].values())[0], color="grey", linestyle="--", linewidth=1)
+            for row in rows:
+                if (row["game"], row["twin"]) == (game, twin):
+                    curve = [float(value) for value in row["curve"].split()]
+                    axis.plot([0.2 * (n + 1) for n in range(len(curve))], curve, color=colours[row["memory"]], lw=1.2)
+            axis.set_title(f"{game.removesuffix('Easy')} {twin}", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("million frames")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("greedy return")
+    handles = [plt.Line2D([], [], color=colour, label=MEMORIES[name]) for name, colour in colours.items()]
+    handles.append(plt.Line2D([], [], color="grey", linestyle="--", label="paper's best"))
+    figure.legend(handles=handles, loc="upper center", ncols=3, bbox_to_anchor=(0.5, 1.03))
+    figure.tight_layout()
+    figure.savefig(HERE / "easy-curves.png", dpi=110, bbox_inches="tight")
+
+
+def main() -> None:
+    """Add, print and draw."""
+    with open(TABLE, newline="") as file:
+        rows = list(csv.DictReader(file))
+    for folder in sys.argv[2:]:
+        add(rows, sys.argv[1], Path(folder))
+    rows.sort(key=lambda row: (row["study"], row["game"], row["twin"], row["memory"], int(row["seed"])))
+    with open(TABLE, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    table(rows)
+    draw(rows)
+
+
+if __name__ == "__main__":
+    main()
