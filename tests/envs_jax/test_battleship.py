@@ -301,6 +301,32 @@ def test_marks_have_one_colour_and_leave_the_tile_visible(id, size):
         assert not ring[middle, middle]
 
 
+@pytest.mark.parametrize("id", SIDES)
+def test_a_closed_walk_that_fires_where_no_mark_is_seen_wins_without_any_memory(id):
+    game, side = make(id), SIDES[id]
+    walk = [(0, y) for y in range(side)]
+    for row in range(side):
+        columns = range(1, side) if row % 2 == 0 else range(side - 1, 0, -1)
+        walk += [(x, side - 1 - row) for x in columns]
+    moves = np.zeros((side, side), np.int32)
+    steps = {(0, -1): UP, (0, 1): DOWN, (-1, 0): LEFT, (1, 0): RIGHT}
+    for (x, y), (next_x, next_y) in zip(walk, walk[1:] + walk[:1], strict=True):
+        moves[x, y] = steps[next_x - x, next_y - y]
+
+    def play(carry, _):
+        state, over, earned = carry
+        seen = state.guesses[state.x, state.y] == 1  # the POMDP's picture shows the mark under the cursor
+        action = jnp.where(seen, jnp.asarray(moves)[state.x, state.y], FIRE)
+        state, reward, terminated, truncated = game.step(KEY, state, action)
+        return (state, over | terminated | truncated, earned + jnp.where(over, 0.0, reward)), None
+
+    def episode(state):
+        return jax.lax.scan(play, (state, False, 0.0), length=2 * side**2)[0][2]
+
+    first = jax.tree.map(lambda leaf: leaf[:256], fresh(id))
+    np.testing.assert_allclose(jax.jit(jax.vmap(episode))(first), 1.0, atol=1e-5)
+
+
 def test_the_state_oracle_hits_every_ship_cell():
     np.testing.assert_allclose(oracle_return(make("BattleShipMedium"), "state", 64), 1.0, atol=1e-5)
 
