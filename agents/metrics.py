@@ -28,9 +28,8 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
     """The number the paper reports for a run: the best smoothed training return.
 
     The training curve is interpolated linearly on 1,000 equispaced points in [0, ``max_frames``] (constant beyond the
-    ends), smoothed by an exponentially weighted mean with span 100 points, turned into its running maximum, and
-    the maximum of that is the score. It contains exploration noise and never goes down; keep it beside a greedy
-    evaluation, not in place of one.
+    ends) and smoothed by an exponentially weighted mean with span 100 points; its maximum is the score. It contains
+    exploration noise and never goes down; keep it beside a greedy evaluation, not in place of one.
 
     Args:
         frames: float [P], increasing; frames seen at each point of the history.
@@ -51,19 +50,19 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
     if np.any(np.diff(x) <= 0):
         raise ValueError("frames must increase from row to row")
     grid = np.linspace(0.0, x[-1] if max_frames is None else max_frames, CURVE_POINTS)
-    return float(np.maximum.accumulate(ewm(np.interp(grid, x, y))).max())
+    return float(ewm(np.interp(grid, x, y)).max())
 
 
 @dataclass
 class EpisodeStats:
     """Returns of training episodes, followed from window to window."""
 
-    last: NDArray[np.float64]  # [N], return of the last finished episode of each environment; 0 before the first
+    last: NDArray[np.float64]  # [N], return of the last finished episode of each environment; NaN before the first
     episodes: int = 0  # finished so far
     smooth: float | None = None  # running average of finished episodes (span 100 windows); None before the first
     finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # [E], those of the last window
 
-    def update(self, episode_reward: Tensor, done: Tensor) -> float:
+    def update(self, episode_reward: Tensor, done: Tensor) -> float | None:
         """Read one window of new steps.
 
         Args:
@@ -71,8 +70,8 @@ class EpisodeStats:
             done: bool [N, T].
 
         Returns:
-            The last finished return of each environment, averaged over the steps and environments of this window: one
-            point of the history :func:`paper_score` reads.
+            The last finished return of each environment, averaged over the window, for :func:`paper_score`; None until
+            each has one: 0 in its place, as in published scores, beats what is negative (docs/differences.md, Tetris).
         """
         returns, ends = episode_reward.cpu().double().numpy(), done.cpu().numpy()
         self.finished = returns[ends]
@@ -83,7 +82,7 @@ class EpisodeStats:
         if len(self.finished):
             mean = float(self.finished.mean())
             self.smooth = mean if self.smooth is None else self.smooth + 2 / (EWM_SPAN + 1) * (mean - self.smooth)
-        return float(known.mean())
+        return None if np.isnan(known).any() else float(known.mean())
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""

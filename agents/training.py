@@ -47,7 +47,7 @@ class TrainResult:
         frames: training frames.
         seconds: time spent collecting and learning.
         evaluation: greedy evaluation at the end; None if interrupted.
-        train_max_ewm: the paper's score of the training curve; None if interrupted.
+        train_max_ewm: the paper's score of the training curve; None where an env ended no episode.
     """
 
     run_dir: Path
@@ -95,7 +95,7 @@ class Trainer:
             return_same_td=True,
             store_states=False,
         )
-        self.stats = EpisodeStats(np.zeros(numbers.num_envs))
+        self.stats = EpisodeStats(np.full(numbers.num_envs, np.nan))
         self.frames = self.updates = 0
         self.seconds = 0.0
 
@@ -324,8 +324,9 @@ class _Run:
     def _finish(self) -> TrainResult:
         began = time.perf_counter()
         result = self._evaluate()
-        history = read_csv(self.folder.path / "metrics.csv", strict=False)
-        score = paper_score([int(r["frames"]) for r in history], [float(r["train_return_last"]) for r in history])
+        rows = [row for row in read_csv(self.folder.path / "metrics.csv", strict=False) if row["train_return_last"]]
+        points = [[float(row[name]) for row in rows] for name in ("frames", "train_return_last")]
+        score = paper_score(*points) if rows else None
         final = {
             "status": "finished",
             "frames": self.trainer.frames,

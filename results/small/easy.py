@@ -1,4 +1,4 @@
-"""Keeps easy.csv, and makes of it the table of small.md and easy-curves.png.
+"""Keeps easy.csv, and makes of it the tables of small.md and easy-curves.png.
 
     python results/small/easy.py [COMMIT STUDY_FOLDER ...]
 
@@ -79,6 +79,25 @@ def table(rows: list[dict[str, str]]) -> None:
         print("| " + " | ".join([*columns, reached.get((enough[0], enough[1]), "no")]) + " |")
 
 
+def compare(rows: list[dict[str, str]]) -> None:
+    """Print what LRU adds on the POMDPs, where both agents were trained: means over seeds."""
+    print("\n| POMDP | seeds | greedy: LRU, none | training: LRU, none | added | paper: LRU, none |")
+    print("|" + "---|" * 6)
+    for game in sorted({row["game"] for row in rows}):
+        runs = {m: [r for r in rows if (r["game"], r["twin"], r["memory"]) == (game, "POMDP", m)] for m in MEMORIES}
+        if not all(runs.values()):
+            continue
+        means = {
+            key: [sum(float(run[key]) for run in runs[m]) / len(runs[m]) for m in MEMORIES]
+            for key in ("eval_mean", "train_max_ewm")
+        }
+        columns = [game.removesuffix("Easy"), " and ".join(str(len(runs[m])) for m in MEMORIES)]
+        columns += [", ".join(number(mean) for mean in pair) for pair in means.values()]
+        columns.append(", ".join(number(one - other) for one, other in means.values()))
+        columns.append(", ".join(number(paper()[game, "POMDP"][model][0], 2) for model in ("LRU", "MLP")))
+        print("| " + " | ".join(columns) + " |")
+
+
 def draw(rows: list[dict[str, str]]) -> None:
     """Greedy returns over frames, a panel a cell and a line a run; dashed, the paper's best."""
     plt.style.use(PAPER.parent / "light.mplstyle")
@@ -117,6 +136,7 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     table(rows)
+    compare(rows)
     draw(rows)
 
 

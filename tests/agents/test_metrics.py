@@ -56,7 +56,7 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
     reward, done = torch.randn(envs, steps, generator=g), torch.rand(envs, steps, generator=g) < 0.3
     expected, last = [], np.zeros((envs, steps))
     for i in range(envs):
-        start, newest = 0, 0.0
+        start, newest = 0, np.nan
         for t in range(steps):
             if done[i, t]:
                 newest = float(reward[i, start : t + 1].double().sum())
@@ -68,16 +68,28 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
         running = running + reward[:, t]
         so_far[:, t] = running
         running = torch.where(done[:, t], 0.0, running)
-    stats, seen, means = EpisodeStats(np.zeros(envs)), [], []
+    stats, seen = EpisodeStats(np.full(envs, np.nan)), []
     for part in (slice(0, min(cut, steps)), slice(min(cut, steps), steps)):
         if reward[:, part].shape[1]:
-            means.append(stats.update(so_far[:, part], done[:, part]) * reward[:, part].shape[1])
+            mean = stats.update(so_far[:, part], done[:, part])
+            if np.isnan(last[:, part]).any():
+                assert mean is None
+            else:
+                assert mean == pytest.approx(last[:, part].mean(), abs=1e-6)
             seen += stats.finished.tolist()
-        saved, stats = stats.state_dict(), EpisodeStats(np.zeros(envs))
+        saved, stats = stats.state_dict(), EpisodeStats(np.full(envs, np.nan))
         stats.load_state_dict(saved)
     np.testing.assert_allclose(sorted(seen), sorted(expected), atol=1e-6)
     assert stats.episodes == len(expected)
-    assert sum(means) == pytest.approx(last.mean(0).sum(), abs=1e-6)
+
+
+def test_an_environment_that_has_not_ended_yet_is_no_success():
+    """Zeros in the place of first returns are what the published score of Tetris without memory is made of."""
+    stats, lost = EpisodeStats(np.full(2, np.nan)), torch.full((2, 4), -1.0)
+    ends = torch.tensor([[False, True, False, True], [False, False, False, False]])
+    assert stats.update(lost, ends) is None and stats.finished.tolist() == [-1.0, -1.0]
+    assert stats.update(lost, ends.flip(0)) is None  # the second has nothing at the beginning of this window
+    assert stats.update(lost, ends & False) == -1.0
 
 
 def test_the_interval_is_that_of_the_normal_mean():
