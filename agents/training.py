@@ -326,7 +326,7 @@ class _Run:
         result = self._evaluate()
         rows = [row for row in read_csv(self.folder.path / "metrics.csv", strict=False) if row["train_return_last"]]
         points = [[float(row[name]) for row in rows] for name in ("frames", "train_return_last")]
-        score = paper_score(*points) if rows else None
+        score = paper_score(points[0], points[1]) if rows else None
         final = {
             "status": "finished",
             "frames": self.trainer.frames,
