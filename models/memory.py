@@ -134,7 +134,7 @@ class Memory(nn.Module):
         """See :class:`MemoryContract`."""
         self._check(x, state, is_init)
         y, h = self.run(x, state["h"], is_init)
-        return y, TensorDict({"h": h[:, -1]}, batch_size=[x.shape[0]])
+        return y, TensorDict({"h": h[:, -1].clone()}, batch_size=[x.shape[0]])  # y may be the same memory
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See :class:`ReplayableMemory`."""
@@ -158,8 +158,10 @@ class Memory(nn.Module):
         if x.shape[1] == 0:
             raise ValueError(f"x must have at least one step, got {list(x.shape)}")
         dtype = self.like.dtype
-        if x.dtype != dtype and not (x.is_floating_point() and torch.is_autocast_enabled(x.device.type)):
+        if x.dtype != dtype:
             raise ValueError(f"x is {x.dtype} but the parameters are {dtype}: cast one of them with .to()")
+        if torch.is_autocast_enabled(x.device.type):
+            raise ValueError("memory models round too much under autocast: turn it off here, as MemoryModule does")
         if not isinstance(is_init, Tensor) or is_init.dtype != torch.bool or is_init.shape != x.shape[:2]:
             given = f"{is_init.dtype} {list(is_init.shape)}" if isinstance(is_init, Tensor) else repr(is_init)
             raise ValueError(
@@ -167,6 +169,8 @@ class Memory(nn.Module):
             )
         batch, wanted = x.shape[:batch_ndim], self.state_leaves()
         shapes = {name: (*batch, *shape) for name, (shape, _) in wanted.items()}
+        if not isinstance(state, TensorDictBase):
+            raise ValueError(f"the state must be a TensorDict, as from initial_state(batch_size), got {type(state)}")
         if set(state.keys()) != set(wanted) or any(state[name].shape != shape for name, shape in shapes.items()):
             got = {name: list(leaf.shape) for name, leaf in state.items()}
             raise ValueError(
@@ -205,10 +209,10 @@ class MemoryModule(TensorDictModuleBase):
         is_init_key: start flags, bool [*batch, 1].
         default_recurrent_mode: mode outside of ``set_recurrent_mode``.
         store: "step": a stored sequence holds the state of every step; "sequence": that of its first step; None: "step"
-            unless one state takes more than 49,152 bytes, the size of a frame.
+            unless a state takes more than 49,152 bytes, the size of a frame, or does not begin with zeros.
 
     Raises:
-        ValueError: unknown ``store``.
+        ValueError: unknown ``store``, or "step" for a memory that does not begin with zeros.
 
     Source: TorchRL's recurrent-state life cycle, ``LSTMModule`` and ``GRUModule``.
 
@@ -251,8 +255,11 @@ class MemoryModule(TensorDictModuleBase):
         leaves = [path for path in paths if isinstance(example.get(path), Tensor)]
         self._empty = [p for p in paths if p not in leaves and not any(leaf[: len(p)] == p for leaf in leaves)]
         self._state_keys = {(*prefix, *leaf): leaf for leaf in leaves}
+        zeros = not any(example.get(leaf).any() for leaf in leaves)
+        if store == "step" and not zeros:
+            raise ValueError("store='step' needs a memory that begins with zeros, as primers write: take 'sequence'")
         state_bytes = sum(example.get(leaf).nbytes for leaf in leaves)
-        self.store = store or ("step" if state_bytes <= LARGE_STATE else "sequence")
+        self.store = store or ("step" if zeros and state_bytes <= LARGE_STATE else "sequence")
         self.in_keys = [self.in_key, *self._state_keys, self.is_init_key]
         self.out_keys = [self.out_key, *(("next", *key) for key in self._state_keys)]
 
@@ -273,13 +280,14 @@ class MemoryModule(TensorDictModuleBase):
                 keys may be missing, which means the initial state.
 
         Returns:
-            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"``: ``out_key`` only).
+            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"``: ``out_key`` only; so do not
+            call it with keywords there).
 
         Raises:
             ValueError: recurrent mode without a time dimension, or start flags that are not [*batch, 1].
-            KeyError: no start flags.
+            KeyError: no input or no start flags.
         """
-        tensordict.set(self.out_key, self.read(tensordict, tensordict.get(self.in_key)))
+        tensordict.set(self.out_key, self.read(tensordict, tensordict[self.in_key]))
         return tensordict
 
     def start_flags(self, tensordict: TensorDictBase) -> Tensor:
@@ -300,6 +308,8 @@ class MemoryModule(TensorDictModuleBase):
     def read(self, tensordict: TensorDictBase, x: Tensor) -> Tensor:
         """Like :meth:`forward`, with the input given and the output returned: for modules around this one.
 
+        Autocast is off inside: a recurrence adds up what bfloat16 rounds away.
+
         Args:
             tensordict: start flags and states are read from it, next states are written to it.
             x: float [*batch, D].
@@ -312,13 +322,15 @@ class MemoryModule(TensorDictModuleBase):
             raise ValueError("recurrent mode reads the last batch dimension as time, but the batch shape is []")
         rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
         x, is_init = x.reshape(*rows, x.shape[-1]), is_init.reshape(rows)
-        if not recurrent:
-            y, after = self.memory(x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1))
-        elif self.store == "step":
-            y, after = replay(self.memory, x, self.stored_state(tensordict, rows), is_init)
-        else:
-            firsts = tensordict.select(*self._state_keys, strict=False)[..., 0]
-            y, after = self.memory(x, self.stored_state(firsts, rows[:1]), is_init)
+        x = x.float() if torch.is_autocast_enabled(x.device.type) else x
+        with torch.autocast(x.device.type, enabled=False):
+            if not recurrent:
+                y, after = self.memory(x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1))
+            elif self.store == "step":
+                y, after = replay(self.memory, x, self.stored_state(tensordict, rows), is_init)
+            else:
+                firsts = tensordict.select(*self._state_keys, strict=False)[..., 0]
+                y, after = self.memory(x, self.stored_state(firsts, rows[:1]), is_init)
         if not (recurrent and self.store == "sequence"):
             for key, leaf in self._state_keys.items():
                 value = after.get(leaf)
@@ -343,7 +355,7 @@ class MemoryModule(TensorDictModuleBase):
         if self.store == "step":
             raise ValueError("with store='step' every step needs a state of its own: make the module with 'sequence'")
         for key in self._state_keys:
-            value = state.get(key)
+            value = state[key]
             axis = tensordict.ndim - 1
             shape = (*value.shape[:axis], tensordict.shape[-1], *value.shape[axis:])
             tensordict.set(key, value.unsqueeze(axis).expand(shape))
@@ -368,8 +380,7 @@ class MemoryModule(TensorDictModuleBase):
         """The transform that puts initial states into an env's resets; ``get_primers_from_module`` finds it.
 
         Returns:
-            ``TensorDictPrimer`` for the state keys, zeros (a state that starts elsewhere is restored by the memory, at
-            ``is_init``).
+            ``TensorDictPrimer`` for the state keys, zeros (a memory that begins elsewhere does so at ``is_init``).
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs import TensorDictPrimer

@@ -126,6 +126,9 @@ class MemoryNetwork(TensorDictModuleBase):
         store: which states a stored sequence holds, see :class:`MemoryModule`.
         predictor: what is remembered and the next one-hot action, [..., H + num_actions], to features [..., E].
 
+    Attributes:
+        out_key, state_keys, store: those of :class:`MemoryModule`.
+
     Raises:
         ValueError: ``zero_action_on_reset`` with ``store="step"``.
 
@@ -175,21 +178,7 @@ class MemoryNetwork(TensorDictModuleBase):
         module = self._recurrent[0]
         self.in_keys = ["pixels", *["last_action"] * bool(num_actions), module.is_init_key, *module.state_keys]
         self.out_keys = module.out_keys
-
-    @property
-    def out_key(self) -> Key:
-        """Where the output is written."""
-        return self._recurrent[0].out_key  # type: ignore[no-any-return]
-
-    @property
-    def store(self) -> Store:
-        """Which states a stored sequence holds."""
-        return self._recurrent[0].store
-
-    @property
-    def state_keys(self) -> Sequence[tuple[str, ...]]:
-        """Keys of the recurrent state, without "next"."""
-        return self._recurrent[0].state_keys
+        self.out_key, self.state_keys, self.store = module.out_key, module.state_keys, module.store
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
         """The transform that puts initial states into an env's resets; see :class:`MemoryModule`."""

@@ -123,6 +123,24 @@ def test_an_operator_that_is_not_associative_is_caught_when_it_is_run_as_a_tree(
     assert caught.value.law == "scan equals step by step" and caught.value.discrepancy > 1e-3
 
 
+class ForgetsAt(MinGRU):
+    """Loses its state between chunks of 128 steps within a call."""
+
+    def run(self, x, h0, is_init):
+        parts = [super(ForgetsAt, self).run(*both) for both in self.chunks(x, h0, is_init)]
+        return tuple(torch.cat(part, 1) for part in zip(*parts, strict=True))
+
+    def chunks(self, x, h0, is_init):
+        for i, (part, flags) in enumerate(zip(x.split(128, 1), is_init.split(128, 1), strict=True)):
+            yield part, h0 if i == 0 else torch.zeros_like(h0), flags
+
+
+def test_a_state_lost_at_the_border_of_a_chunk_is_caught():
+    with pytest.raises(MemoryLawError, match="T=150") as caught:
+        check_memory(ForgetsAt(3, 4))
+    assert caught.value.law == "scan equals step by step"
+
+
 class LateReset(nn.Module):
     """Resets one step late, and does so alike in every split, because the flag is part of the state."""
 

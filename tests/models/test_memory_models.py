@@ -312,6 +312,11 @@ def test_wrong_inputs_get_one_clear_line(name):
     if name != "mlp":
         with pytest.raises(ValueError, match=r"another model or batch size; begin with initial_state"):
             memory(torch.zeros(2, 5, 3), memory.initial_state(3), flags)
+    for wrong in (None, torch.zeros(2, 4)):
+        with pytest.raises(ValueError, match="must be a TensorDict, as from initial_state"):
+            memory(torch.zeros(2, 5, 3), wrong, flags)
+    with torch.autocast("cpu", torch.bfloat16), pytest.raises(ValueError, match="autocast"):
+        memory(torch.zeros(2, 5, 3), memory.initial_state(2), flags)
     with pytest.raises(ValueError, match="positive"):
         make_memory(name, 0, 4)
 

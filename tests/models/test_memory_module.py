@@ -241,3 +241,55 @@ def test_wrong_flags_and_missing_time_get_one_clear_line():
         module(TensorDict({"x": torch.zeros(2, 3), "is_init": torch.zeros(2, dtype=torch.bool)}, [2]))
     with set_recurrent_mode(True), pytest.raises(ValueError, match="time"):
         module(TensorDict({"x": torch.zeros(3), "is_init": torch.zeros(1, dtype=torch.bool)}, []))
+    with pytest.raises(KeyError, match="x"):
+        module(TensorDict({"is_init": torch.zeros(2, 1, dtype=torch.bool)}, [2]))
+    with pytest.raises(KeyError, match="memory"):
+        MemoryModule(make_memory("gru", 3, 4), store="sequence").begin_with(TensorDict({}, [2, 5]), TensorDict({}, [2]))
+
+
+class StartsAtOnes(OnlyTwoMethods):
+    """A constant other than zeros at the start of an episode."""
+
+    def initial_state(self, batch_size):
+        return super().initial_state(batch_size).apply(torch.ones_like)
+
+    def forward(self, x, state, is_init):
+        h, outputs = state["deep", "h"], []
+        for t in range(x.shape[1]):
+            h = self.cell(x[:, t], torch.where(is_init[:, t, None], 1, h))
+            outputs.append(h)
+        return torch.stack(outputs, 1), TensorDict({"deep": {"h": h}}, batch_size=[len(x)])
+
+
+def test_a_memory_that_does_not_begin_with_zeros_learns_from_what_it_acted():
+    policy = make_policy(StartsAtOnes())
+    data = make_env(policy).rollout(20, policy, break_when_any_done=False)
+    assert policy[1].store == "sequence" and data["is_init"][:, 1:].any()
+    torch.testing.assert_close(replayed(policy, data)["action_value"], data["action_value"], rtol=0, atol=1e-6)
+    with pytest.raises(ValueError, match="zeros"):
+        MemoryModule(StartsAtOnes(), store="step")
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_autocast_around_a_module_changes_nothing_in_the_memory(name):
+    module = MemoryModule(MEMORIES[name](), in_key="x", out_key="y")
+    data = TensorDict({"x": torch.randn(2, 5, 8).bfloat16(), "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)}, [2, 5])
+    exact = data.clone().set("x", data["x"].float())
+    for mode in (False, True):
+        with set_recurrent_mode(mode), torch.no_grad():
+            expected = module(exact.clone())
+            with torch.autocast("cpu", torch.bfloat16):
+                got = module(data.clone())
+        for key in module.out_keys if not mode or module.store == "step" else ["y"]:
+            assert got[key].dtype == expected[key].dtype
+            torch.testing.assert_close(got[key], expected[key], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", MEMORIES)
+def test_a_write_into_the_output_leaves_the_state_alone(name):
+    memory = MEMORIES[name]()
+    with torch.no_grad():
+        y, state = memory(torch.randn(2, 1, 8), memory.initial_state(2), torch.zeros(2, 1, dtype=torch.bool))
+        before = state.clone()
+        y.fill_(7.0)
+    assert (state == before).all()

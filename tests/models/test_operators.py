@@ -1,6 +1,5 @@
 """The operators behind the scans, lifted to start flags: however steps are bracketed, the scan comes out."""
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,29 +29,6 @@ def lifted(operator):
         return (right[0] if flag else operator(left[0], right[0])), left[1] or flag
 
     return combine
-
-
-def element(kind, dtype):
-    """A random element of one of the two monoids."""
-    if kind == "linear":
-        return torch.randn(3, dtype=dtype), torch.randn(3, dtype=dtype)
-    return torch.randn(3, 3, dtype=dtype) / 2, torch.randn(3, 2, dtype=dtype)
-
-
-OPERATORS = {"linear": linear, "matrix": matrix}
-
-
-@pytest.mark.parametrize("dtype", [F64, torch.complex128])
-@pytest.mark.parametrize("kind", OPERATORS)
-@given(flags=st.tuples(st.booleans(), st.booleans(), st.booleans()), seed=st.integers(0, 2**16))
-@settings(max_examples=40, deadline=None)
-def test_three_in_a_row_may_be_bracketed_either_way(kind, dtype, flags, seed):
-    torch.manual_seed(seed)
-    combine = lifted(OPERATORS[kind])
-    x, y, z = ((element(kind, dtype), flag) for flag in flags)
-    (one, one_flag), (other, other_flag) = combine(combine(x, y), z), combine(x, combine(y, z))
-    assert one_flag == other_flag == any(flags)
-    torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
 
 
 def bracketed(combine, elements, generator):
