@@ -1,12 +1,16 @@
 """What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here imports torch."""
 
 import dataclasses
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
+# Names that are no options, because other fields decide them and learners rely on them.
+OF_ENV = ("id", "num_envs", "observability", "obs_size", "seed", "device", "rules", "categorical_actions")
+OF_NETWORK = ("preset", "memory", "obs_size", "num_outputs", "num_actions", "out_key", "state_key", "store", "encoder")
 
 
 class Range(NamedTuple):
@@ -17,6 +21,8 @@ class Range(NamedTuple):
 
 
 Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
+DEVICES = ("cpu", "cpu:0", "cuda", *(f"cuda:{index}" for index in range(128)))
+Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", lambda x: x in DEVICES)]
 Count = Annotated[int, Range("a whole number >= 1", lambda x: x >= 1)]
 CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: x >= 0)]
 Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
@@ -56,10 +62,20 @@ def coerce(name: str, value: Any, kind: Any) -> Any:
         return float(value)
     if kind == Options:
         require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
+        for option, given in value.items():
+            require(survives_json({option: given}), f"{name}.{option}", given, "a value that JSON gives back as it was")
         return dict(value)
     words = {str: "a string", bool: "true or false"}
     require(isinstance(value, kind), name, value, words.get(kind, f"a {kind.__name__}"))
     return value
+
+
+def survives_json(value: Any) -> bool:
+    """Whether JSON gives a value back as it was."""
+    try:
+        return bool(json.loads(json.dumps(value)) == value)
+    except (TypeError, ValueError, RecursionError):  # it cannot be written, or not be compared
+        return False
 
 
 @dataclass(frozen=True)
@@ -160,8 +176,6 @@ class PQNConfig(QConfig):
     Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
     """
 
-    GROUP: ClassVar[str] = "pqn."
-
     bootstrap: Bootstrap = "next"
     """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
     last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
@@ -178,8 +192,6 @@ class PPOConfig(LearnerConfig):
 
     Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
     """
-
-    GROUP: ClassVar[str] = "ppo."
 
     learning_rate: Positive = 1e-4
     """Step size at the start."""
@@ -211,7 +223,6 @@ class DQNConfig(QConfig):
     experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
     """
 
-    GROUP: ClassVar[str] = "dqn."
     SPLIT: ClassVar[str] = "batch_sequences"
 
     lam: Fraction = 0.0
@@ -235,8 +246,7 @@ class DQNConfig(QConfig):
         super().__post_init__()
         length = self.overlap + self.num_steps
         self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
-        stored = self.targets == "stored"
-        self._require(not (stored and self.target_every), "target_every", "0 with targets='stored'")
+        self._require(self.targets != "stored" or not self.target_every, "target_every", "0 with targets='stored'")
         held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
         frames = -(-needed // self.num_envs) * self.num_envs * length
         self._require(held >= needed, "replay_frames", f">= {frames}, room for {needed} sequences of {length} frames")
@@ -250,6 +260,8 @@ class DQNConfig(QConfig):
 
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
 """The algorithms, and the class of the field with their numbers."""
+for _name, _kind in GROUPS.items():
+    _kind.GROUP = f"{_name}."
 
 
 @dataclass(frozen=True)
@@ -281,7 +293,7 @@ class TrainConfig(Checked):
     """Frames of training; rounded down to whole updates."""
     seed: Seed = 0
     """Seed of everything random in the run, in [0, 2**30)."""
-    device: Text = "cpu"
+    device: Device = "cpu"
     """Torch device of the network and the learner."""
     amp: bool = False
     """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the rest stays float32.
@@ -312,9 +324,12 @@ class TrainConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()  # names of games and models are checked when they are made
-        kind = self.device.partition(":")[0]
-        self._require(kind in ("cpu", "cuda", "mps", "xpu"), "device", "a torch device such as 'cpu' or 'cuda:0'")
-        graphs = kind == "cuda" or not self.cuda_graphs
+        for name, names in (("env_options", OF_ENV), ("network_options", OF_NETWORK)):
+            found = ", ".join(option for option in getattr(self, name) if option in names)
+            self._require(not found, name, f"without {found}, which other fields decide")
+        cells = self.network_options.get("memory_options") or {}
+        require(isinstance(cells, Mapping), "network_options.memory_options", cells, "a table of options of the memory")
+        graphs = self.device.startswith("cuda") or not self.cuda_graphs
         self._require(graphs, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device")
         envs, steps, frames = self.learner.num_envs, self.learner.num_steps, self.learner.frames_per_update
         allowed = f"at least one update of {envs} envs x {steps} steps = {frames} frames"
@@ -325,8 +340,7 @@ class TrainConfig(Checked):
     @property
     def learner(self) -> LearnerConfig:
         """Numbers of the learner that ``algorithm`` names."""
-        found: LearnerConfig = getattr(self, self.algorithm)
-        return found
+        return getattr(self, self.algorithm)  # type: ignore[no-any-return]
 
     @property
     def num_updates(self) -> int:

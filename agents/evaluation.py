@@ -1,7 +1,7 @@
 """Greedy evaluation on seeds that training never sees."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -76,7 +76,7 @@ def evaluate(
     Every environment contributes exactly one episode, so long episodes count as much as short ones.
 
     Args:
-        agent: an ``Agent``; with ``env`` given, anything with ``initial_state`` and ``act``.
+        agent: an ``Agent``, played where its network is; with ``env``, anything with ``initial_state`` and ``act``.
         observability: twin to play; default the one the agent was trained on (of a mixed training, half the episodes
             each). With ``env`` given, its own is put back afterwards.
         episodes: number of environments, and of episodes.
@@ -90,7 +90,8 @@ def evaluate(
     require(episodes >= 1, "episodes", episodes, "a whole number >= 1")
     require(observability in (None, "full", "partial"), "observability", observability, "'full' or 'partial'")
     if env is None:
-        env = make_eval_env(agent.config, episodes, observability)
+        device = str(next(agent.network.parameters()).device)
+        env = make_eval_env(replace(agent.config, device=device, cuda_graphs=False), episodes, observability)
     before = env.observability
     try:
         if observability is not None:

@@ -55,6 +55,7 @@ class Agent(TensorDictModuleBase):
         config: of the run that trained it.
         network: on its device; see :meth:`outputs` for what its outputs mean.
         frames: training frames behind it.
+        offers: what :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs", "value").
 
     Example:
         >>> import arcade_torch
@@ -69,6 +70,7 @@ class Agent(TensorDictModuleBase):
     def __init__(self, config: TrainConfig, network: Network, frames: int = 0) -> None:
         super().__init__()
         self.config, self.network, self.frames = config, network, frames
+        self.offers = network.offers if isinstance(network, ActorCriticNetwork) else ("q", "value")
         self.policy = make_policy(network, explore=False)
         self.in_keys, self.out_keys = self.policy.in_keys, self.policy.out_keys
 
@@ -76,11 +78,6 @@ class Agent(TensorDictModuleBase):
         """Write the greedy action and what it rests on."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             return self.policy(tensordict)
-
-    @property
-    def offers(self) -> tuple[str, ...]:
-        """What :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs", "value")."""
-        return ActorCriticNetwork.offers if isinstance(self.network, ActorCriticNetwork) else ("q", "value")
 
     def initial_state(self, batch_size: int) -> TensorDictBase:
         """Recurrent state before the first observation, TensorDict [N]."""
@@ -133,8 +130,7 @@ def build_network(config: TrainConfig) -> Network:
     for module in network.modules():
         if isinstance(module, Encoder):
             module.amp = config.amp
-    network.to(config.device)
-    return network
+    return network.to(config.device)  # type: ignore[no-any-return]
 
 
 def compile_network(network: nn.Module, backend: str = "inductor") -> None:
@@ -160,12 +156,13 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     """
     checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
-    network = build_network(replace(config, device="cpu"))
+    network = build_network(replace(config, device="cpu", cuda_graphs=False))
     try:
         network.load_state_dict(checkpoint.weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise CheckpointError(f"the weights in {checkpoint.path} do not fit the network: {reason}") from error
     if device is None:
-        device = config.device if config.device == "cpu" or torch.cuda.is_available() else "cpu"
+        wanted = torch.device(config.device)
+        device = wanted if (wanted.index or 0) < torch.cuda.device_count() else "cpu"
     return Agent(config, network.to(device), checkpoint.frames).eval()  # type: ignore[no-any-return]

@@ -74,7 +74,7 @@ def gae(
 class SequenceGAE(nn.Module):
     """Advantages by one pass of the critic over each sequence, final observations read where they belong.
 
-    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target`` and ``state_value`` [N, L, 1].
+    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value`` [N, L, 1] or [L, 1].
 
     Args:
         critic: any TensorDict module that writes ``state_value`` [*, 1].
@@ -109,7 +109,7 @@ class SequenceGAE(nn.Module):
         """Estimate advantages; gives the same object, with the three entries.
 
         Args:
-            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [B, T] with dense next observations.
+            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [N, L], [L] with next observations.
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
@@ -122,7 +122,8 @@ class SequenceGAE(nn.Module):
         ends = data["terminated"]
         advantage = gae(data["reward"], here, following, ends, data["cut"] & ~ends, gamma=self.gamma, lam=self.lmbda)
         entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
-        shape = batch.get("is_init").shape[: here.ndim]
+        flags = batch.get("is_init")  # of sequences, the batch itself does not say how long they are
+        shape = flags.shape[:-1] if flags.ndim > batch.ndim else batch.shape
         for key, entry in entries.items():
             batch[self.writes[key]] = entry.reshape(shape).unsqueeze(-1)
         return batch
@@ -211,8 +212,7 @@ class PPOLoss(ClipPPOLoss):
         return log_weight, dist, kl, correction
 
     def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
-        entropy: Tensor = dist.entropy()
-        return entropy.unsqueeze(-1)
+        return dist.entropy().unsqueeze(-1)  # type: ignore[no-any-return]
 
 
 def normalise(advantage: Tensor) -> Tensor:

@@ -153,6 +153,7 @@ class PQNLoss(LossModule):
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TDLambda
     out_keys = ["loss", "q_mean", "target_mean", "td_error"]  # noqa: RUF012 (TorchRL's convention)
+    functional = True  # see the argument
 
     value_network: TensorDictModuleBase
     value_network_params: TensorDictParams
@@ -170,7 +171,7 @@ class PQNLoss(LossModule):
         functional: bool = True,
     ) -> None:
         super().__init__()
-        self._functional = functional
+        self.functional = functional
         if functional:
             self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
         else:
@@ -179,32 +180,15 @@ class PQNLoss(LossModule):
         self.inputs = NetworkInputs(value_network)
         self.time_limit, self.bootstrap, self.delay_value = time_limit, bootstrap, delay_value
         self.burn_in, self.reduction = burn_in, reduction
-        self._in_keys: list[Key] | None = None
+        self._default_value_estimator()
 
-    @property
-    def functional(self) -> bool:
-        """Whether the parameters are held apart from the network."""
-        return self._functional
-
-    @property
-    def in_keys(self) -> list[Key]:
-        """Entries that every batch holds; assign others to call the loss with plain tensors in another order."""
-        if self._in_keys is not None:
-            return self._in_keys
+    def _set_in_keys(self) -> None:
+        """Entries that every batch holds; when names are set, assign others for plain tensors in another order."""
         keys = self.tensor_keys
         roots = dict.fromkeys([*self.inputs.observation_keys, *self.inputs.state_keys, keys.action, keys.is_init])
         outcome = [("next", key) for key in (keys.reward, keys.terminated, keys.truncated)]
         nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
-        return [*roots, *outcome, *nexts]
-
-    @in_keys.setter
-    def in_keys(self, keys: list[Key]) -> None:
-        self._in_keys = keys
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        if self._value_estimator is not None:
-            names = ("reward", "done", "terminated", "value_target")
-            self._value_estimator.set_keys(**{name: getattr(self.tensor_keys, name) for name in names})
+        self.in_keys = [*roots, *outcome, *nexts]
 
     def make_value_estimator(
         self, value_type: ValueEstimators | ValueEstimatorBase | None = None, **hyperparams: Any
@@ -266,7 +250,7 @@ class PQNLoss(LossModule):
         return TensorDict(loss=loss, **means, batch_size=[])
 
     def _online(self) -> AbstractContextManager[Any]:
-        if not self._functional:
+        if not self.functional:
             return nullcontext()
         return self.value_network_params.to_module(self.value_network, preserve_module_state=False)  # type: ignore[no-any-return]
 

@@ -29,6 +29,7 @@ from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, lo
 from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
+from arcade_torch.dlpack import pick_devices
 from arcade_torch.envs_jax import resolve_id
 
 Progress = Callable[[Mapping[str, Any]], None]
@@ -66,17 +67,21 @@ class Trainer:
     Args:
         config: of the run.
         replay_folder: where a replay writes, made when first needed; None for a temporary folder.
+
+    Raises:
+        ValueError: the device is not there; the game, the memory model, the network or one of their options is unknown.
     """
 
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
         self.config, numbers = config, config.learner
+        device, _ = pick_devices(config.device)  # refused here if it is not there
         self.network = build_network(config)
         if config.compile:
             compile_network(self.network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
-        device = torch.device(config.device)
-        self._random: Any = torch.cuda if device.type == "cuda" else torch  # whose generator draws the actions
+        on_gpus = torch.cuda.default_generators
+        self.random = on_gpus[device.index] if device.type == "cuda" else torch.default_generator  # draws the actions
         training = Training(self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs)
         self.learner = LEARNERS[config.algorithm](self.network, numbers, training)
         self.policy = make_policy(self.network)
@@ -161,7 +166,7 @@ class Trainer:
         collector.pop("policy_state_dict", None)
         return {
             **self.learner.state_dict(),
-            "explore": self._random.get_rng_state(),
+            "explore": self.random.get_state(),
             "shuffle": self.shuffle.get_state(),
             "collector": collector,
             "stats": self.stats.state_dict(),
@@ -176,7 +181,7 @@ class Trainer:
         try:
             self.learner.load_state_dict(state)
             self.network.load_state_dict(checkpoint.weights)
-            self._random.set_rng_state(state["explore"].cpu())
+            self.random.set_state(state["explore"].cpu())
             self.shuffle.set_state(state["shuffle"])
             self.collector.load_state_dict(state["collector"], strict=False)
             self.stats.load_state_dict(state["stats"])
@@ -223,7 +228,7 @@ def train(
         CheckpointError: ``resume`` found only damaged checkpoints.
         NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last checkpoint is good.
         LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
-        ValueError: the game, the memory model or the network does not exist.
+        ValueError: the game, the memory model, the network or the device does not exist.
     """
     config = dataclasses.replace(config, env=resolve_id(config.env))
     folder = RunFolder(Path(run_dir))
@@ -259,7 +264,7 @@ class _Run:
         path, frames = self.folder.path, self.trainer.frames
         with (
             closing(CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)) as self.metrics,
-            closing(CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames)) as self.evals,
+            closing(CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames - self.trainer.done)) as self.evals,
             closing(RunLogger(self.config, path, frames)) as self.logger,
         ):
             try:

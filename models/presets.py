@@ -135,8 +135,10 @@ def make_network(
         raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
     chosen = replace(chosen, **options)
     for name in ("hidden_size", "layers", "feedforward_size", "towers"):
-        if not isinstance(getattr(chosen, name), int):
-            raise ValueError(f"{name} must be a whole number, got {getattr(chosen, name)!r}")
+        if not isinstance(size := getattr(chosen, name), int):
+            raise ValueError(f"{name} must be a whole number, got {size!r}")
+        if size < 1:
+            raise ValueError(f"{name} must be at least 1, got {size}")
     if chosen.towers not in (1, 2):
         raise ValueError(f"towers must be 2 (actor and critic apart) or 1 (one network for both), got {chosen.towers}")
     encoder = chosen.encoder(obs_size)
@@ -161,9 +163,7 @@ def make_network(
     if chosen.predicts:
         known, size = hidden_size + actions, encoder.feature_size
         keys["predictor"] = nn.Sequential(nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size))
-    zero_action = chosen.zero_action_on_reset
-    if store == "step" and "zero_action_on_reset" not in options:
-        zero_action = False  # a start flag may stand where a sampler cut an episode
+    zero_action = chosen.zero_action_on_reset and (store != "step" or "zero_action_on_reset" in options)
     return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys)
 
 

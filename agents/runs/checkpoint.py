@@ -68,8 +68,7 @@ def save_checkpoint(
     torch.save(trainer, draft / _TRAINER)
     sums = {part: checksum(draft / part) for part in (_WEIGHTS, _TRAINER)}
     write_json(draft / _META, {"format": FORMAT, "frames": frames, "config": config.to_dict(), "sha256": sums})
-    if final.exists():
-        shutil.rmtree(final)
+    shutil.rmtree(final, ignore_errors=True)
     os.replace(draft, final)
     write_atomic(folder / _LATEST, final.name + "\n")
     for old in (*list_checkpoints(folder)[KEEP:], *folder.glob(".frames-*")):

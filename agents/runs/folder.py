@@ -81,7 +81,7 @@ class RunFolder:
             yield
 
     def _prepare(self, config: TrainConfig) -> None:
-        for draft in self.path.glob(".*.[0-9]*"):
+        for draft in (*self.path.glob(".*.[0-9]*"), *self.replay.glob(".window-*")):
             draft.unlink(missing_ok=True)
         for draft in self.checkpoints.glob(".frames-*"):
             shutil.rmtree(draft, ignore_errors=True)

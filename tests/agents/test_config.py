@@ -3,9 +3,11 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
+import torch
 
-from arcade_torch.agents.config import GROUPS, DQNConfig, PQNConfig, TrainConfig, differing_fields
+from arcade_torch.agents.config import GROUPS, OF_ENV, OF_NETWORK, DQNConfig, PQNConfig, TrainConfig, differing_fields
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
 
@@ -92,6 +94,24 @@ def test_a_preset_can_be_changed_down_to_its_learner():
         ({"ppo": {"lambda": 1}}, r"unknown field 'ppo\.lambda'"),
         ({"ppo": {"gamma": "high"}}, r"ppo\.gamma must be a number"),
         ({"network_options": 3}, "network_options"),
+        ({"network_options": {"memory_options": 3}}, r"network_options\.memory_options must be a table .*; got 3$"),
+        *[
+            ({"network_options": {name: "x"}}, rf"^network_options must be without {name}, which other fields decide")
+            for name in OF_NETWORK
+        ],
+        *[
+            ({"env_options": {name: 1}}, rf"^env_options must be without {name}, which other fields decide; got ")
+            for name in OF_ENV
+        ],
+        *[
+            ({"env_options": {"noise": value}}, r"^env_options\.noise must be a value that JSON gives back")
+            for value in (abs, (1, 2), {1: 2}, float("nan"), np.zeros(2), torch.zeros(2))
+        ],
+        ({"env_options": {1: 2}}, r"^env_options\.1 must be a value"),
+        *[
+            ({"device": device}, rf"^device must be 'cpu', 'cuda' or one of several such as 'cuda:0'; got {device!r}$")
+            for device in ("foo", "mps", "xpu:0", "cpu:x", "cuda:", "cuda:01", "cuda:1000")
+        ],
     ],
 )
 def test_a_bad_field_gets_one_line_that_names_it(change, words):
@@ -209,6 +229,11 @@ def test_what_a_machine_cannot_do_is_refused(change, words):
     assert TrainConfig.from_dict(config.to_dict()) == config
 
 
-def test_a_device_that_torch_does_not_know_gets_one_line():
-    with pytest.raises(ValueError, match=r"^device must be a torch device such as 'cpu' or 'cuda:0'; got 'foo'$"):
-        preset("small", device="foo")
+def test_options_that_json_keeps_are_taken_and_the_devices_that_games_know():
+    for options in (
+        {"memory_options": {"slow_gates": True}, "skip": "none"},
+        {"memory_options": None, "x": [1, 2.5, ""]},
+    ):
+        assert preset("small", network_options=options).network_options == options
+    for device in ("cpu", "cpu:0", "cuda", "cuda:0", "cuda:12"):
+        assert preset("small", device=device).device == device

@@ -1,5 +1,7 @@
 """How a network acts: explores, samples, is greedy; an agent is a policy."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -7,7 +9,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import arcade_torch
-from arcade_torch.agents import Agent, build_network, make_actor, make_policy, preset
+from arcade_torch.agents import Agent, build_network, evaluate, load, make_actor, make_policy, preset
+from arcade_torch.agents.runs.checkpoint import save_checkpoint
+from arcade_torch.tools.analysis.windows import resolve_agent
 from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
 
 MANY = 20_000
@@ -125,3 +129,24 @@ def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
         assert torch.equal(agent.outputs(out, "value"), out.amax(-1, keepdim=True))
     with pytest.raises(ValueError, match=r"offers .*, not 'advantage'"):
         agent.outputs(out, "advantage")
+
+
+@pytest.mark.parametrize(("device", "graphs"), [("cuda", False), ("cuda", True), ("cuda:3", False)])
+def test_an_agent_of_a_gpu_is_loaded_and_plays_where_there_is_none(tmp_path, monkeypatch, device, graphs):
+    """Of one with a high index also where there are others."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: device == "cuda:3")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: int(device == "cuda:3"))
+    config = preset("smoke", env="SignpostEasy-v0", device=device, cuda_graphs=graphs)
+    weights = build_network(replace(config, device="cpu", cuda_graphs=False)).state_dict()
+    save_checkpoint(tmp_path / "checkpoints", config, 128, weights, {})
+    agent = load(tmp_path)
+    assert agent.config == config and next(agent.network.parameters()).device.type == "cpu"
+    assert len(evaluate(agent, episodes=2).returns) == 2
+    _, env = resolve_agent(agent, num_envs=2)
+    assert env.device.type == "cpu"
+
+
+@pytest.mark.parametrize("name", ["hidden_size", "layers"])
+def test_a_network_without_any_size_is_refused_in_one_line(name):
+    with pytest.raises(ValueError, match=rf"^{name} must be at least 1, got -4$"):
+        build_network(preset("smoke", memory="gru", network_options={name: -4}))

@@ -105,6 +105,15 @@ def test_advantages_do_not_depend_on_how_many_rows_are_read_at_once_and_rows_kee
     torch.testing.assert_close(loss(whole[rows])["entropy"], loss(whole[rows.flip(0)])["entropy"])
 
 
+def test_a_flat_sequence_gets_the_advantages_and_the_losses_of_a_batch_of_one():
+    _, batch, loss = acted(with_two_states(stream(1, 8, seed=3)), "stock", shift=0.4)
+    whole, flat = loss.value_estimator(batch.clone()), loss.value_estimator(batch[0].clone())
+    for key in ESTIMATES:
+        assert flat[key].shape == (8, 1) and torch.equal(flat[key], whole[key][0])
+    for key, part in loss(whole).exclude("ESS").items():  # TorchRL's ESS counts rows
+        torch.testing.assert_close(loss(flat)[key], part)
+
+
 def test_without_estimates_the_loss_makes_them_and_leaves_the_batch_alone():
     _, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
     fresh = loss(batch)

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -110,6 +111,14 @@ def test_resuming_a_finished_run_returns_its_result_at_once(whole, monkeypatch):
     again = train(CONFIG, folder, resume=True)
     assert (again.frames, again.train_max_ewm) == (result.frames, result.train_max_ewm)
     assert again.evaluation.returns.tolist() == result.evaluation.returns.tolist()
+
+
+@pytest.mark.parametrize("left", ["{", None])
+def test_a_finished_run_whose_result_is_lost_is_evaluated_again_and_logged_once(whole, tmp_path, left):
+    run = shutil.copytree(whole[0], tmp_path / "run")
+    (run / "eval.json").write_text(left) if left else (run / "eval.json").unlink()
+    assert train(CONFIG, run, resume=True).status == "finished"
+    assert_same_run(run, whole[0])
 
 
 def test_a_folder_that_is_taken_is_refused_and_left_alone(whole, tmp_path):
@@ -227,6 +236,31 @@ def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> 
     trainer.learner.load_state_dict(trainer.learner.state_dict())
     trainer.close()
     assert trainer.learner.optimizer.param_groups[0]["lr"] is rate
+
+
+def test_a_gpu_that_is_not_there_is_refused_in_one_line_and_leaves_no_folder_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"^device is 'cuda', but torch sees no GPU: use 'cpu', or install torch with"):
+        train(dataclasses.replace(CONFIG, device="cuda"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_generator_that_is_saved_is_that_of_the_device_on_which_actions_are_drawn(monkeypatch):
+    class Made(Exception):
+        pass
+
+    def stop(*_):
+        raise Made
+
+    monkeypatch.setattr(training, "pick_devices", lambda device: (torch.device(device), None), raising=False)
+    monkeypatch.setattr(training, "build_network", lambda config: None)
+    monkeypatch.setitem(training.LEARNERS, "pqn", stop)
+    generators = [torch.Generator(), torch.Generator()]
+    monkeypatch.setattr(torch.cuda, "default_generators", generators)
+    trainer = object.__new__(training.Trainer)
+    with pytest.raises(Made):
+        trainer.__init__(dataclasses.replace(CONFIG, device="cuda:1"))
+    assert trainer.random is generators[1]
 
 
 KILLED = """

@@ -185,4 +185,4 @@ def resolve_agent(
     if twin not in get_args(Twin):
         raise ValueError(f"this agent was trained on {twin} twins: name one of them, full or partial")
     device = str(next(agent.network.parameters()).device)
-    return player, make_eval_env(replace(agent.config, device=device), num_envs, twin)
+    return player, make_eval_env(replace(agent.config, device=device, cuda_graphs=False), num_envs, twin)

@@ -63,9 +63,13 @@ def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written
             folder.claim(CONFIG).__enter__()
         (folder.path / ".progress.json.123").write_text("{")
         (folder.checkpoints / ".frames-000000000064.123").mkdir(parents=True)
+        folder.replay.mkdir()
+        for name in ("window-000000000.safetensors", ".window-000000001.safetensors.123"):
+            (folder.replay / name).write_text("frames")
         process.kill()
     with folder.claim(CONFIG):
-        assert sorted(path.name for path in folder.path.rglob("*")) == ["checkpoints", "config.json", LOCK]
+        left = sorted(path.name for path in folder.path.rglob("*"))
+        assert left == ["checkpoints", "config.json", LOCK, "replay", "window-000000000.safetensors"]
 
 
 def test_a_lock_alone_does_not_make_a_folder_taken(tmp_path: Path) -> None:
