@@ -289,7 +289,7 @@ class TrainConfig(Checked):
     """Further options of ``make_network``."""
     algorithm: Literal["pqn", "ppo", "dqn"] = "pqn"
     """Learner; its numbers are in the field of that name, those of the others are not looked at."""
-    total_frames: int = 20_000_000
+    total_frames: Annotated[int, Range("at most 10**15", lambda x: x <= 10**15)] = 20_000_000
     """Frames of training; rounded down to whole updates."""
     seed: Seed = 0
     """Seed of everything random in the run, in [0, 2**30)."""

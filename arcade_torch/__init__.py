@@ -6,7 +6,8 @@ Public names are resolved on first use: importing the package costs little, ``ar
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import arcade_torch.gym  # noqa: F401  (puts the games into Gymnasium's registry)
+import arcade_torch.gym  # puts the games into Gymnasium's registry
+import arcade_torch.process  # noqa: F401  (notes forks)
 
 __version__ = "0.2.0"
 

@@ -29,7 +29,7 @@ class ArcadeCollector(BaseCollector):
 
     The first window acts ``overlap`` more steps, to fill the overlap; they are not counted as frames. The same happens
     after somebody else stepped, reset or loaded the env: no window holds steps from both sides of such a change, and
-    the policy's state begins anew there.
+    the policy's state begins anew there, as do the episodes that had ended.
 
     Args:
         env: The env, not wrapped (TorchRL's ``Collector`` is for transformed envs).
@@ -42,9 +42,9 @@ class ArcadeCollector(BaseCollector):
             the one that was theirs when they were acted.
         compress: uint8 [N, S, S, 3] -> uint8 [N, ...], what is stored of a frame. The policy sees the compressed frame
             too, so that acting and learning see the same.
-        final_frames: Which final frames are drawn: ``"all"``, and sequences hold dense ``("next", "pixels")``; those of
-            steps that were ``"truncated"`` and not terminated (a bootstrap needs no others), as ``final_pixels``; or
-            ``"none"``.
+        final_frames: Which final frames are drawn: ``"all"``, and batches hold dense ``("next", "pixels")``; those of
+            steps that were ``"truncated"`` and not terminated (a bootstrap needs no others), as ``final_pixels`` of
+            sequences; or ``"none"``. Iterated batches hold next frames with ``"all"`` alone.
         init_random_frames: Act at random for so many frames; the policy still runs, for its state.
         seed: Seed of env and random actions; None leaves the env as it is.
         return_same_td: Whether all batches share one storage, so that a batch is overwritten by the next one: half the
@@ -156,9 +156,10 @@ class ArcadeCollector(BaseCollector):
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield TensorDict [N, T] in TorchRL's layout until ``total_frames`` have been collected."""
         while self._frames < self.total_frames:
-            self._collect_window(random=False, dense=not self.compact_obs)
+            compact = self.compact_obs or self._final_frames != "all"
+            self._collect_window(random=False, dense=not compact)
             assert self._buffer is not None
-            batch = self._buffer.transitions(self.compact_obs)
+            batch = self._buffer.transitions(compact)
             batch["collector"] = TensorDict({"traj_ids": self._trajectories()}, batch_size=batch.batch_size)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
@@ -198,7 +199,7 @@ class ArcadeCollector(BaseCollector):
             self._acted = 0
             self._traj_ids = self._next_traj_id + torch.arange(self._num_envs, device=self.env.device)
             self._next_traj_id += self._num_envs
-            self._observe(self.env.observe())
+            self._observe(self.env.maybe_reset(self.env.observe()))
         elif self.env.generation != self._seen:
             self._observe(self.env.observe())
         if self._acted == 0:

@@ -1,6 +1,5 @@
 """The compiled functions of a game or a mixture of games, shared by all envs that play it. Loads no torch."""
 
-import os
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -262,22 +261,3 @@ def _compile(ids: str | tuple[str, ...], obs_size: int, rules: str, /, **options
     shares = Counter(ids)
     games = [make_game(id, obs_size=obs_size, rules=rules, **options) for id in shares]
     return CompiledGame(MixedGames(games, tuple(shares.values())))
-
-
-_started_in: int | None = None  # the process in which JAX computes
-
-
-def check_process() -> None:
-    """Refuse to go on in a process that was forked after JAX had started: its first computation would hang for ever.
-
-    Raises:
-        RuntimeError: This is such a process.
-    """
-    global _started_in
-    if _started_in not in (None, os.getpid()):
-        raise RuntimeError(
-            "this process was forked after JAX had started, where JAX hangs: start workers with 'spawn' (Gymnasium: "
-            "vector_kwargs={'context': 'spawn'}), or use the native vector env: gymnasium.make_vec without "
-            "vectorization_mode"
-        )
-    _started_in = os.getpid()

@@ -20,18 +20,19 @@ from arcade_torch.compiled import (
     CompiledGame,
     FinalObservations,
     FrameMemory,
-    check_process,
 )
 from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, wait_for_torch
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.process import check_process
 from arcade_torch.snapshot import Snapshots
 from arcade_torch.specs import make_specs
 
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
 Place = tuple[Canvas, int, torch.Tensor]
+Live = tuple[Batch, torch.Tensor]  # the batch, and bool [N, 2]: where its last step terminated or truncated
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
 
 
@@ -59,7 +60,7 @@ class ArcadeEnv(EnvBase):
     give equal bits, whatever N, and whichever path is taken.
 
     Threads may each step envs of their own at the same time; one env belongs to one thread at a time. Other processes
-    have to be spawned: in one that was forked after JAX had started, an env refuses to be made.
+    have to be spawned: in one that was forked after this package was loaded and JAX had started, no env can be made.
 
     Args:
         game: A game, several as ``MixedGames``, or a compiled one (whose functions are then shared).
@@ -69,7 +70,8 @@ class ArcadeEnv(EnvBase):
         device: Device of all tensors; None for the device that JAX computes on.
         categorical_actions: Actions are int64 [N]; False: one-hot [N, num_actions].
         state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and makes every step start
-            from the ``state`` it is handed, so that a planner can branch.
+            from the ``state`` it is handed, so that a planner can branch. The twin is the one that was set last; resets
+            go on with the random keys of the last step, whichever branch that was on.
         task_in_td: Whether there is a key ``task``; None: if there are several games.
         debug: Whether actions are checked on CUDA too.
 
@@ -111,7 +113,8 @@ class ArcadeEnv(EnvBase):
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         wait_for_torch(torch_device, jax_device)
         first = self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device))
-        self._live = SimpleNamespace(batch=first, generation=0, view=0)  # assignment to an nn.Module is slow
+        self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
+        self._live = SimpleNamespace(batch=first, ends=self._no_ends, generation=0, view=0)  # nn.Module sets slowly
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
         self._memory, self._ends = FrameMemory(shape, jax_device), FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
@@ -168,7 +171,8 @@ class ArcadeEnv(EnvBase):
         """Copy everything that determines the future: game states, random keys, observability, counts.
 
         Returns:
-            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game.
+            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. It does
+            not say which episodes have ended: reset those first.
         """
         return self._snapshots.export(self._live.batch)
 
@@ -179,7 +183,7 @@ class ArcadeEnv(EnvBase):
             state: What ``get_state`` gave, here or on another env of the same game with as many envs.
 
         Returns:
-            The root tensordict of that state: what a policy acts on next.
+            The root tensordict of that state: what a policy acts on next. ``done`` is false everywhere.
 
         Raises:
             ValueError: The state of another game or batch size, or a broken one.
@@ -191,7 +195,7 @@ class ArcadeEnv(EnvBase):
         """Draw the live state.
 
         Returns:
-            The root tensordict: what a policy acts on next.
+            The root tensordict: what a policy acts on next; ``done`` where an episode has ended and waits for a reset.
         """
         wait_for_torch(self.device, self._jax_device)
         return self._root(self._live.batch, to_torch(self._batched.render(self._live.batch), self.device))
@@ -256,9 +260,9 @@ class ArcadeEnv(EnvBase):
         """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
-    def _go_on(self, batch: Batch) -> None:
-        """Put another state in place."""
-        self._live.batch = batch
+    def _go_on(self, batch: Batch, ends: torch.Tensor | None = None) -> None:
+        """Put another state in place. ``ends`` bool [N, 2] says where a step terminated or truncated it."""
+        self._live.batch, self._live.ends = batch, self._no_ends if ends is None else ends
         self._live.generation += 1
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
@@ -300,31 +304,33 @@ class ArcadeEnv(EnvBase):
         root = self._root(batch, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
             validation.check_merge(tensordict, root)
-        self._go_on(batch)
+        self._go_on(batch, self._live.ends)  # which counts in the rows that stay
         return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._state_in_td:  # go on from the state the caller handed over
-            self._go_on(self._snapshots.load(tensordict.get("state", None)))
+        if self._state_in_td:  # go on from the state the caller handed over, and show the twin that was set last
+            handed = self._snapshots.load(tensordict.get("state", None))
+            self._go_on(handed._replace(partial=self._live.batch.partial))
         action = self._check_action(validation.tensor(tensordict, "action"))
-        argument, before = int32_argument(action, self._jax_device), self._live.batch
-        stepped, pixels, numbers = self._compiled.step_only(before, argument, self._memory.spare())
-        frames = to_torch(self._memory.show(pixels), self.device)
-        self._go_on(stepped)
-        following = self._next(frames, action, to_torch(numbers, self.device))
+        argument, before = int32_argument(action, self._jax_device), (self._live.batch, self._live.ends)
+        stepped, pixels, packed = self._compiled.step_only(before[0], argument, self._memory.spare())
+        frames, numbers = to_torch(self._memory.show(pixels), self.device), to_torch(packed, self.device)
+        self._go_on(stepped, numbers[:, TERMINATED:] > 0)
+        following = self._next(frames, action, numbers)
         if self._state_in_td:
             following["state"] = self._snapshots.export(stepped)
         if "_step" in tensordict:
             return self._only_marked(tensordict, before, following)
         return following
 
-    def _only_marked(self, tensordict: TensorDictBase, before: Batch, following: TensorDict) -> TensorDictBase:
+    def _only_marked(self, tensordict: TensorDictBase, before: Live, following: TensorDict) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
-        marked, stepped = validation.mask(tensordict, "_step", self.num_envs), self._live.batch
-        self._go_on(before)  # where it stays if the next line refuses
+        marked = validation.mask(tensordict, "_step", self.num_envs)
+        stepped, ends = self._live.batch, self._live.ends
+        self._go_on(*before)  # where it stays if the next line refuses
         validation.check_merge(tensordict, following)
-        rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before)))
-        self._go_on(self._batched.narrow(rows))
+        rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before[0])))
+        self._go_on(self._batched.narrow(rows), ends.where(marked.unsqueeze(-1), before[1]))
         left_alone = following.apply(torch.zeros_like)
         kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
         left_alone.update(tensordict.select(*kept, strict=False))
@@ -363,14 +369,14 @@ class ArcadeEnv(EnvBase):
             seed = int(torch.randint(2**32, ()))
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
-        self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]))
+        self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]), self._live.ends)
 
     def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""
         step_count = to_torch(batch.step_count, self.device).to(torch.int64).unsqueeze(-1)
         episode_reward = to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1)
         counts = {"is_init": step_count == 0, "step_count": step_count, "episode_reward": episode_reward}
-        ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+        ends = self._live.ends & (step_count > 0)
         root = self._entries(frames, to_torch(batch.last_action, self.device), counts, ends)
         if self._state_in_td:
             root["state"] = self._snapshots.export(batch)

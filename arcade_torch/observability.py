@@ -1,6 +1,6 @@
 """Which envs of a batch show the Markov state (MDP) and which the partial view (POMDP). Loads no torch."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -31,9 +31,7 @@ def partial_flags(
     """
     if partial_obs is not None:
         if observability is not None:
-            raise ValueError(
-                "both observability and partial_obs are given: keep observability, partial_obs is its alias"
-            )
+            raise ValueError("observability and partial_obs are given: keep observability, partial_obs is its alias")
         if not isinstance(partial_obs, bool):
             raise TypeError(f"partial_obs is {format_value(partial_obs)}, allowed: True, False")
         return np.full(num_envs, partial_obs)
@@ -41,8 +39,10 @@ def partial_flags(
         if observability not in (None, "full", "partial"):
             raise ValueError(f"observability is {format_value(observability)}, {_ALLOWED}")
         return np.full(num_envs, observability == "partial")
-    given: Any = observability
-    flags = np.array(given.cpu().numpy() if hasattr(given, "cpu") else given)
+    try:
+        flags = np.array(observability.cpu().numpy() if hasattr(observability, "cpu") else observability)
+    except ValueError:  # rows of different lengths
+        flags = np.array(None)
     if flags.dtype != np.bool_ or flags.shape != (num_envs,):
         raise ValueError(f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}")
     return flags

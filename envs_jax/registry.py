@@ -196,7 +196,8 @@ def option_names(id: str) -> list[str]:
         The names, in the order of the game's documentation.
     """
     parameters = inspect.signature(_factory(resolve_id(id))).parameters.values()
-    return [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in ("id", "obs_size", "rules")]
+    named = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    return [name for name in named if name not in ("id", "obs_size", "rules")]
 
 
 for _name, _where in (GAMES | PROBES).items():

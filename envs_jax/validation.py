@@ -17,6 +17,14 @@ def format_value(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
+def check_penalty(what: str, value: Any) -> None:
+    """Raise TypeError unless the option ``what`` is an int or a float, and ValueError unless it is from -1 to 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{what} is {format_value(value)}, expected a number from -1 to 0")
+    if not -1 <= value <= 0:
+        raise ValueError(f"{what} is {value!r}, allowed: -1 to 0")
+
+
 def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """Refuse a value outside a closed set.
 

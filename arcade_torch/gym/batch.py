@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.compiled import CompiledGame, FinalObservations, FrameMemory, check_process
+from arcade_torch.compiled import CompiledGame, FinalObservations, FrameMemory
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.process import check_process
 
 Bools = npt.NDArray[np.bool_]
 Frames = npt.NDArray[np.uint8]
@@ -29,7 +30,7 @@ class Stepped(NamedTuple):
     info: Info  # episode_reward float64 [N], step_count int64 [N]
 
 
-def seed_keys(seed: int | Sequence[int], num_envs: int) -> jax.Array:
+def seed_keys(seed: int | Sequence[int] | npt.NDArray[Any], num_envs: int) -> jax.Array:
     """Random keys of N envs.
 
     Args:
@@ -41,13 +42,15 @@ def seed_keys(seed: int | Sequence[int], num_envs: int) -> jax.Array:
         uint32 [num_envs, 2].
 
     Raises:
+        TypeError: A seed is no whole number.
         ValueError: A seed is out of range, or their number is wrong.
     """
-    if isinstance(seed, int | np.integer):
-        return env_keys(int(seed), num_envs)
+    seed = seed.tolist() if isinstance(seed, np.ndarray) else seed
+    if not isinstance(seed, Sequence):
+        return env_keys(seed, num_envs)
     if len(seed) != num_envs:
         raise ValueError(f"{len(seed)} seeds for {num_envs} envs: give one seed, or one an env")
-    return jnp.concatenate([env_keys(int(each), 1) for each in seed])
+    return jnp.concatenate([env_keys(each, 1) for each in seed])
 
 
 class NumpyBatch:

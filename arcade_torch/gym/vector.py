@@ -99,16 +99,16 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         """Begin episodes in all envs, or where a mask says so.
 
         Args:
-            seed: One seed: env ``i`` has the bits of env ``i`` of ``arcade_torch.make(..., seed=seed)``. One an env:
-                each has the bits of ``gymnasium.make`` with its seed. None goes on with the random numbers there are
-                (at first: draws a seed).
+            seed: One seed: env ``i`` has the bits of env ``i`` of ``arcade_torch.make(..., seed=seed)``. One an env,
+                none of them None: each has the bits of ``gymnasium.make`` with its seed. None alone goes on with the
+                random numbers there are (at first: draws a seed).
             options: ``{"reset_mask": bool [N]}``: the other envs go on.
 
         Returns:
             Frames and infos.
 
         Raises:
-            ValueError: A seed out of range, an unknown option, or a mask that does not fit.
+            ValueError: A seed out of range (TypeError: no whole number), an unknown option, a mask that does not fit.
         """
         mask = self._reset_mask(check_reset_options(options, ("reset_mask",)))
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)

@@ -6,6 +6,7 @@ from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.minesweeper.params import LEVELS, Params
 from arcade_torch.envs_jax.minesweeper.picture import Screen
 from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
+from arcade_torch.envs_jax.validation import check_penalty
 
 
 class MineSweeper(LevelGame[MineSweeperState]):
@@ -28,14 +29,14 @@ class MineSweeper(LevelGame[MineSweeperState]):
         starts on any cell, numbers are legible and equal in both twins.
 
     Raises:
+        TypeError: ``mine_reward`` is no number.
         ValueError: ``mine_reward`` is positive or beyond -1.
     """
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, mine_reward: float = 0.0) -> None:
-        if not -1 <= mine_reward <= 0:
-            raise ValueError(f"mine_reward is {mine_reward!r}, allowed: -1 to 0")
+        check_penalty("mine_reward", mine_reward)
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.mine_reward = float(mine_reward)
         self.max_steps = level.max_steps

@@ -6,6 +6,7 @@ from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.skittles.params import LEVELS, MAX_STEPS, Params
 from arcade_torch.envs_jax.skittles.picture import Screen
 from arcade_torch.envs_jax.skittles.rules import SkittlesState
+from arcade_torch.envs_jax.validation import check_penalty
 
 
 class Skittles(LevelGame[SkittlesState]):
@@ -26,14 +27,14 @@ class Skittles(LevelGame[SkittlesState]):
         through exists, ``terminated`` is a flag and not a count.
 
     Raises:
+        TypeError: ``hit_reward`` is no number.
         ValueError: ``hit_reward`` is positive or beyond -1.
     """
 
     levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, hit_reward: float = 0.0) -> None:
-        if not -1 <= hit_reward <= 0:
-            raise ValueError(f"hit_reward is {hit_reward!r}, allowed: -1 to 0")
+        check_penalty("hit_reward", hit_reward)
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.hit_reward = float(hit_reward)
         self.max_steps = MAX_STEPS

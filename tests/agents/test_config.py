@@ -94,6 +94,7 @@ def test_a_preset_can_be_changed_down_to_its_learner():
         ({"ppo": {"lambda": 1}}, r"unknown field 'ppo\.lambda'"),
         ({"ppo": {"gamma": "high"}}, r"ppo\.gamma must be a number"),
         ({"network_options": 3}, "network_options"),
+        ({"total_frames": 10**30}, r"^total_frames must be at most 10\*\*15; got 1000"),
         ({"network_options": {"memory_options": 3}}, r"network_options\.memory_options must be a table .*; got 3$"),
         *[
             ({"network_options": {name: "x"}}, rf"^network_options must be without {name}, which other fields decide")

@@ -95,13 +95,24 @@ def test_compact_batches_lack_only_the_next_frames() -> None:
 
 
 @pytest.mark.parametrize("overlap", [0, 4])
+@pytest.mark.parametrize("mode", ["all", "truncated", "none"])
+def test_iteration_gives_all_next_frames_or_none(mode: Any, overlap: int) -> None:
+    """Where final frames were not drawn, the first frames of the next episodes stood in their place."""
+    rollout = stub_env().rollout(3 * T + overlap, scripted, break_when_any_done=False)[:, overlap:]
+    batches = stub_collector(scripted, total_frames=3 * N * T, final_frames=mode, overlap=overlap)
+    ours = torch.cat(list(batches), 1).exclude("collector")
+    assert rollout["next", "terminated"].any() and rollout["next", "truncated"].any()
+    assert_same(ours, rollout if mode == "all" else rollout.exclude(("next", "pixels")))
+
+
+@pytest.mark.parametrize("overlap", [0, 4])
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
 def test_sequences_hold_the_data_of_a_rollout(game: CompiledGame, overlap: int) -> None:
     rollout = stub_env(game).rollout(10 * T + overlap, scripted, break_when_any_done=False)
     collector = stub_collector(scripted, game, overlap=overlap)
     for window in range(10):
         found = steps(collector.collect())
-        assert len(list(found.keys(True, True))) == 14 if game is not MIXED else 15
+        assert len(list(found.keys(True, True))) == (14 if game is not MIXED else 15)
         assert_same(found, rollout[:, window * T : (window + 1) * T + overlap].select(*found.keys(True, True)))
 
 
@@ -405,7 +416,7 @@ def test_a_change_of_observability_between_windows_is_seen_at_once() -> None:
 
 
 def rollout_of(env: ArcadeEnv) -> None:
-    env.rollout(3)
+    assert env.rollout(100)["next", "done"][:, -1].any()  # it stops at the first end, before the reset
 
 
 def reset_some(env: ArcadeEnv) -> None:
@@ -427,15 +438,18 @@ def another_collector(env: ArcadeEnv) -> None:
 @pytest.mark.parametrize("overlap", [0, 3])
 @pytest.mark.parametrize("interfere", [rollout_of, reset_some, step_raw, load, another_collector])
 def test_what_others_did_to_the_env_leaks_into_no_window(interfere: Callable[[ArcadeEnv], None], overlap: int) -> None:
-    """The overlap is dropped, the policy's state begins anew, episode numbers go on."""
+    """The overlap is dropped, the policy's state begins anew, episode numbers go on; none goes on after its end."""
     collector = stub_collector(Recurrent(), overlap=overlap)
     before = collector.collect()
     interfere(collector.env)
-    state = collector.env.get_state()
+    state, ended = collector.env.get_state(), collector.env.observe()["done"]
+    assert ended.any() == (interfere is rollout_of)
     batch = collector.collect()
+    assert batch["is_init"][:, 0][ended].all()
     expected = stub_collector(Recurrent(), overlap=overlap)
     expected.collect()
     expected.env.set_state(state)
+    expected.env.reset(TensorDict({"_reset": ended}, [N]))
     assert_same(batch, expected.collect())
     assert torch.equal(replay(batch), batch["total"]) and not torch.equal(before["pixels"], batch["pixels"])
     inside, done = batch["is_init"][:, 1:], batch["next", "done"][:, :-1]

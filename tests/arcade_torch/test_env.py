@@ -221,6 +221,23 @@ def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(tmp_path: An
     assert_same(root.select("pixels", "step_count"), env.observe().select("pixels", "step_count"))
 
 
+def test_what_is_observed_after_an_end_says_so_until_it_is_reset_or_loaded() -> None:
+    env = stub_env(LOCKSTEP, seed=1)
+    odd, last = torch.arange(N) % 2 == 1, env.rollout(100)["next"][:, -1]
+    keys = ("done", "terminated", "truncated", "is_init")
+    assert last["truncated"].all() and not last["terminated"].any()
+    assert_same(env.observe().select(*keys), last.select(*keys))
+    env.set_seed(3)  # episodes go on
+    env.observe()["truncated"].zero_()
+    root = env.reset(env.observe().set("_reset", odd))
+    assert root["done"].squeeze(-1).tolist() == env.observe()["done"].squeeze(-1).tolist() == (~odd).tolist()
+    for _ in range(5):  # the others stay where they are until the odd ones have ended too
+        assert env.observe()["done"].squeeze(-1).tolist() == (~odd).tolist()
+        env.step(scripted(env.observe()).set("_step", odd))
+    assert env.observe()["done"].all()
+    assert not env.set_state(env.get_state())["done"].any()  # a snapshot does not say what has ended
+
+
 def test_a_snapshot_is_a_private_copy() -> None:
     env = stub_env(seed=1)
     env.reset()
@@ -264,6 +281,15 @@ def test_the_state_in_the_tensordict_is_the_state_that_is_stepped() -> None:
     again = env.step(root.clone().set("action", torch.full((N,), 4)))
     assert_same(first, again)
     assert torch.equal(first["next", "state", "step_count"], root["state", "step_count"] + 1)
+
+
+def test_a_step_from_the_state_in_the_tensordict_shows_the_twin_that_was_set_last() -> None:
+    env = stub_env(observability="partial", state_in_td=True)
+    root = env.reset()
+    env.set_observability("full")
+    following = env.step(scripted(root))["next"]
+    assert not env.observability.any() and not following["state", "partial"].any()
+    assert (following["pixels"][:, 1:4] != 0).any()  # the stub's partial frames hide the serial number
 
 
 def test_one_hot_actions_mean_the_same_as_integers() -> None:

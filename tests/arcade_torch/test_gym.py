@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import arcade_torch
 from arcade_torch.envs_jax import probe_ids
+from arcade_torch.gym.batch import seed_keys
 from arcade_torch.gym.env import ArcadeGymEnv
 from arcade_torch.gym.vector import ArcadeVectorEnv
 
@@ -256,6 +257,19 @@ def test_bad_arguments_are_refused_with_one_clear_line(
         ArcadeGymEnv("MineSweeperEasy", **arguments)
     with pytest.raises(error, match=message.replace("render_mode is", "render_mode of a vector environment is")):
         ArcadeVectorEnv("MineSweeperEasy", 1, **arguments)
+
+
+@pytest.mark.parametrize(
+    "seed", [1.5, True, "12", [1, 2.0], [True, 2], [None, 2], ["1", 2], {1, 2}, np.ones(2)], ids=repr
+)
+def test_a_seed_that_is_no_whole_number_is_refused_in_one_line(seed: object) -> None:
+    with pytest.raises(TypeError, match=r"^seed is .*, expected a whole number from 0 to 4294967295$"):
+        seed_keys(seed, 2)  # type: ignore[arg-type]
+
+
+def test_seeds_of_numpy_mean_what_those_of_python_mean() -> None:
+    assert (seed_keys(np.array([3, 4]), 2) == seed_keys([3, 4], 2)).all()
+    assert (seed_keys(np.int64(3), 2) == seed_keys(3, 2)).all()  # type: ignore[arg-type]
 
 
 def test_the_vector_env_refuses_what_does_not_fit() -> None:

@@ -3,6 +3,7 @@
 import pytest
 
 from arcade_torch.envs_jax import make, option_names, register, registered_ids, resolve_id
+from tests.own_registry import forget_games
 
 
 def test_ids_are_versioned_and_sorted():
@@ -62,9 +63,26 @@ def test_wrong_rules_and_options_are_refused():
         make(3)
 
 
+@pytest.mark.parametrize("wrong", ["-0.5", None, [-0.5], False])
+@pytest.mark.parametrize(("id", "option"), [("MineSweeperEasy", "mine_reward"), ("SkittlesEasy", "hit_reward")])
+def test_a_penalty_that_is_no_number_is_refused(id, option, wrong):
+    with pytest.raises(TypeError) as error:
+        make(id, **{option: wrong})
+    assert str(error.value) == f"{option} is {wrong!r}, expected a number from -1 to 0"
+
+
 def test_options_are_listed():
     assert option_names("CartPoleEasy") == ["arrow"]
     assert option_names("MineSweeperHard") == ["mine_reward"]
+
+
+def test_options_of_a_game_of_ones_own_need_not_be_keyword_only(monkeypatch):
+    def factory(id, obs_size, rules, pairs=3, *, suits=4, **unnamed):
+        raise NotImplementedError
+
+    forget_games(monkeypatch)
+    register("PairsEasy-v0", factory)
+    assert option_names("PairsEasy") == ["pairs", "suits"]
 
 
 def test_registering_needs_a_version_and_a_free_name():

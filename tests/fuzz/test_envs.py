@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 import arcade_torch
+from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax import registered_ids, resolve_id
 from tests.fuzz.contract import attempt, fuzz
 from tests.fuzz.hostile import FLOATS, NAMES, NUMBERS, OBJECTS, anything, names, seeds
@@ -57,6 +58,15 @@ def test_make_works_or_says_in_one_line_what_is_wrong(seed: int) -> None:
         if name == "num_envs" and type(words[name]) is int and 2 < words[name] < 10**6:
             words[name] = 2  # would be fine, and compile anew
     attempt("make", lambda: arcade_torch.make(**words))
+
+
+@fuzz(2_000)
+@given(
+    st.sampled_from((("MineSweeperEasy", "mine_reward"), ("SkittlesEasy", "hit_reward"))),
+    anything | st.floats(-1.1, 0.1),
+)
+def test_a_penalty_is_taken_or_refused(option: tuple[str, str], value: Any) -> None:
+    attempt("envs_jax.make", lambda: make_game(option[0], **{option[1]: value}))
 
 
 @fuzz(6_000)

@@ -1,0 +1,27 @@
+"""Refuses processes in which JAX would hang. Loads no JAX, and is loaded with the package."""
+
+import os
+import sys
+
+_started_in: int | None = None  # the first process known to have started JAX
+
+
+def _before_fork() -> None:
+    """Note that JAX has started: here, or in a process that this one was forked from."""
+    global _started_in
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if _started_in is None and getattr(bridge, "backends_are_initialized", bool)():  # bool() is false
+        _started_in = os.getpid()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(before=_before_fork)
+
+
+def check_process() -> None:
+    """Raise RuntimeError in a process that was forked after JAX had started: computing there would hang for ever."""
+    if _started_in not in (None, os.getpid()):
+        raise RuntimeError(
+            "this process was forked after JAX had started, where JAX hangs: start workers with 'spawn' (Gymnasium: "
+            "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it needs no workers"
+        )
