@@ -34,9 +34,7 @@ class Table:
     def show(self) -> None:
         """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
         lines = [list(map(str, line)) for line in (self.columns, *self.rows)]
-        widths = [
-            max(len(part) for cell in cells for part in cell.split("\n")) + 3 for cells in zip(*lines, strict=True)
-        ]
+        widths = [max(map(len, "\n".join(cells).split("\n"))) + 3 for cells in zip(*lines, strict=True)]
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
         width = max(console().width if terminal else sum(widths) + 1, NARROWEST)

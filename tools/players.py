@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.envs_jax import make
 from arcade_torch.tools.files import markdown_table, measured_rows
 
 PLAYERS = ("random", "state", "frames")
@@ -40,11 +42,9 @@ def measure(
     Raises:
         ValueError: unknown game or player, or the game has no such oracle.
     """
-    from arcade_torch.envs_jax import make
     from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 
-    if player not in PLAYERS:
-        raise ValueError(f"player is {player!r}, allowed: {', '.join(PLAYERS)}")
+    require(player in PLAYERS, "player", player, f"one of {', '.join(PLAYERS)}")
     started, game = time.monotonic(), make(id, **options)
     who = RandomPlayer(0) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
     played = play(game, who, episodes, 0, frames=player == "frames", block=min(episodes, block), seconds=seconds)
@@ -61,7 +61,7 @@ def references(
 
     A game without an oracle lacks that player.
     """
-    file, found = folder / f"references-{game}-{rules}.json", {}
+    file = folder / f"references-{game}-{rules}.json"
     how: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
     try:
         kept = read_json(file)
@@ -69,12 +69,9 @@ def references(
             return {row["player"]: Baseline(**row) for row in kept["players"]}
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass  # there is none, or it is damaged or older: it is made anew
-    for player in PLAYERS:
-        try:
-            found[player] = measure(game, player, episodes, block=EPISODES, rules=rules, **how["options"])
-        except ValueError:
-            if player == "random":
-                raise
+    settings = {"rules": rules, **how["options"]}
+    there = [player for player in PLAYERS if player in ("random", *make(game, **settings).oracles)]
+    found = {player: measure(game, player, episodes, block=EPISODES, **settings) for player in there}
     write_json(file, {"how": how, "players": [row._asdict() for row in found.values()]})
     return found
 
@@ -87,8 +84,6 @@ def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) ->
 
 def markdown(rows: Iterable[Baseline]) -> str:
     """The rows as a Markdown table, one line a game."""
-    from arcade_torch.envs_jax import make
-
     games: dict[str, dict[str, Baseline]] = {}
     for row in rows:
         games.setdefault(row.id, {})[row.player] = row

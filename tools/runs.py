@@ -18,10 +18,9 @@ METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
 _SIZE = ("layers", "hidden_size")
 _VERSION = re.compile(r"-v\d+$")
-_NOT_SETTINGS = {
-    *("env", "observability", "memory", "seed", "algorithm", "network", "network_options", "rules", "obs_size"),
-    *("device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"),
-}
+FREE = {"device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"}
+"""Settings that may differ among runs that are compared."""
+_CELL = {"env", "observability", "memory", "seed", "algorithm", "network", "network_options", "rules", "obs_size"}
 
 
 @dataclass(frozen=True)
@@ -80,18 +79,18 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
     return found
 
 
-def is_baseline(agent: str, baseline: str) -> bool:
-    """Whether an agent is the memory-free one, alone or behind the name of an algorithm; any case."""
-    agent, baseline = agent.lower(), baseline.lower()
-    memory = agent.partition(" ")[0]  # without its size
-    return baseline in (agent, memory) or memory.endswith(f"-{baseline}")
+def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
+    """Whether an agent is the memory-free one, in any case and size; group 1 is its algorithm, ``ppo-``, or empty."""
+    return re.fullmatch(rf"(|\S*-){re.escape(baseline)}( .*)?", agent, re.IGNORECASE)
 
 
-def find_baseline(agents: Sequence[str], baseline: str) -> str | None:
-    """The memory-free agent that others are measured against: the one of that very name, else that of PQN, else any."""
-    free = [agent for agent in agents if is_baseline(agent, baseline)]
-    order = {name: (name.lower() != baseline.lower(), not name.lower().startswith("pqn-")) for name in free}
-    return min(free, key=order.__getitem__, default=None)
+def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
+    """Agent -> the memory-free agent of its algorithm, where there is one; that of the very name or of PQN is first."""
+    algorithm = {agent: found[1].lower() for agent in agents if (found := memory_free(agent, baseline))}
+    free = sorted(algorithm, key=lambda agent: (agent.lower() != baseline.lower(), algorithm[agent] != "pqn-"))
+    first = {algorithm[agent]: agent for agent in reversed(free)}
+    own = {agent: [start for start in first if agent.lower().startswith(start)] for agent in (*free, *agents)}
+    return {agent: first[max(starts, key=len)] for agent, starts in own.items() if starts}
 
 
 @dataclass(frozen=True)
@@ -235,7 +234,7 @@ def find_runs(paths: Sequence[Path]) -> Runs:
     runs = [run for run in opened.values() if run is not None]
     if not runs:
         raise ValueError(f"none of the {len(opened)} runs below {listed([str(p) for p in paths])} has finished")
-    _check_comparable(Runs(tuple(runs)))
+    check_comparable(Runs(tuple(runs)))
     unfinished = [folder.name for folder, run in opened.items() if run is None]
     notes = [f"left out, not finished: {listed(unfinished)}"] if unfinished else []
     made = [run.record.get("versions") for run in runs]
@@ -260,7 +259,7 @@ def _folders(path: Path) -> list[Path]:
     return sorted(found, key=lambda folder: (order.get(folder.name, len(order)), folder))
 
 
-def _check_comparable(found: Runs) -> None:
+def check_comparable(found: Runs) -> None:
     """Refuse several versions or rules of a game, a run that stands there twice, and seeds that are none."""
     games = sorted({run.game for run in found.runs if _VERSION.search(run.game)})
     for old, new in pairwise(games):
@@ -282,7 +281,7 @@ def _check_comparable(found: Runs) -> None:
 
 def _settings(run: Run) -> dict[str, Any]:
     """What decides a run's result beside its agent, its game and its seed."""
-    others = _NOT_SETTINGS | ({"pqn", "ppo", "dqn"} - {run.key.algorithm})
+    others = _CELL | FREE | ({"pqn", "ppo", "dqn"} - {run.key.algorithm})
     own = {name: value for name, value in run.config.items() if name not in others}
     return flatten(own | {"env_options": run.config.get("env_options") or {}})
 

@@ -1,7 +1,9 @@
 """Run folders as the trainer writes them, without any training."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +26,14 @@ def small_study(**changes: object) -> Study:
     return Study.from_dict(values | changes)
 
 
-def write_run(path: Path, run: RunSpec, final: float, frames: int = 350_000, status: str = "finished") -> None:
+def write_run(
+    path: Path,
+    run: RunSpec,
+    final: float,
+    frames: int = 350_000,
+    status: str = "finished",
+    settings: Mapping[str, Any] | None = None,
+) -> None:
     """A run folder with config, metrics, evaluations and progress; finished unless told otherwise."""
     rng = np.random.default_rng(abs(hash((run.memory, run.observability, run.seed))) % 2**32)
     path.mkdir(parents=True, exist_ok=True)
@@ -36,7 +45,7 @@ def write_run(path: Path, run: RunSpec, final: float, frames: int = 350_000, sta
         "algorithm": run.algorithm,
         "total_frames": frames,
         "pqn": {"gamma": 0.99, "lam": 0.8},
-    }
+    } | dict(settings or {})
     (path / "config.json").write_text(json.dumps({"config": config, "versions": {}, "command": ["x"]}))
     xs = np.linspace(frames / 5, frames, 5).astype(int)
     means = final * np.linspace(0.1, 1.0, 5) + 0.02 * rng.standard_normal(5)
@@ -60,6 +69,7 @@ def write_study(root: Path, study: Study, spread: float = 0.02) -> StudyFolder:
     folder.claim(study, "arcade-torch demo")
     for run in study.runs():
         shift = spread * (run.seed - (len(study.seeds) - 1) / 2)
-        write_run(folder.run(run).path, run, FINAL[run.observability, run.memory] + shift)
+        settings = study.config(run).to_dict()
+        write_run(folder.run(run).path, run, FINAL[run.observability, run.memory] + shift, settings=settings)
     folder.write_results(study)
     return folder

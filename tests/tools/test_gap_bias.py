@@ -54,8 +54,15 @@ def test_means_without_seeds_have_no_interval(paper: GapBias) -> None:
 
 
 @given(value=st.floats(-1, 1))
-def test_five_games_are_mapped_and_five_are_not(value: float) -> None:
-    signed = ("BattleShipHard-v0", "MineSweeperEasy", "BreakoutMedium", "TetrisEasy-v3", "NavigatorHard")
+def test_five_games_and_the_probe_are_mapped_and_five_are_not(value: float) -> None:
+    signed = (
+        "SignpostEasy-v0",
+        "BattleShipHard-v0",
+        "MineSweeperEasy",
+        "BreakoutMedium",
+        "TetrisEasy-v3",
+        "NavigatorHard",
+    )
     plain = ("CartPoleEasy", "NoisyCartPoleEasy", "AutoEncodeHard", "CountRecallMedium-v0", "SkittlesEasy")
     assert all(normalise(game, value) == (value + 1) / 2 for game in signed)
     assert all(normalise(game, value) == value for game in plain)
@@ -114,6 +121,19 @@ def test_the_bias_of_the_memory_free_agent_is_exactly_zero() -> None:
     table = gap_and_bias(scores(values), draws=100)
     assert table.baseline == "MLP" and table.rows[0].agent == "MLP"
     assert (table.rows[0].bias.low, table.rows[0].bias.value, table.rows[0].bias.high) == (0.0, 0.0, 0.0)
+
+
+def test_bias_is_measured_against_the_memory_free_agent_of_the_same_algorithm() -> None:
+    mdp = {"pqn-lru": 0.3, "pqn-mlp": 0.3, "dqn-lru": 0.5, "ppo-lru 2x64": 0.7, "ppo-mlp": 0.9}
+    values = {(agent, twin): [value] * 2 for agent, value in mdp.items() for twin in ("full", "partial")}
+    table = gap_and_bias(scores(values), draws=10)
+    assert [row.agent for row in table.rows] == ["pqn-mlp", "ppo-mlp", "pqn-lru", "dqn-lru", "ppo-lru 2x64"]
+    assert table.baseline == "pqn-mlp" and table.baselines["dqn-lru"] is None
+    found = {row.agent: row.bias.value for row in table.rows}
+    assert np.isnan(found.pop("dqn-lru"))  # that algorithm has none without memory
+    assert found == pytest.approx({"pqn-mlp": 0, "ppo-mlp": 0, "pqn-lru": 0, "ppo-lru 2x64": -0.2})
+    table = gap_and_bias(scores(values), baseline="ppo-mlp", draws=10)  # who names one agent measures all against it
+    assert {row.agent: row.bias.value + 0.9 for row in table.rows} == pytest.approx(mdp)
 
 
 def test_the_order_of_the_runs_does_not_matter() -> None:

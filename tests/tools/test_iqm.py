@@ -1,10 +1,10 @@
-"""The interquartile mean and its stratified bootstrap, against rliable on the same scores and the same draws."""
+"""The interquartile mean, against scipy on the same scores, and its stratified bootstrap."""
 
 import numpy as np
 import pytest
 
 from arcade_torch.tools import gap_and_bias
-from arcade_torch.tools.analysis.bootstrap import iqm, mean_over_tasks, percentile_interval, resampled
+from arcade_torch.tools.analysis.bootstrap import iqm, resampled
 from arcade_torch.tools.runs import Score
 
 
@@ -30,23 +30,12 @@ def test_the_table_has_the_interquartile_mean_with_an_interval() -> None:
     assert row.mdp_iqm.low < row.mdp_iqm.value < row.mdp_iqm.high
 
 
-@pytest.mark.parametrize("name", ["iqm", "mean"])
-def test_value_and_interval_are_those_of_rliable(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    library = pytest.importorskip("rliable.library")
-    metrics = pytest.importorskip("rliable.metrics")
-    theirs, ours = {"iqm": (metrics.aggregate_iqm, iqm), "mean": (metrics.aggregate_mean, mean_over_tasks)}[name]
-    runs, tasks, draws = 7, 6, 400
-    scores = np.random.default_rng(1).normal(size=(runs, tasks))
-    places = [np.random.default_rng(2 + task).integers(runs, size=(draws, runs)) for task in range(tasks)]
-
-    given = iter(np.stack(places, axis=-1))  # rliable draws from numpy's global state: hand it the very same draws
-    monkeypatch.setattr(np.random, "choice", lambda *words, **options: next(given))
-    values, intervals = library.get_interval_estimates({"x": scores}, lambda x: np.array([theirs(x)]), reps=draws)
-    cells = [scores[:, task] for task in range(tasks)]
-    assert float(ours(cells)) == pytest.approx(float(values["x"][0]), abs=1e-9)
-    drawn = [cell[place] for cell, place in zip(cells, places, strict=True)]
-    interval = percentile_interval(float(ours(cells)), ours(drawn), 0.95)
-    assert (interval.low, interval.high) == pytest.approx(tuple(intervals["x"][:, 0]), abs=1e-9)
+@pytest.mark.parametrize("shape", [(7, 6), (5, 1), (1, 3), (2, 2)])
+def test_the_value_is_the_trimmed_mean_of_scipy(shape: tuple[int, int]) -> None:
+    """The definition of Agarwal et al.: `scipy.stats.trim_mean` of all runs, a quarter off at both ends."""
+    scores = np.random.default_rng(1).normal(size=(50, *shape))  # draws, runs, tasks
+    right = pytest.importorskip("scipy.stats").trim_mean(scores.reshape(50, -1), 0.25, axis=1)
+    assert iqm([scores[..., task] for task in range(shape[1])]) == pytest.approx(right, abs=1e-12)
 
 
 def test_tasks_are_resampled_apart_and_keep_their_seeds() -> None:

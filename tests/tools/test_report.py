@@ -105,6 +105,24 @@ def test_a_study_without_the_control_still_has_a_page(tmp_path: Path, no_oracles
     assert "no scores for the memory-free agent" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
+def test_agents_are_told_about_beside_the_memory_free_one_of_their_algorithm(tmp_path: Path, no_oracles: None) -> None:
+    what = small_study(algorithms=["pqn", "ppo"])
+    folder = write_study(tmp_path / "s", what)
+    for run in [run for run in what.runs() if (run.algorithm, run.memory, run.observability) == ("ppo", "mlp", "full")]:
+        write_run(folder.run(run).path, run, 0.9 + 0.02 * run.seed, settings=what.config(run).to_dict())
+    page = report(tmp_path / "s", skip=("saliency",)).read_text()
+    assert "On the MDP, where memory is not needed, pqn-mingru adds 0.0" in page
+    assert "ppo-mingru costs 0.2" in page and "and ppo-mlp 0." not in page and "needed, ppo-mlp" not in page
+
+
+def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles: None) -> None:
+    folder = write_study(tmp_path / "s", small_study())
+    file = folder.run(small_study().runs()[0]).path / "config.json"
+    file.write_text(file.read_text().replace('"gamma": 0.99', '"gamma": 0.5'))
+    with pytest.raises(ValueError, match=r"seeds of mingru on MineSweeperEasy \(full\) differ in pqn.gamma"):
+        report(tmp_path / "s", skip=("saliency",))
+
+
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no part 'strips' to skip; parts: saliency, recall"):
         report(tmp_path / "s", skip=("strips",))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import pytest
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, gap_and_bias
+from arcade_torch.tools.commands.figure import Figure
 from arcade_torch.tools.play.scores import COLUMNS
 from arcade_torch.tools.runs import AgentKey, agent_names, find_runs, read_scores
 from arcade_torch.tools.studies.grid import RunSpec
@@ -69,3 +70,60 @@ def test_two_players_share_one_file_of_human_scores(tmp_path: Path) -> None:
     assert [score.value for score in read_scores(tmp_path / "human.csv")] == [0.5, 0.5, 0.7, 0.7]
     table = gap_and_bias(tmp_path / "human.csv", baseline="human", draws=10)
     assert table.row("human").seeds == 2 and table.row("human").mdp.value == pytest.approx(0.6)
+
+
+def test_episodes_that_people_played_on_both_twins_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [",".join(COLUMNS)]
+    for seed, twin in enumerate(("full", "partial", "mixed", "both")):
+        lines.append(f"human,CartPole,easy,{twin},0.{seed + 1},3,terminated,1,{seed},012,{GAME},128,default,{{}},ann")
+    (tmp_path / "human.csv").write_text("\n".join(lines) + "\n")
+    words = [
+        "analyze",
+        "gap-bias",
+        str(tmp_path / "human.csv"),
+        "--baseline",
+        "human",
+        "--out",
+        str(tmp_path / "g.csv"),
+    ]
+    assert cli.main(words) == 0
+    assert "left out, of no single twin: 2 scores (mixed or both)" in capsys.readouterr().out
+    (row,) = read_csv(tmp_path / "g.csv")
+    assert (row["mdp"], row["pomdp"], row["seeds"]) == ("0.1", "0.2", "1")
+
+
+def test_runs_may_be_named_behind_another_option() -> None:
+    def parsed(*words: str) -> Any:
+        return Figure.parse(words, "arcade-torch figure recall-density").options
+
+    one = (Path("runs/one"), Path("runs/two"))
+    for words in (["--runs", *map(str, one), "--bins", "3", "16"], ["--bins", "3", "16", "--runs", *map(str, one)]):
+        assert (parsed(*words).runs, parsed(*words).bins) == (one, (3, 16))
+    assert parsed("--bins", "3", "--runs=runs/one", "--csv").runs == one[:1]
+    assert parsed("runs/one", "--runs", "runs/two", "--csv").runs == one[::-1]
+
+
+def test_a_run_without_settings_is_refused_for_their_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write(tmp_path / "bare", "lru", "full", 0, 0.5)
+    (run / "config.json").write_text(json.dumps({"env": GAME, "memory": "lru"}))
+    assert cli.main(["figure", "hyperparameters", "--runs", str(run), "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "say nothing of their settings" in said and said.count("\n") == 1
+
+
+def test_an_agent_without_a_memory_free_one_of_its_algorithm_has_no_bias_anywhere(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = ["algorithm,memory,game,observability,seed,score"]
+    for algorithm, memory, value in (("pqn", "mlp", 0.3), ("ppo", "lru", 0.9), ("pqn", "lru", 0.4)):
+        for game in ("CartPoleEasy", "SkittlesEasy"):
+            lines += [f"{algorithm},{memory},{game},{twin},0,{value}" for twin in ("full", "partial")]
+    (tmp_path / "scores.csv").write_text("\n".join(lines) + "\n")
+    for name in ("returns", "gap-bias"):
+        assert cli.main(["figure", name, "--runs", str(tmp_path / "scores.csv"), "--out", str(tmp_path)]) == 0
+        (row,) = [line for line in capsys.readouterr().out.splitlines() if "ppo-lru" in line]
+        assert "none" in row and "nan" not in row
+    rows = {row["agent"]: row["bias"] for row in read_csv(tmp_path / "gap-bias.csv") if not row["without"]}
+    assert rows["ppo-lru"] == "nan" and float(rows["pqn-lru"]) == pytest.approx(0.1)

@@ -92,7 +92,7 @@ def test_of_several_episodes_the_first_that_is_long_enough_is_explained_else_the
         ({"norm": "l3"}, "norm must be one of l2sq, l2, l1"),
         ({"reduce": "mean"}, "reduce must be one of per_action, sum"),
         ({"target": "v"}, "target must be one of q, logits, probs, value"),
-        ({"n": 3}, "outside a window of 3 frames"),
+        ({"n": 3}, "n must be inside a window of 3 frames; got 3"),
         ({"chunk": 0}, "chunk must be at least 1"),
         ({"last_action": torch.zeros(2)}, "the length of last_action must be that of frames"),
     ],

@@ -7,14 +7,16 @@ import signal
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
+from arcade_torch.tools.studies import engines
 from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
@@ -33,12 +35,13 @@ class Fabricator:
         for job in jobs:
             if len(self.done) == self.stop_after:
                 raise KeyboardInterrupt
-            assert json.loads(job.config.read_text())["env"] == self.runs[job.name].game
+            settings = json.loads(job.config.read_text())
+            assert settings["env"] == self.runs[job.name].game
             self.done.append(job.name)
             if self.fail and self.fail in job.name:
                 yield JobResult(job.name, "no luck")
             else:
-                write_run(job.folder, self.runs[job.name], 0.5)
+                write_run(job.folder, self.runs[job.name], 0.5, settings=settings)
                 yield JobResult(job.name)
 
 
@@ -163,6 +166,70 @@ def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(tmp
     assert len(engine.done) == 4 and all("seed2" in name for name in engine.done)
 
 
+def change_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the settings that a run says it was made with."""
+    record = json.loads((run / "config.json").read_text())
+    change(record["config"])
+    (run / "config.json").write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda config: config["pqn"].update(lam=0.123), r"pqn.lam \(0.123 != 0.65\)"),
+        (lambda config: config.update(amp=True), "amp"),
+        (lambda config: config.update(env_options={"mine_reward": -1}), "env_options.mine_reward"),
+        (lambda config: config["pqn"].pop("lam"), r"pqn.lam \(0.95 != 0.65\)"),  # from before there was that field
+    ],
+)
+def test_a_finished_run_that_was_made_with_other_settings_is_refused(
+    change: Callable[[dict[str, Any]], object], message: str, tmp_path: Path
+) -> None:
+    what = small_study(settings={"pqn": {"lam": 0.65}})
+    folder = write_study(tmp_path / "s", what)
+    change_config(folder.run(what.runs()[2]).path, change)
+    before = (folder.root / "study.json").read_bytes()
+    with pytest.raises(FileExistsError, match=f"{what.runs()[2].name} has other settings, .*{message}"):
+        carry_out(small_study(settings={"pqn": {"lam": 0.65}}, seeds=3), folder.root, Fabricator(what))
+    assert (folder.root / "study.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda config: config.update(device="cuda:1", threads=4, compile=True, cuda_graphs=True, logger="wandb"),
+        lambda config: config.update(eval_every=512, eval_episodes=7, checkpoint_every=0),
+        lambda config: config.update(env="MineSweeperEasy-v0"),  # as `train` pins it
+        lambda config: config["ppo"].update(clip=0.7),  # another algorithm's
+        lambda config: (config["pqn"].pop("bootstrap"), config.pop("amp")),  # from before there were these fields
+        lambda config: config.update(no_longer=1),  # a field that is gone: it cannot be compared
+    ],
+)
+def test_what_does_not_change_a_result_lets_a_study_go_on(
+    change: Callable[[dict[str, Any]], object], tmp_path: Path
+) -> None:
+    what = small_study()
+    folder = write_study(tmp_path / "s", what)
+    change_config(folder.run(what.runs()[2]).path, change)
+    engine = Fabricator(what)
+    carry_out(what, folder.root, engine)
+    assert engine.done == []
+
+
+def test_two_shards_may_begin_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    what, root, exists, other = small_study(), tmp_path / "s", Path.exists, [True]
+
+    def late(path: Path, **how: Any) -> bool:
+        found = exists(path, **how)
+        if path.name == "study.json" and other and other.pop():
+            StudyFolder(root).claim(what, "the other shard")  # between this look and the next
+        return found
+
+    monkeypatch.setattr(Path, "exists", late)
+    StudyFolder(root).claim(what, "this shard")
+    assert StudyFolder(root).load() == what and not other
+
+
 def test_versions_of_the_first_runs_stay_on_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = StudyFolder(tmp_path / "s")
     folder.claim(small_study(), "first")
@@ -266,7 +333,9 @@ def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin")
-def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path) -> None:
+def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cores = available_cores()[:2]
+    monkeypatch.setattr(engines, "available_cores", lambda: cores)
     text = f"""
         import os, pathlib, time
         here = pathlib.Path({str(tmp_path)!r})
@@ -275,10 +344,23 @@ def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path) -> Non
         (here / f"up-{{os.getpid()}}").touch()
         while len(list(here.glob("up-*"))) < COUNT: time.sleep(0.02)
     """
-    count = min(2, len(available_cores()))
+    count = len(cores)
     text = text.replace("COUNT", str(count))
     assert all(result.error == "" for result in python_engine(count).run(jobs(tmp_path, *[text] * count)))
     assert len(list(tmp_path.glob("core-*-1"))) == count
+
+
+def test_only_a_study_that_takes_all_cores_gives_each_run_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two studies of one worker each were both pinned to the first core."""
+    pinned: list[set[int]] = []
+    monkeypatch.setattr(engines, "available_cores", lambda: [3, 7])
+    monkeypatch.setattr(os, "sched_setaffinity", lambda process, cores: pinned.append(cores), raising=False)
+    for workers, wanted in ((1, [{3, 7}] * 2), (3, [{3, 7}] * 2), (2, [{3}, {7}]), (0, [{3}, {7}])):
+        list(Processes(workers, program=("true",), poll_s=0.01).run(jobs(tmp_path, "", "")))
+        assert pinned == wanted
+        pinned.clear()
 
 
 def test_closing_the_engine_asks_workers_to_stop_and_lets_them_save(tmp_path: Path) -> None:
@@ -425,10 +507,10 @@ def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(tmp
 
 def test_shards_share_the_runs_out_and_each_knows_the_results_of_all(tmp_path: Path) -> None:
     what, root = small_study(), tmp_path / "s"
-    engines = [Fabricator(what) for _ in range(3)]
-    results = [study(what, root, e, stream=io.StringIO(), shard=f"{i + 1}/3") for i, e in enumerate(engines)]
+    parts = [Fabricator(what) for _ in range(3)]
+    results = [study(what, root, e, stream=io.StringIO(), shard=f"{i + 1}/3") for i, e in enumerate(parts)]
     assert [result.finished for result in results] == [3, 6, 8]
-    assert sorted(name for engine in engines for name in engine.done) == sorted(run.name for run in what.runs())
+    assert sorted(name for part in parts for name in part.done) == sorted(run.name for run in what.runs())
     for wrong in ("0/3", "4/3", "3", "a/b", "1/0"):
         with pytest.raises(ValueError, match="a shard is written 3/10, the third of ten"):
             planned(what, wrong)

@@ -149,6 +149,26 @@ def test_where_the_disk_is_not_shared_the_small_files_travel_back(tmp_path: Path
     assert not list((tmp_path / "far").glob("*/*"))
 
 
+@pytest.mark.usefixtures("_small_training")
+def test_a_failed_run_leaves_its_checkpoints_where_it_was_carried_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the trainer's state they came home as checkpoints that no attempt could go on from."""
+    whole = Job.train
+
+    def fails(job: Job) -> None:
+        whole(job)
+        (job.folder / "metrics.csv").write_text("frames\n")
+        (job.folder / "eval.json").unlink()
+        raise RuntimeError("a bad day")
+
+    monkeypatch.setattr(Job, "train", fails)
+    (job,) = some_jobs(tmp_path, 1)
+    error, _, files = carry_out(job._replace(config=tmp_path / "nowhere.json"), job.config.read_bytes())
+    assert error == "RuntimeError: a bad day" and list(files) == ["metrics.csv"]
+    assert len(list((tmp_path / "far").rglob("trainer.pt"))) == 1  # another attempt there goes on
+
+
 @pytest.mark.ray
 @pytest.mark.slow
 def test_a_study_on_a_cluster_of_its_own_equals_one_in_this_process_and_listens_to_this_machine_only(

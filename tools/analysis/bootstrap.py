@@ -36,7 +36,7 @@ def mean_over_tasks(cells: Sequence[Array]) -> Array:
 def iqm(cells: Sequence[Array]) -> Array:
     """Interquartile mean: the mean of the middle half of all runs of all tasks; [..., n_seeds] a task to [...].
 
-    Source: Agarwal et al. (2021), arXiv 2108.13264; the same as ``aggregate_iqm`` of rliable 1.2.
+    Source: Agarwal et al. (2021), arXiv 2108.13264.
     """
     runs = np.sort(np.concatenate(cells, axis=-1), axis=-1)
     cut = int(0.25 * runs.shape[-1])

@@ -134,8 +134,9 @@ def contamination(
                 progress(len(points), starts)
             if len(points) >= starts:
                 break
-    if not parts:
-        raise ValueError(f"none of {skipped} episodes was long enough: {shortest} frames are needed")
+    if not any(np.isfinite(flip).any() for flip, *_ in parts):
+        wanted = f"{shortest} frames are needed, and {steps[0]} steps after the disturbed one"
+        raise ValueError(f"none of {skipped + len(parts)} episodes was long enough: {wanted}")
     flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Contamination(strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what)
 

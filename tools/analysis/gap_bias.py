@@ -2,7 +2,7 @@
 
 ``Gap(f) = J(f, MDP) - J(f, POMDP)``: what partial observability costs agent f; small is good.
 ``Bias(f) = J(f, MDP) - J(no memory, MDP)``: what memory costs where it is not needed; negative is a cost.
-J is the normalised return, averaged over tasks.
+J is the normalised return, averaged over tasks; the agent without memory is of the same algorithm.
 
 Source: POPGym Arcade (ICML 2026), definitions of Gap and Bias. Intervals: stratified bootstrap over seeds.
 """
@@ -18,13 +18,13 @@ from arcade_torch.agents.config import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
-from arcade_torch.tools.runs import Score, Source, find_baseline, read_scores
+from arcade_torch.tools.runs import Score, Source, find_baselines, read_scores
 
-TWINS = ("full", "partial")
+TWINS, BOTH_TWINS = ("full", "partial"), ("mixed", "both")
 NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm")
 """Columns of the table that have an interval."""
-SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator")
-"""Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already."""
+SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator", "Signpost")
+"""Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already, and so should those of your own games."""
 
 
 def game_of(env_id: str) -> str:
@@ -39,7 +39,7 @@ def game_of(env_id: str) -> str:
 
 
 def normalise(env_id: str, value: Any) -> Any:
-    """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for five games, x for the others.
+    """Map a return, or an array of them, to [0, 1]: (x + 1) / 2 for `SIGNED_GAMES`, x for the others.
 
     Returns outside a game's range stay outside [0, 1]. The id may have its version or not.
 
@@ -63,7 +63,7 @@ class AgentRow:
     mdp: Interval  # the same, normalised to [0, 1] task by task
     pomdp: Interval
     gap: Interval  # mdp - pomdp
-    bias: Interval  # mdp - mdp of the memory-free agent
+    bias: Interval  # mdp - mdp of the memory-free agent of its algorithm; NaN where there is none
     coverage: float  # measured coverage of the interval of Gap; NaN where there is no interval
     mdp_iqm: Interval  # interquartile mean of the normalised returns of all MDP runs
     pomdp_iqm: Interval
@@ -73,11 +73,12 @@ class AgentRow:
 class GapBias:
     """Table of Gap and Bias."""
 
-    rows: tuple[AgentRow, ...]  # one an agent, in the order in which agents were met, the memory-free one first
+    rows: tuple[AgentRow, ...]  # one an agent, in the order in which agents were met, memory-free ones first
     tasks: tuple[str, ...]  # environment ids over which the means go: those that every agent has on both twins
     dropped: tuple[str, ...]  # environment ids left out because some agent lacks them
     metric: str  # what the score of a run is
-    baseline: str  # the memory-free agent
+    baseline: str  # the memory-free agent, of several algorithms the first
+    baselines: Mapping[str, str | None]  # agent -> the memory-free agent of its algorithm
     confidence: float  # nominal, of the intervals
     draws: int  # of the bootstrap
     without: Mapping[str, tuple[AgentRow, ...]]  # rows leaving out one game, all its difficulties; empty for one game
@@ -85,10 +86,9 @@ class GapBias:
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
-        for row in self.rows:
-            if row.agent == agent:
-                return row
-        raise ValueError(f"no agent {agent!r}; there are {', '.join(row.agent for row in self.rows)}")
+        found = {row.agent: row for row in self.rows}
+        require(agent in found, "an agent", agent, f"one of {', '.join(found)}")
+        return found[agent]
 
     def gap_difference(self, first: str, second: str) -> Interval:
         """Gap(first) - Gap(second) with an interval from the same draws."""
@@ -129,7 +129,7 @@ def gap_and_bias(
     Args:
         runs: a study's folder, run folders, a CSV file, or scores; see `arcade_torch.tools.runs.read_scores`.
         metric: ``eval_final`` (greedy) or ``train_max_ewm`` (the paper's).
-        baseline: the memory-free agent (any case).
+        baseline: the memory-free agent (any case); that of one algorithm, ``pqn-mlp``, serves all.
         draws: bootstrap draws.
         confidence: of the intervals, in (0, 1).
         seed: of the draws.
@@ -142,27 +142,27 @@ def gap_and_bias(
     """
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
     require(draws >= 1, "draws", draws, "at least 1")
-    cells = _cells(read_scores(runs, metric))
+    cells = _cells([score for score in read_scores(runs, metric) if score.observability not in BOTH_TWINS])
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
-    base = find_baseline(agents, baseline)
-    if base is None:
+    if not (found := find_baselines(agents, baseline)):
         raise ValueError(f"no scores for the memory-free agent {baseline!r}; there are {', '.join(agents) or 'none'}")
-    agents = [base, *(agent for agent in agents if agent != base)]
+    baselines = {agent: found.get(agent) for agent in [*found.values(), *agents]}
     every = list(dict.fromkeys(game for _, game, _ in cells))
     tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]
     if not tasks:
         raise ValueError("no task has finished runs of every agent on both twins: nothing to compare yet")
-    rows, values = _rows(cells, agents, tasks, draws, confidence, seed, iqm=True)
+    rows, values = _rows(cells, baselines, tasks, draws, confidence, seed, iqm=True)
     games = list(dict.fromkeys(game_of(task) for task in tasks))
     without = {}
     for game in games if len(games) > 1 else []:
         rest = [task for task in tasks if game_of(task) != game]
-        without[game], _ = _rows(cells, agents, rest, draws, confidence, seed, iqm=False)
+        without[game], _ = _rows(cells, baselines, rest, draws, confidence, seed, iqm=False)
     dropped = tuple(game for game in every if game not in tasks)
-    return GapBias(rows, tuple(tasks), dropped, metric, base, confidence, draws, without, values)
+    return GapBias(rows, tuple(tasks), dropped, metric, rows[0].agent, baselines, confidence, draws, without, values)
 
 
 Cells = dict[tuple[str, str, str], Array]
+Baselines = Mapping[str, str | None]
 
 
 def _cells(scores: Sequence[Score]) -> Cells:
@@ -176,11 +176,11 @@ def _cells(scores: Sequence[Score]) -> Cells:
 
 
 def _rows(
-    cells: Cells, agents: Sequence[str], tasks: Sequence[str], draws: int, confidence: float, seed: int, iqm: bool
+    cells: Cells, baselines: Baselines, tasks: Sequence[str], draws: int, confidence: float, seed: int, iqm: bool
 ) -> tuple[tuple[AgentRow, ...], dict[str, dict[str, Array]]]:
     """A row an agent, and agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its draws."""
     rows, values = list[AgentRow](), dict[str, dict[str, Array]]()
-    for i, agent in enumerate(agents):
+    for i, (agent, free) in enumerate(baselines.items()):
         mine, counts = values.setdefault(agent, {}), list[tuple[int, ...]]()
         for j, (twin, name) in enumerate(zip(TWINS, ("mdp", "pomdp"), strict=True)):
             seeds = [cells[agent, task, twin] for task in tasks]
@@ -190,9 +190,9 @@ def _rows(
             mine[f"{name}_raw"], mine[name] = bootstrap.mean_over_tasks(raw), bootstrap.mean_over_tasks(scaled)
             mine[f"{name}_iqm"] = bootstrap.iqm(scaled if iqm else [each[:1] for each in scaled])
             counts.append(tuple(map(len, seeds)))
-        mine["gap"], mine["bias"] = mine["mdp"] - mine["pomdp"], mine["mdp"] - values[agents[0]]["mdp"]
+        mine["gap"], mine["bias"] = mine["mdp"] - mine["pomdp"], mine["mdp"] - (values[free]["mdp"] if free else np.nan)
         fewest = min(map(min, counts))
-        free_seeds = min(len(cells[agents[0], task, "full"]) for task in tasks)
+        free_seeds = min(len(cells[free or agent, task, "full"]) for task in tasks)
         known = dict.fromkeys(mine, fewest > 1) | {"bias": min(fewest, free_seeds) > 1}
         ends = {name: percentile_interval(x[0], x[1:], confidence, known[name]) for name, x in mine.items()}
         coverage = bootstrap.measured_coverage(*counts, confidence) if fewest > 1 else float("nan")

@@ -86,8 +86,7 @@ def saliency(
     require(chunk >= 1, "chunk", chunk, "at least 1")
     require(frames.ndim == 4, "the shape of frames", list(frames.shape), "[T, H, W, C]")
     total = frames.shape[0]
-    if not -total <= n < total:
-        raise ValueError(f"n = {n} is outside a window of {total} frames")
+    require(-total <= n < total, "n", n, f"inside a window of {total} frames")
     zeros = torch.zeros(total, dtype=torch.int64, device=frames.device)
     actions, starts = (zeros if given is None else given.reshape(-1) for given in (last_action, is_init))
     for name, given in (("last_action", actions), ("is_init", starts)):

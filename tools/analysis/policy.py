@@ -100,10 +100,8 @@ def policy_of(model: Any) -> Policy:
         read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
         offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
         return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module)
-    raise TypeError(
-        "model must be an agent, a network with encode and remember, a Policy or a pair (encode, remember), "
-        f"got {type(model).__name__}"
-    )
+    forms = "an agent, a network with encode and remember, a Policy or a pair (encode, remember)"
+    raise TypeError(f"model must be {forms}, got {type(model).__name__}")
 
 
 def resolve(model: Any, what: str) -> str:

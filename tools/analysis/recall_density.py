@@ -53,10 +53,8 @@ class RecallDensity:
     def _mean(self, of: Callable[[Array], Array]) -> Array:
         """Mean over trajectories."""
         if not self.lengths.size:
-            raise ValueError(
-                f"no trajectory is left: {self.dropped} had fewer than {MIN_STEPS} frames, "
-                f"{self.silent} no gradient at all; play more episodes"
-            )
+            why = f"{self.dropped} had fewer than {MIN_STEPS} frames, {self.silent} no gradient at all"
+            raise ValueError(f"no trajectory is left: {why}; play more episodes")
         return np.asarray(np.mean([of(share) for share in self.shares], axis=0))
 
 

@@ -49,8 +49,7 @@ class BenchOptions:
     resumable: ClassVar[bool] = False
     out: Path | None = None
     """File for the numbers, .json or .csv (of several tables one file each, its name added); overwritten."""
-    keep_memory: bool = False
-    """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
+    keep_memory: bool = False  # Have the C library keep freed memory, as train does and a loop of your own does not.
 
 
 class Kind(NamedTuple):
@@ -94,9 +93,8 @@ def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[st
         if name in kept:
             keep_freed_memory()
         for table, row in module_of(name).run(benches[name], log):
-            tables.setdefault(table, {"rows": []})["rows"].append(
-                {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
-            )
+            short = {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
+            tables.setdefault(table, {"rows": []})["rows"].append(short)
     about = machine() | {"keep_memory": ", ".join(kept) or "no"}
     return {"format": FORMAT, "machine": about, "size": size, "tables": tables}
 

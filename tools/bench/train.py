@@ -39,8 +39,7 @@ class Options(BenchOptions):
     threads: int = 0  # Torch threads; 0 leaves the setting alone.
     grad_steps: int = 4  # Gradient steps in each timed pass; those of an update are all alike.
     repeats: int = 3  # Passes; the median counts.
-    keep_memory: bool = True
-    """Have the C library keep freed memory, as arcade-torch train does and a loop of your own does not."""
+    keep_memory: bool = True  # Have the C library keep freed memory, as train does and a loop of your own does not.
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -84,12 +83,8 @@ def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
 
     frames, every_step = config.frames_per_update, config.grad_steps_per_update
     learned = round(frames * options.grad_steps / every_step)  # of an update's frames in a pass
-    found = interleaved(
-        {"collect": Measure(collect, units=frames), "learn": Measure(learn, units=learned)},
-        seconds=1e-9,
-        repeats=options.repeats,
-        warm_ups=1,
-    )
+    measures = {"collect": Measure(collect, units=frames), "learn": Measure(learn, units=learned)}
+    found = interleaved(measures, seconds=1e-9, repeats=options.repeats, warm_ups=1)
     collect_fps, learn_fps = found["collect"].rate, found["learn"].rate
     row: dict[str, Any] = {"network": trainer.config.network, "memory": trainer.config.memory, "form": form}
     row |= {"parameters": sum(p.numel() for p in trainer.network.parameters())}

@@ -101,9 +101,8 @@ class BenchCompare(Command):
         old, new = registry.read_results(self.old), registry.read_results(self.new)
         was, now = old["machine"], new["machine"]
         about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
-        if differs := [
-            f"{name} {was.get(name)} and {now.get(name)}" for name in about if was.get(name) != now.get(name)
-        ]:
+        differs = [f"{name} {was.get(name)} and {now.get(name)}" for name in about if was.get(name) != now.get(name)]
+        if differs:
             print(f"not the same machine: {', '.join(differs)}")
         changes = registry.compare(old, new, self.tolerance)
         for verdict in ("worse", "missing", "better", "new"):

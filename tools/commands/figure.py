@@ -6,6 +6,7 @@ of the first run.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,12 @@ class Figure(Command):
 
     @classmethod
     def parse(cls, words: Sequence[str], prog: str) -> "Figure":
-        """Read the options of one figure; runs are named with or without ``--runs``."""
+        """Read the options of one figure; runs are named with or without ``--runs``, which goes in front."""
         _, group, name = prog.split()
         entry = FIGURES[name]
-        words = [word.removeprefix("--runs=") for word in words if word != "--runs"]
+        starts = [0, *(place for place, word in enumerate(words) if word.startswith("--")), len(words)]
+        parts = sorted((words[a:b] for a, b in pairwise(starts)), key=lambda one: not "".join(one).startswith("--runs"))
+        words = [word.removeprefix("--runs=") for part in parts for word in part if word != "--runs"]
         Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
         entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
         options: Any = parse_options(entry.options, words, prog)

@@ -8,12 +8,12 @@ import numpy as np
 
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis.bootstrap import Interval, seed_coverage
-from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias
+from arcade_torch.tools.analysis.gap_bias import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
 from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
 from arcade_torch.tools.files import Table, read_csv
-from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, is_baseline, read_scores, table_of
+from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, memory_free, read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),
@@ -49,7 +49,7 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     """The figure ``size-sweep``: a panel a game; agents are named LAYERSxWIDTH, the memory-free one without."""
     found = find_runs(options.runs)
     sized = agent_names(found.names, sized=True)
-    names = {key: name if is_baseline(name, options.baseline) else sized[key] for key, name in found.names.items()}
+    names = {key: name if memory_free(name, options.baseline) else sized[key] for key, name in found.names.items()}
     every = list(zip(found.runs, found.scores(options.metric), strict=True))
     notes, tables = list(found.notes), dict[str, GapBias]()
     for game in dict.fromkeys(run.game for run in found.runs):
@@ -100,9 +100,9 @@ def human(options: PaperOptions, progress: Progress | None) -> Made:
 
 
 def plot(rows: Sequence[AgentRow], axis: Any) -> None:
-    """Draw a point an agent, with both intervals and the name beside it; people have no Bias."""
+    """Draw a point an agent that has a Bias, with both intervals and the name beside it."""
     colours = agent_colours([row.agent for row in rows])
-    for place, row in enumerate(row for row in rows if not _is_person(row.agent)):
+    for place, row in enumerate(filter(_has_bias, rows)):
         point, colour = (row.bias.value, row.gap.value), colours[row.agent]
         look = {"fmt": MARKERS[place % len(MARKERS)], "color": colour, "capsize": 2, "lw": 1}
         axis.errorbar(*point, *(whiskers(*np.array([each]).T) for each in (row.gap, row.bias)), **look)
@@ -117,7 +117,7 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
 
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
-    chosen = [row for row in rows if not (name == "bias" and _is_person(row.agent))]
+    chosen = [row for row in rows if name != "bias" or _has_bias(row)]
     ends, places = np.array([getattr(row, name) for row in chosen]).T, range(len(chosen))
     colours, errors = agent_colours([row.agent for row in rows]), {"error_kw": {"lw": 1}, "capsize": 3}
     axis.bar(places, ends[0], 0.72, color=[colours[row.agent] for row in chosen], yerr=whiskers(*ends), **errors)
@@ -134,8 +134,8 @@ def _without_each(table: GapBias) -> Any:
     agents = [row.agent for row in table.rows]
     offsets, places = np.linspace(-0.34, 0.34, len(agents)), np.arange(len(columns))
     for axis, name in zip(axes[:, 0], DRAWN, strict=True):
-        for place, agent in enumerate(agents):
-            if name == "bias" and (_is_person(agent) or agent == table.baseline):
+        for place, (agent, row) in enumerate(zip(agents, table.rows, strict=True)):
+            if name == "bias" and (not _has_bias(row) or agent == table.baselines[agent]):
                 continue
             ends = np.array([getattr(rows[place], name) for rows in columns.values()]).T
             look = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
@@ -150,9 +150,9 @@ def _without_each(table: GapBias) -> Any:
     return figure
 
 
-def _is_person(agent: str) -> bool:
-    """Whether a row is people: they have no Bias, which compares training runs."""
-    return agent.lower() == "human"
+def _has_bias(row: AgentRow) -> bool:
+    """Whether Bias, which compares runs of one algorithm, is known of a row: not of people."""
+    return row.agent.lower() != "human" and not np.isnan(row.bias.value)
 
 
 def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
@@ -168,8 +168,10 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
         raise ValueError("name at least one study folder, run folder or CSV file")
     folders = [path for path in options.runs if table_of(path) is None]
     found = find_runs(folders) if folders else Runs(())
-    table = _computed(read_scores(options.runs, options.metric), options)
-    notes = found.notes + found.single_seeds()
+    scores = read_scores(options.runs, options.metric)
+    table, notes = _computed(scores, options), found.notes + found.single_seeds()
+    if apart := sum(score.observability in BOTH_TWINS for score in scores):
+        notes.append(f"left out, of no single twin: {apart} score{'s' * (apart > 1)} ({' or '.join(BOTH_TWINS)})")
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
@@ -187,7 +189,7 @@ def _printed(table: GapBias, what: str) -> Table:
 
     def cell(interval: Interval) -> str:
         ends = "" if np.isnan(interval.low) else f"\n{interval.low:+.3f} {interval.high:+.3f}"
-        return f"{interval.value:+.3f}{ends}"
+        return "none" if np.isnan(interval.value) else f"{interval.value:+.3f}{ends}"
 
     head = {
         **{"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias", "mdp_iqm": "MDP IQM"},

@@ -209,6 +209,8 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
     columns = {name: _settings(here, name) for name, here in configs.items()}
     names = dict.fromkeys(name for column in columns.values() for name in column)
     rows = [{"setting": name} | {key: column.get(name, "") for key, column in columns.items()} for name in names]
+    if not rows:
+        raise ValueError(f"the runs below {options.runs[0]} say nothing of their settings: nothing to draw")
     head, table = ["setting", *columns], [list(row.values()) for row in rows]
     figure, axes = style.panels(1, 1, (2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2)))
     axes[0, 0].set_axis_off()

@@ -13,7 +13,7 @@ from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, 
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.options import at_least
-from arcade_torch.tools.runs import is_baseline, listed
+from arcade_torch.tools.runs import listed, memory_free
 
 BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
 MEMORY_FREE = ("mlp", "feedforward")
@@ -76,7 +76,7 @@ def _measure(options: DensityOptions, progress: Progress | None) -> tuple[Densit
 def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
     """Two panels, MDP and POMDP; a bar a game, all memory models and seeds pooled; the darkest part is most recent."""
     remembering = {
-        task: value for task, value in masses.items() if not any(is_baseline(task[0], name) for name in MEMORY_FREE)
+        task: value for task, value in masses.items() if not any(memory_free(task[0], name) for name in MEMORY_FREE)
     } or masses
     games = list(dict.fromkeys(game for _, game, _ in remembering))
     tasks = style.agents_by_task(remembering)

@@ -148,12 +148,10 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
     """Some moments of one episode side by side, the MDP twin above the POMDP twin."""
     rises = bool(steps) and steps[0] >= 0 and all(a < b for a, b in pairwise(steps))
     require(rises, "steps", list(steps), "whole numbers that rise from 0 or more")
-    columns, count = list[Frame](), 0
-    for count, twins in enumerate(_moments(id, obs_size, seed, steps[-1]), start=1):
-        if count - 1 in steps:
-            columns.append(np.vstack([_padded(frame, obs_size) for frame in twins]))
-    if count <= steps[-1]:
-        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {count} steps: stay below")
+    moments = list(_moments(id, obs_size, seed, steps[-1]))
+    if len(moments) <= steps[-1]:
+        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay below")
+    columns = [np.vstack([_padded(frame, obs_size) for frame in moments[step]]) for step in steps]
     return np.hstack(columns)[:-GAP, :-GAP]
 
 

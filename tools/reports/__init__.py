@@ -20,7 +20,7 @@ from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import Finals, select_cells
-from arcade_torch.tools.runs import METRICS, Runs, open_run
+from arcade_torch.tools.runs import METRICS, Runs, check_comparable, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
@@ -91,6 +91,7 @@ def report(
     runs = Runs(tuple(run for path in started if (run := open_run(path)) is not None))
     if not runs.runs:
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
+    check_comparable(runs)
     agents = list(dict.fromkeys(runs.names[run.key] for run in runs.runs))
     finals = agents_by_task({task: [run.value("eval_final") for run in group] for task, group in runs.groups().items()})
     cells, note = select_cells(runs, finals, study.baseline)
@@ -157,16 +158,16 @@ def _learning(runs: Runs, finals: Finals, agents: Sequence[str], players: Player
 
 def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[str, Any]:
     """Gap and bias by both metrics, also written as CSV, and what they say; or why there are none."""
-    baseline = study.baseline if len(study.algorithms) == 1 else f"{study.algorithms[0]}-{study.baseline}"
     found: dict[str, Any] = {"trouble": "", "table": None, "second": None, "sentences": [], "caution": ""}
     for place, name in zip(("table", "second"), sorted(METRICS, key=lambda name: name != metric), strict=True):
         try:
-            table = found[place] = gap_and_bias(runs.scores(name), metric=name, baseline=baseline)
+            table = found[place] = gap_and_bias(runs.scores(name), metric=name, baseline=study.baseline)
             write_csv(folder.analysis / f"gap_bias_{name}.csv", table.table())
         except ValueError as error:
             found["trouble"] = found["trouble"] or str(error)
     if (table := found["table"]) is not None:
-        agents = [row.agent for row in sorted(table.rows[1:], key=lambda row: -row.pomdp.value)]
+        rows = [row for row in table.rows if table.baselines[row.agent] not in (None, row.agent)]
+        agents = [row.agent for row in sorted(rows, key=lambda row: -row.pomdp.value)]
         found["sentences"] = [score_sentence(table, name, agent) for agent in agents for name in SENTENCES]
         found |= {"score_panels": panels.score_panels(table), "caution": coverage_sentence(table)}
     return found
@@ -174,7 +175,7 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
 
 def score_sentence(table: GapBias, name: str, agent: str) -> str:
     """One of `SENTENCES` about an agent with memory, and how sure it is."""
-    base, row = table.row(table.baseline), table.row(agent)
+    base, row = table.row(table.baselines[agent] or table.baseline), table.row(agent)
     difference = table.difference(name, *((base.agent, agent) if name == "gap" else (agent, base.agent)))
     value, low, high = found = row.bias if name == "bias" else difference
     fact, single, clear, vague = SENTENCES[name]

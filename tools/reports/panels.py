@@ -20,7 +20,7 @@ from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.figures import Progress, contamination, gap_bias, logs, recall_density, saliency, style
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
-from arcade_torch.tools.runs import Runs, is_baseline
+from arcade_torch.tools.runs import Runs, memory_free
 
 FULL, SMALL = (4.9, 3.0), (3.3, 2.3)  # inches; small ones for many tasks
 BINS = 8  # parts of an episode, or as many as the shortest episode of a task has frames
@@ -72,7 +72,7 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
         if seen == twin
     }
     everybody = dict.fromkeys(agent for found in means.values() for agent in found)
-    free = [agent for agent in everybody if is_baseline(agent, baseline)]
+    free = [agent for agent in everybody if memory_free(agent, baseline)]
     strength = {agent: fmean([found[agent] for found in means.values() if agent in found]) for agent in everybody}
     best = sorted((agent for agent in everybody if agent not in free), key=lambda agent: -strength[agent])
     pair = [*free[:1], *(best[:1])]

@@ -111,7 +111,7 @@ class Inline:
 
 @dataclass
 class Processes:
-    """Local worker processes, one a job, each on a core of its own."""
+    """Local worker processes, one a job; where they are as many as the cores, each on a core of its own."""
 
     workers: int = 0  # how many at once; one a core by default
     program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")  # start of a worker's command line
@@ -121,17 +121,17 @@ class Processes:
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
         cores = available_cores()
-        count = self.workers or len(cores)
-        free = [cores[index % len(cores)] for index in range(count)]
-        waiting, active = list(jobs), dict[subprocess.Popen[bytes], tuple[Job, int]]()
+        # Fewer workers go where there is room: another study, or shard, may be at work on the same machine.
+        free = [{core} for core in cores] if self.workers in (0, len(cores)) else [set(cores)] * self.workers
+        waiting, active = list(jobs), dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
         try:
             while waiting or active:
                 while waiting and free:
-                    job, core = waiting.pop(0), free.pop(0)
-                    active[self._start(job, core, pin=count <= len(cores))] = job, core
+                    job, where = waiting.pop(0), free.pop(0)
+                    active[self._start(job, where)] = job, where
                 for process in [each for each in active if each.poll() is not None]:
-                    job, core = active.pop(process)
-                    free.append(core)
+                    job, where = active.pop(process)
+                    free.append(where)
                     yield JobResult(job.name, _error(process.returncode, job.log))
                 time.sleep(self.poll_s)
         finally:
@@ -145,9 +145,9 @@ class Processes:
                     process.kill()
                     process.wait()
 
-    def _start(self, job: Job, core: int, pin: bool) -> "subprocess.Popen[bytes]":
+    def _start(self, job: Job, cores: set[int]) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") if pin else {}
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         with job.log.open("ab") as log:
             process = subprocess.Popen(
                 [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
@@ -157,9 +157,9 @@ class Processes:
                 env={**os.environ, **threads, PARENT_VARIABLE: str(os.getpid())},
                 start_new_session=True,  # the terminal's Ctrl-C goes to the study alone, which then stops its workers
             )
-        if pin and hasattr(os, "sched_setaffinity"):
+        if hasattr(os, "sched_setaffinity"):
             with contextlib.suppress(ProcessLookupError, PermissionError):  # slower without it, not wrong
-                os.sched_setaffinity(process.pid, {core})
+                os.sched_setaffinity(process.pid, cores)
         return process
 
 
@@ -292,7 +292,7 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """Carry out a run on a machine of the cluster.
 
     The paths of the job are those of the machine that sends it. Returns why the run failed, in one line, and the
-    traceback (empty for success), and the content of its small files where the disk is not shared.
+    traceback (empty for success), and where the disk is not shared its small files: of a failed run no checkpoints.
     """
     shared, files = False, dict[str, bytes]()
     with contextlib.suppress(OSError):
@@ -303,10 +303,9 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         job = job._replace(folder=here / "run", config=write_atomic(here / "config.json", config))
     error, trace = job.attempt()
     if not shared:
-        for path in (path for path in job.folder.rglob("*") if path.is_file()):
-            name = path.relative_to(job.folder)
-            if not _NOT_SENT & set(name.parts):
-                files[name.as_posix()] = path.read_bytes()
+        kept = _NOT_SENT | ({"checkpoints"} if error else set())
+        found = {path.relative_to(job.folder): path for path in job.folder.rglob("*") if path.is_file()}
+        files = {name.as_posix(): path.read_bytes() for name, path in found.items() if not kept & set(name.parts)}
         if not error:
             shutil.rmtree(job.config.parent)
     return error, trace, files

@@ -14,15 +14,17 @@
 """
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from arcade_torch.agents.config import TrainConfig, differing_fields
 from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.options import command_line
-from arcade_torch.tools.runs import Run, read_record
+from arcade_torch.tools.runs import FREE, Run, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -80,9 +82,11 @@ class StudyFolder:
 
         The grid may grow between two invocations; what decides a run's result may not change. A ``study.json`` that is
         not even JSON is written anew: the run folders know what they hold and refuse other settings themselves. A
-        folder with other files, or a study with other settings, is refused by a ``FileExistsError``.
+        folder with other files, or a study or a finished run with other settings, is refused by a ``FileExistsError``.
         """
         old: dict[str, Any] = {}
+        # Looked at before study.json, which another shard may be about to write.
+        foreign = self.root.exists() and not all(each.name.startswith(".study.json.") for each in self.root.iterdir())
         if (self.root / "study.json").exists():
             with contextlib.suppress(ValueError):
                 old = self.record()
@@ -92,8 +96,11 @@ class StudyFolder:
             what += [f"run {run.name}, which this study lacks" for run in before.runs() if run.name not in names]
             if what:
                 raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
-        elif self.root.exists() and not all(entry.name.startswith(".study.json.") for entry in self.root.iterdir()):
+        elif foreign:
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
+        for spec in study.runs():
+            if (run := self.run(spec)).final is not None and (fields := _other_settings(run, study.config(spec))):
+                raise FileExistsError(f"{run.path} has other settings, {', '.join(fields)}: choose another --out")
         jobs = [self.job(run) for run in study.runs()]
         commands = {job.name: command_line(["train", *job.words]) for job in jobs}
         here = versions()
@@ -125,3 +132,11 @@ class StudyFolder:
                 error = str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
         begun = "unfinished" if run.path.exists() else "waiting"
         return row | {"error": error, "status": "finished" if final else "failed" if error else begun}
+
+
+def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
+    """In what a run differs from its plan that may change its result."""
+    with contextlib.suppress(OSError, ValueError, TypeError):  # damaged, or of a version with other fields
+        configs, free = (TrainConfig.from_dict(run.config), plan), {name: getattr(plan, name) for name in FREE}
+        return differing_fields(*(replace(config, env=resolve_id(config.env), **free) for config in configs))
+    return []

@@ -52,6 +52,11 @@ def test_delays_beyond_the_end_of_an_episode_are_missing_and_counted_so() -> Non
     assert np.isnan(found.mean("flip")[0, -1]) and np.isnan(found.kl).all()  # Q-values have no distribution
 
 
+def test_delays_that_no_episode_reaches_are_refused() -> None:
+    with pytest.raises(ValueError, match="was long enough: 2 frames are needed, and 9 steps after the disturbed one"):
+        contamination(linear_policy(0.9, dtype=torch.float32), ToyEnv([6]), delays=(9, 50), starts=4)
+
+
 def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode() -> None:
     found = contamination(linear_policy(0.5, dtype=torch.float32), ToyEnv(ENV), starts=50, delays=(0,))
     assert len(found.points) == 50
