@@ -56,12 +56,8 @@ class MemoryBlock(nn.Module):
         options = memory_options or {}
         self.input_size, self.hidden_size, self.residual = input_size, hidden_size, skip == "residual"
         self.linear = nn.Linear(input_size, hidden_size)
-        self.cells = nn.ModuleList(
-            make_memory(memory, hidden_size, hidden_size, **options)
-            if isinstance(memory, str)
-            else memory(hidden_size, hidden_size, **options)
-            for _ in range(layers)
-        )
+        make = partial(make_memory, memory) if isinstance(memory, str) else memory
+        self.cells = nn.ModuleList(make(hidden_size, hidden_size, **options) for _ in range(layers))
         self.linears = nn.ModuleList(nn.Linear(hidden_size, hidden_size) for _ in range(layers))
         self.names = [f"layer{i}" for i in range(layers)]
 

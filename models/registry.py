@@ -1,6 +1,7 @@
 """Memory models by name: one dictionary, open to models of your own."""
 
 import difflib
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -73,6 +74,10 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
         near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ValueError(f"unknown memory {name!r}: {hint}known are {', '.join(_FACTORIES)}; add with register_memory")
+    try:
+        inspect.signature(_FACTORIES[name]).bind(input_size, hidden_size, **options)
+    except TypeError as error:
+        raise TypeError(f"memory {name!r} has other options: {error}") from error
     return _FACTORIES[name](input_size, hidden_size, **options)
 
 

@@ -322,6 +322,8 @@ def test_wrong_inputs_get_one_clear_line(name):
 
 
 def test_unknown_options_are_refused():
+    with pytest.raises(TypeError, match=r"^memory 'gru' has other options: got an unexpected keyword argument 'foo'$"):
+        make_memory("gru", 3, 4, foo=1)
     with pytest.raises(ValueError, match="tanh"):
         make_memory("mingru", 3, 4, candidate="relu")
     with pytest.raises(ValueError, match="r_min"):

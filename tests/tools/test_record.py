@@ -53,7 +53,7 @@ def test_a_scripted_player_plays_as_it_does_for_the_references(kind: str) -> Non
 class Suspicious:
     """An agent whose actions depend on everything it is shown and on what it has been shown before."""
 
-    config = preset("smoke", env=GAME, device="cpu")
+    network = torch.nn.Linear(1, 1)
 
     def initial_state(self, batch_size: int) -> TensorDict:
         return TensorDict({"sum": torch.zeros(batch_size, dtype=torch.int64)}, batch_size=[batch_size])

@@ -50,7 +50,7 @@ def trained(agent: Any, partial: bool) -> Chooser:
     import torch
     from tensordict import TensorDict
 
-    device = agent.config.device if torch.cuda.is_available() else "cpu"
+    device = next(agent.network.parameters()).device
     state, last_action = agent.initial_state(1), 0
 
     def choose(session: Session) -> int:
