@@ -114,8 +114,9 @@ def test_a_run_without_settings_is_refused_for_their_table(tmp_path: Path, capsy
 
 
 def test_an_agent_without_a_memory_free_one_of_its_algorithm_has_no_bias_anywhere(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)  # or the table would be cut to that width
     lines = ["algorithm,memory,game,observability,seed,score"]
     for algorithm, memory, value in (("pqn", "mlp", 0.3), ("ppo", "lru", 0.9), ("pqn", "lru", 0.4)):
         for game in ("CartPoleEasy", "SkittlesEasy"):
