@@ -11,6 +11,9 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from scipy.stats import ttest_ind
+
+from arcade_torch.tools.analysis.gap_bias import game_of
 
 HERE = Path(__file__).parent
 PAPER = HERE.parents[1] / "tools" / "data" / "paper_returns.csv"
@@ -54,9 +57,7 @@ def paper() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
             if row["difficulty"] == "easy" and row["model"] != "human" and not zeros:
                 for twin in ("MDP", "POMDP"):
                     value = float(row[f"{twin.lower()}_mean"]), float(row[f"{twin.lower()}_std"])
-                    found.setdefault((row["env"].replace("NoisyPole", "NoisyCartPole") + "Easy", twin), {})[
-                        row["model"]
-                    ] = value
+                    found.setdefault((game_of(row["env"]) + "Easy", twin), {})[row["model"]] = value
     return found
 
 
@@ -81,20 +82,21 @@ def table(rows: list[dict[str, str]]) -> None:
 
 
 def compare(rows: list[dict[str, str]]) -> None:
-    """Print what LRU adds on the POMDPs, where both agents were trained: means over seeds."""
-    print("\n| POMDP | seeds | greedy: LRU, none | training: LRU, none | added | paper: LRU, none |")
-    print("|" + "---|" * 6)
+    """Print what LRU adds on the POMDPs, where both agents were trained: means over seeds, Welch's 95 % intervals."""
+    print("\n| POMDP | seeds | greedy: LRU, none | added | training: LRU, none | added | paper: LRU, none |")
+    print("|" + "---|" * 7)
     for game in sorted({row["game"] for row in rows}):
         runs = {m: [r for r in rows if (r["game"], r["twin"], r["memory"]) == (game, "POMDP", m)] for m in MEMORIES}
         if not all(runs.values()):
             continue
-        means = {
-            key: [sum(float(run[key]) for run in runs[m]) / len(runs[m]) for m in MEMORIES]
-            for key in ("eval_mean", "train_max_ewm")
-        }
         columns = [game.removesuffix("Easy"), " and ".join(str(len(runs[m])) for m in MEMORIES)]
-        columns += [", ".join(number(mean) for mean in pair) for pair in means.values()]
-        columns.append(", ".join(number(one - other) for one, other in means.values()))
+        for key in ("eval_mean", "train_max_ewm"):
+            one, other = ([float(run[key]) for run in runs[m]] for m in MEMORIES)
+            means = sum(one) / len(one), sum(other) / len(other)
+            columns += [", ".join(map(number, means)), number(means[0] - means[1])]
+            if min(len(one), len(other)) > 1:
+                interval = ttest_ind(one, other, equal_var=False).confidence_interval()
+                columns[-1] += f" [{number(interval.low, 2)}, {number(interval.high, 2)}]"
         models = paper()[game, "POMDP"]
         columns.append(", ".join(number(models[name][0], 2) if name in models else "-" for name in ("LRU", "MLP")))
         print("| " + " | ".join(columns) + " |")
