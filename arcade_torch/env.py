@@ -315,7 +315,7 @@ class ArcadeEnv(EnvBase):
         argument, before = int32_argument(action, self._jax_device), (self._live.batch, self._live.ends)
         stepped, pixels, packed = self._compiled.step_only(before[0], argument, self._memory.spare())
         frames, numbers = to_torch(self._memory.show(pixels), self.device), to_torch(packed, self.device)
-        self._go_on(stepped, numbers[:, TERMINATED:] > 0)
+        self._go_on(stepped, numbers[:, TERMINATED:] > 0)  # not the flags that are handed out: those may be written to
         following = self._next(frames, action, numbers)
         if self._state_in_td:
             following["state"] = self._snapshots.export(stepped)

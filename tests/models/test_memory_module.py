@@ -52,19 +52,19 @@ class Countdown(EnvBase):
 
 
 class OnlyTwoMethods(nn.Module):
-    """A third party's memory: no base class, no replay."""
+    """A third party's memory: no base class, no replay; episodes may begin with another constant than zero."""
 
-    def __init__(self):
+    def __init__(self, start=0.0):
         super().__init__()
-        self.cell = nn.GRUCell(8, 8)
+        self.cell, self.start = nn.GRUCell(8, 8), start
 
     def initial_state(self, batch_size):
-        return TensorDict({"deep": {"h": torch.zeros(batch_size, 8)}}, batch_size=[batch_size])
+        return TensorDict({"deep": {"h": torch.full((batch_size, 8), self.start)}}, batch_size=[batch_size])
 
     def forward(self, x, state, is_init):
         h, outputs = state["deep", "h"], []
         for t in range(x.shape[1]):
-            h = self.cell(x[:, t], torch.where(is_init[:, t, None], 0, h))
+            h = self.cell(x[:, t], torch.where(is_init[:, t, None], self.start, h))
             outputs.append(h)
         return torch.stack(outputs, 1), TensorDict({"deep": {"h": h}}, batch_size=[len(x)])
 
@@ -247,27 +247,13 @@ def test_wrong_flags_and_missing_time_get_one_clear_line():
         MemoryModule(make_memory("gru", 3, 4), store="sequence").begin_with(TensorDict({}, [2, 5]), TensorDict({}, [2]))
 
 
-class StartsAtOnes(OnlyTwoMethods):
-    """A constant other than zeros at the start of an episode."""
-
-    def initial_state(self, batch_size):
-        return super().initial_state(batch_size).apply(torch.ones_like)
-
-    def forward(self, x, state, is_init):
-        h, outputs = state["deep", "h"], []
-        for t in range(x.shape[1]):
-            h = self.cell(x[:, t], torch.where(is_init[:, t, None], 1, h))
-            outputs.append(h)
-        return torch.stack(outputs, 1), TensorDict({"deep": {"h": h}}, batch_size=[len(x)])
-
-
 def test_a_memory_that_does_not_begin_with_zeros_learns_from_what_it_acted():
-    policy = make_policy(StartsAtOnes())
+    policy = make_policy(OnlyTwoMethods(start=1.0))
     data = make_env(policy).rollout(20, policy, break_when_any_done=False)
     assert policy[1].store == "sequence" and data["is_init"][:, 1:].any()
     torch.testing.assert_close(replayed(policy, data)["action_value"], data["action_value"], rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="zeros"):
-        MemoryModule(StartsAtOnes(), store="step")
+        MemoryModule(OnlyTwoMethods(start=1.0), store="step")
 
 
 @pytest.mark.parametrize("name", MEMORIES)
