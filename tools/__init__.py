@@ -17,12 +17,11 @@ _PUBLIC = {
     "report": "reports",
     "saliency": "analysis.pixel_saliency",
     "saliency_figure": "figures.saliency",
-    "shuffled_beginning": "analysis.contamination",
     "study": "studies.runner",
 }
 
 if TYPE_CHECKING:
-    from arcade_torch.tools.analysis.contamination import contamination, shuffled_beginning
+    from arcade_torch.tools.analysis.contamination import contamination
     from arcade_torch.tools.analysis.gap_bias import gap_and_bias
     from arcade_torch.tools.analysis.pixel_saliency import saliency
     from arcade_torch.tools.analysis.policy import Policy
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Policy", "Study", "contamination", "gap_and_bias", "greedy_window", "recall_density", "report", "saliency",
-    "saliency_figure", "shuffled_beginning", "study",
+    "saliency_figure", "study",
 ]  # fmt: skip
 
 

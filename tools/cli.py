@@ -17,7 +17,7 @@ from typing import Any
 from arcade_torch.tools.bench.registry import BENCHES
 from arcade_torch.tools.errors import WORK_FAILED, MissingPackage, is_told, one_line
 from arcade_torch.tools.figures import FIGURES
-from arcade_torch.tools.options import load_extensions, take_imports
+from arcade_torch.tools.options import imported, load_extensions, take_imports
 
 EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 
@@ -25,7 +25,6 @@ HELP = ("-h", "--help", "help")
 EVERYWHERE = """\
 With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory models;
 --debug shows the traceback of an error."""
-
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("study.Demo", "small study of two games: learning, gap, bias and saliency in one HTML page"),
@@ -145,7 +144,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if is_told(error):
             _say(one_line(error))
             return EXIT_FAILED if type(error).__name__ in WORK_FAILED else EXIT_BAD_INPUT
-        _say("this is a fault of arcade-torch; please report it with what follows")
+        passed = {(at.f_code.co_filename, at.f_globals["__name__"]) for at, _ in traceback.walk_tb(error.__traceback__)}
+        own = [name for name in imported() if any(name in names for names in passed)]
+        _say(f"{own[0]} failed:" if own else "this is a fault of arcade-torch; please report it with what follows")
         traceback.print_exc()
         return EXIT_FAILED
     finally:

@@ -25,9 +25,7 @@ class MissingPackage(ImportError):
         super().__init__(f"the package {top} is missing: pip install {wanted}")
 
 
-_FILES = (FileNotFoundError, FileExistsError, PermissionError, NotADirectoryError, IsADirectoryError)
-BAD_INPUT = (ValueError, TypeError, *_FILES)
-"""What the library raises for bad input, beside its own error types."""
+FILES = (FileNotFoundError, FileExistsError, PermissionError, NotADirectoryError, IsADirectoryError)
 
 WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
 """Own error types that do not mean bad input; told in one line too."""
@@ -56,7 +54,7 @@ def is_told(error: BaseException) -> bool:
     if type(error).__module__.startswith("arcade_torch."):
         return True
     if not isinstance(error, ValueError | TypeError):
-        return isinstance(error, _FILES)
+        return isinstance(error, FILES)
     at = error.__traceback__
     while at is not None and at.tb_next is not None:
         at = at.tb_next

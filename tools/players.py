@@ -70,15 +70,20 @@ def references(
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass  # there is none, or it is damaged or older: it is made anew
     settings = {"rules": rules, **how["options"]}
-    there = [player for player in PLAYERS if player in ("random", *make(game, **settings).oracles)]
+    there = players_of(game, **settings)
     found = {player: measure(game, player, episodes, block=EPISODES, **settings) for player in there}
     write_json(file, {"how": how, "players": [row._asdict() for row in found.values()]})
     return found
 
 
+def players_of(game: str, **settings: Any) -> list[str]:
+    """Those of `PLAYERS` that a game has: a game of your own may lack an oracle."""
+    return [player for player in PLAYERS if player in ("random", *make(game, **settings).oracles)]
+
+
 def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
     """Every player in every game, one row after another; rows that ``out`` holds already are not measured again."""
-    keys = ((id, player) for id in ids for player in PLAYERS)
+    keys = ((id, player) for id in ids for player in players_of(id))
     return measured_rows(out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds))
 
 

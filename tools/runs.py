@@ -355,10 +355,14 @@ def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
     columns = {role: next((name for name in names if name in header), "") for role, names in roles.items()}
     if missing := [role for role, name in columns.items() if not name]:
         raise ValueError(f"{path} has no column for {', '.join(missing)}; it has {', '.join(header) or 'none'}")
+    played = dict[str, list[str | None]]()
     for row in rows:
         agent, game, twin, seed, score = (row[name] for name in columns.values())
         if not score:
             continue
+        how = [row.get(name) for name in ("rules", "obs_size", "options")]
+        if (first := played.setdefault(game, how)) != how:
+            raise ValueError(f"{path}: {game} has scores of rules, obs_size and options {first} and {how}: keep one")
         try:
             made = Score("", game, twin, int(seed), float(score), row.get("player") or "")
         except ValueError:

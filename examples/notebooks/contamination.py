@@ -59,5 +59,5 @@ for name, result in found.items():
 # * With memory one noisy frame can change decisions many steps later, on a task whose every frame says all there is to
 #   know. That is contamination.
 #
-# Noise takes frames out of what training has seen. `shuffled_beginning` permutes early frames instead, each of them a
+# Noise takes frames out of what training has seen. `shuffle=True` permutes early frames instead, each of them a
 # frame of the game. For whole studies: `arcade-torch analyze contamination RUNS ...`, with `--shuffle`.

@@ -1,8 +1,8 @@
 """What every entry point keeps, whatever arrives: it works, or refuses in one line that we wrote; and the counts.
 
-Refused properly means: an error type of the package (or one of `BAD_INPUT` of the command line), raised by a ``raise``
-statement in our own source, with one non-empty line. An ``AttributeError`` out of a dictionary, an error of torch, JAX
-or the standard library that passes through, a hang: all of them fail the test.
+Refused properly means: an error type of the package (or ``ValueError``, ``TypeError`` or one about files), raised by a
+``raise`` statement in our own source, with one non-empty line. An ``AttributeError`` out of a dictionary, an error of
+torch, JAX or the standard library that passes through, a hang: all of them fail the test.
 """
 
 import ast
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, settings
 
-from arcade_torch.tools.errors import BAD_INPUT
+from arcade_torch.tools.errors import FILES
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = tuple(str(ROOT / name) + os.sep for name in ("arcade_torch", "envs_jax", "models", "agents", "tools"))
@@ -88,7 +88,7 @@ def improper(error: BaseException) -> str | None:
     if isinstance(error, Refused):
         return None
     kind, text = type(error), str(error)
-    if not isinstance(error, BAD_INPUT) and not kind.__module__.startswith("arcade_torch."):
+    if not isinstance(error, (ValueError, TypeError, *FILES)) and not kind.__module__.startswith("arcade_torch."):
         return "not an error type of ours"
     if not text.strip() or "\n" in text:
         return "not one line"

@@ -139,6 +139,19 @@ def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
         cli.main(["list", "--debug"])
 
 
+@pytest.mark.usefixtures("own_registry")
+def test_a_failure_below_what_was_imported_is_not_called_ours(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from arcade_torch.tools.commands import list as command
+
+    (tmp_path / "mine.py").write_text("import arcade_torch.tools\narcade_torch.tools.broken = lambda: 1 // 0\n")
+    monkeypatch.setattr(command.List, "run", lambda self: sys.modules["arcade_torch.tools"].broken())
+    assert cli.main(["list", "--import", str(tmp_path / "mine.py")]) == cli.EXIT_FAILED
+    said = capsys.readouterr().err
+    assert said.startswith(f"arcade-torch: {tmp_path / 'mine.py'} failed:\n") and "ZeroDivisionError" in said
+
+
 def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     from arcade_torch.tools.commands import study as command
 

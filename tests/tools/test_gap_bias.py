@@ -1,5 +1,6 @@
 """Gap and Bias against the paper's aggregates, and the bootstrap against what is known about it."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arcade_torch.tools import gap_and_bias
-from arcade_torch.tools.analysis.bootstrap import mean_over_tasks, measured_coverage, percentile_interval, resampled
+from arcade_torch.tools import figures, gap_and_bias
+from arcade_torch.tools.analysis.bootstrap import (
+    mean_over_tasks,
+    measured_coverage,
+    percentile_interval,
+    resampled,
+    seed_coverage,
+)
 from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
+from arcade_torch.tools.figures import ScoreOptions
+from arcade_torch.tools.figures.style import drawing
 from arcade_torch.tools.runs import Score, read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
@@ -44,7 +53,7 @@ def test_the_texts_quoted_differences_come_out(paper: GapBias) -> None:
     assert paper.row("GDN").pomdp.value == pytest.approx(0.469, abs=5e-4)
     assert paper.row("MinGRU").pomdp.value == pytest.approx(0.471, abs=5e-4)
     assert paper.row("GDN").bias.value - paper.row("MinGRU").bias.value == pytest.approx(-0.091, abs=5e-4)
-    assert paper.gap_difference("MinGRU", "GDN").value == pytest.approx(0.089, abs=5e-4)
+    assert paper.difference("gap", "MinGRU", "GDN").value == pytest.approx(0.089, abs=5e-4)
     assert len(paper.tasks) == 30 and len(paper.without) == 10
 
 
@@ -113,6 +122,58 @@ def test_gap_and_bias_share_the_resample_of_the_mdp_runs() -> None:
     row = table.row("lru")  # only the MDP runs vary, so Gap and Bias must be equal draw by draw
     assert (row.gap.low, row.gap.high) == (row.bias.low, row.bias.high)
     assert row.gap.high > row.gap.low
+
+
+def test_twins_and_agents_are_resampled_apart_even_where_their_scores_are_equal() -> None:
+    same = [0.0, 0.2, 0.5, 0.6, 1.0]
+    table = gap_and_bias(
+        scores({(agent, twin): same for agent in ("mlp", "lru") for twin in ("full", "partial")}), draws=300
+    )
+    for interval in (table.row("lru").gap, table.row("lru").bias, table.difference("pomdp", "lru", "mlp")):
+        assert interval.value == 0 and interval.low < -0.2 and interval.high > 0.2
+
+
+def test_confidence_decides_intervals_differences_and_their_measured_coverage() -> None:
+    rng = np.random.default_rng(4)
+    runs = scores({(a, twin): list(rng.normal(size=4)) for a in ("mlp", "lru") for twin in ("full", "partial")})
+    wide, narrow = (gap_and_bias(runs, draws=400, confidence=confidence) for confidence in (0.95, 0.5))
+    of = [(table.row("lru").gap, table.difference("gap", "lru", "mlp")) for table in (wide, narrow)]
+    assert all(a.low < b.low and b.high < a.high for a, b in zip(*of, strict=True))
+    assert narrow.row("lru").coverage == measured_coverage((4,), (4,), 0.5) < wide.row("lru").coverage - 0.2
+    assert seed_coverage(5, 0.5) < seed_coverage(5) - 0.2
+
+
+def test_the_least_coverage_stands_under_figure_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Both agents have a cell of two seeds; in the other cells one of them has two and the other five."""
+    lines, rng = ["agent,game,observability,seed,score"], np.random.default_rng(0)
+    cells = product(("mlp", "lru"), range(6), ("full", "partial"), range(5))
+    for agent, game, twin, seed in cells:
+        if seed < 2 or (agent == "mlp" and (game, twin) != (0, "full")):
+            lines.append(f"{agent},Game{game},{twin},{seed},{rng.normal()}")
+    (tmp_path / "scores.csv").write_text("\n".join(lines))
+    table = gap_and_bias(tmp_path / "scores.csv", draws=10)
+    shares = [row.coverage for row in table.rows]
+    assert shares[0] > shares[1] + 0.03 and table.coverage == {2: shares[1]}
+    with drawing("light"):
+        made = figures.gap_bias.gap_bias(ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10), None)
+    share = f"{100 * shares[1]:.0f} %"
+    assert made.pictures[0].note.endswith(f"measured coverage with 2 seeds {share}")
+    assert made.tables[0].caption.endswith(f"measured coverage of the gap's: {share} with 2 seeds")
+
+
+def test_a_single_seed_of_one_side_leaves_no_interval_of_the_difference() -> None:
+    many, one = [0.1, 0.2, 0.4], [0.3]
+    values = {("mlp", "full"): one, ("mlp", "partial"): one, ("lru", "full"): many, ("lru", "partial"): many}
+    table = gap_and_bias(scores(values), draws=50)
+    assert table.row("lru").gap.low < table.row("lru").gap.high
+    assert np.isnan(table.row("lru").bias.low) and np.isnan(table.difference("gap", "lru", "mlp").low)
+
+
+def test_raw_returns_stay_as_they_are_and_only_the_normalised_ones_are_mapped() -> None:
+    values = {(agent, twin): [-0.5, 0.5, 0.6] for agent in ("mlp", "lru") for twin in ("full", "partial")}
+    row = gap_and_bias(scores(values, "TetrisEasy"), draws=10).row("lru")
+    assert [row.mdp_raw.value, row.mdp.value, row.mdp_iqm.value] == pytest.approx([0.2, 0.6, 0.6])
+    assert [row.pomdp_raw.value, row.pomdp.value, row.pomdp_iqm.value] == pytest.approx([0.2, 0.6, 0.6])
 
 
 def test_the_bias_of_the_memory_free_agent_is_exactly_zero() -> None:
@@ -184,6 +245,10 @@ def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
     ]
     file.write_text("\n".join(lines) + "\n")
     assert len(read_scores(file)) == 8
+    both = ["agent,game,observability,seed,eval_mean,train_max_ewm", "mlp,X,full,0,0.25,0.75"]
+    (tmp_path / "results.csv").write_text("\n".join(both) + "\n")
+    for metric, value in (("eval_final", 0.25), ("train_max_ewm", 0.75)):
+        assert [score.value for score in read_scores(tmp_path / "results.csv", metric)] == [value]
     assert gap_and_bias(file, draws=10).row("lru").seeds == 2
 
 
@@ -206,12 +271,26 @@ def test_bad_tables_are_refused_with_a_reason(tmp_path: Path, text: str, message
         gap_and_bias(file, draws=10)
 
 
+def test_scores_of_several_rules_are_not_pooled_and_lost_runs_are_told(tmp_path: Path) -> None:
+    head, rows = "agent,game,observability,seed,status,rules,eval_mean", ["mlp,X,full,0,finished,default,.9"]
+    rows += ["mlp,X,partial,0,finished,default,.1", "mlp,X,partial,1,failed,default,"]
+    (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
+    made, table, _ = figures.gap_bias._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
+    assert table.row("mlp").gap.value == pytest.approx(0.8) and made.notes == ["left out, not finished: 1 run"]
+    (tmp_path / "s.csv").write_text("\n".join([head, *rows, "mlp,X,full,1,finished,reference,.1"]))
+    with pytest.raises(ValueError, match=r"X has scores of rules, .*'default'.* and .*'reference'"):
+        read_scores(tmp_path / "s.csv")
+
+
 def test_a_bare_name_and_its_version_are_one_game() -> None:
     twins = [("mlp", "full"), ("mlp", "partial"), ("lru", "full"), ("lru", "partial")]
     bare = [Score(agent, "TetrisEasy", twin, 0, 0.5) for agent, twin in twins]
     full = [Score(agent, "TetrisEasy-v1", twin, 1, 0.7) for agent, twin in twins]
     table = gap_and_bias(bare + full, draws=10)
     assert table.tasks == ("TetrisEasy-v1",) and table.row("lru").seeds == 2
+    names = ("TetrisEasy", "TetrisEasy-v9", "TetrisEasy-v10")
+    newest = read_scores([Score("mlp", game, "full", seed, 0.5) for seed, game in enumerate(names)])
+    assert newest[0].game == "TetrisEasy-v10"
 
 
 def test_an_unknown_metric_is_refused() -> None:

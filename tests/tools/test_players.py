@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arcade_torch.envs_jax import make
 from arcade_torch.tools import cli, players
 from arcade_torch.tools.play.recording import scene, sheet
 
@@ -53,6 +54,14 @@ def test_the_table_is_written_between_the_marks_of_a_page(tmp_path: Path, capsys
     assert cli.main(words) == cli.EXIT_BAD_INPUT
     assert "needs one line '<!-- baselines -->'" in capsys.readouterr().err
     assert page.read_text() == "no marks"
+
+
+def test_a_game_without_oracles_has_the_random_player_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(make("SignpostEasy")), "oracles", {"state": "x:X"})
+    assert players.players_of("SignpostEasy") == ["random", "state"]
+    monkeypatch.setattr(type(make("SignpostEasy")), "oracles", {})
+    rows = list(players.measure_all(["SignpostEasy-v0"], 8, 60, tmp_path / "b.csv"))
+    assert [row.player for row in rows] == ["random"] and players.markdown(rows).count("SignpostEasy") == 1
 
 
 def test_a_file_of_something_else_is_refused_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -149,19 +149,22 @@ def table(mlp: list[float], lru: list[float]) -> Any:
 
 def test_the_headline_claims_only_what_the_interval_allows() -> None:
     clear = reports.score_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "gap", "lru")
-    assert ": over these three seeds memory narrows the observability gap by 0.70" in clear
+    assert ": over these 3 seeds memory narrows the observability gap by 0.70" in clear
     many = reports.score_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "gap", "lru")
     assert ": memory narrows the observability gap by 0.70" in many
     worse = reports.score_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "gap", "lru")
     assert "memory widens the observability gap by 0.70" in worse
     vague = reports.score_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "gap", "lru")
-    assert "contains zero, so three seeds do not settle it" in vague
+    assert "contains zero, so 3 seeds do not settle it" in vague
+    ahead = reports.score_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "pomdp", "lru")
+    assert ahead.startswith("On the POMDP lru reaches a normalised return of 0.81, the memory-free agent 0.11, a diff")
+    assert "a difference of +0.70 [+0." in ahead
     single = reports.score_sentence(table([0.1], [0.9]), "gap", "lru")
     assert "single seed" in single and "narrows" not in single
 
 
 def test_few_seeds_come_with_a_caution() -> None:
-    assert "With two seeds" in reports.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
+    assert "With 2 seeds" in reports.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
     assert "no intervals" in reports.coverage_sentence(table([0.1], [0.3]))
 
 
@@ -234,4 +237,5 @@ def test_one_scale_serves_a_whole_row_and_few_frames_leave_places_empty() -> Non
         _, axes = plt.subplots(1, 3)
         assert saliency.plot(frames, maps, axes, sigma_px=0.0) == 2.0
         heats = [axis.images[1].get_array() for axis in axes[1:]]
+    assert [axis.get_title() for axis in axes] == ["", "$o_{n-1}$", "$o_{n}$"]
     assert not axes[0].images and heats[0].max() == 1.0 and heats[1].max() == np.sqrt(0.5)

@@ -1,15 +1,21 @@
 """The report of a large study, and what it shows of the inside of agents."""
 
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from arcade_torch.agents import preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, report, reports
+from arcade_torch.tools.analysis.checkpoints import Label
+from arcade_torch.tools.analysis.contamination import Contamination
+from arcade_torch.tools.analysis.recall_density import RecallDensity
+from arcade_torch.tools.figures.style import drawing
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import representatives, select_cells
-from arcade_torch.tools.runs import Runs, open_run
+from arcade_torch.tools.runs import AgentKey, Runs, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import write_run
@@ -50,6 +56,9 @@ def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch
     assert "60 runs</summary>" in page and "study.json" in page
     assert page.count("arcade-torch train") == 1
     assert 'class="heat best" style="--v:' in page and 'href="#curve-TetrisEasy-v0-partial"' in page
+    mines = page.partition('href="#curve-MineSweeperEasy-v0-full">')[2].partition("</tr>")[0]
+    heats = re.findall(r'--v:(\d+)">(-?[\d.]+)<', mines)
+    assert len(heats) == 3 and all(abs(int(heat) - 50 * (float(value) + 1)) <= 1 for heat, value in heats)
     first = page.index("Partial observability costs the memory-free agent")
     assert "and lru 0.07" in page[first : first + 200] and "The same for every other agent" in page
 
@@ -77,6 +86,20 @@ def test_representatives_without_a_control_are_the_best_agent() -> None:
         ("B", "partial"): {"pqn-mlp": [0.3], "pqn-lru": [0.9]},
     }
     assert representatives(both, "mlp") == (["pqn-mlp", "pqn-lru"], ["B", "A"])
+
+
+def test_columns_of_the_page_are_those_steps_that_their_headings_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    delays, flip = np.array(panels.NOISE["delays"]), np.tile([1.0, 0.5, 0.25, 0.0, 0.0, np.nan], (4, 1, 1))
+    found = Contamination(np.array([0.3]), delays, flip, flip, flip * np.nan, np.zeros((4, 2), np.int64), 0.0, 0, "q")
+    label = Label(AgentKey("pqn", "lru"), GAMES[0], "full", 0, Path("run"), "lru")
+    monkeypatch.setattr(panels, "measure_run", lambda *words: (label, found))
+    dense = RecallDensity(np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q")
+    with drawing("light"):
+        (row,) = panels.contamination_section({label.task: [label.path]}, ["lru"], None)["rows"]
+        monkeypatch.setattr(panels, "measure_run", lambda *words: (label, dense))
+        (past,) = panels.recall_section({label.task: [label.path]}, ["lru"], None)["rows"]
+    assert (row["at_once"], row["one"], row["later"]) == (1, 0.5, 0.1875) and (row["seeds"], row["points"]) == (1, 4)
+    assert [past[name] for name in ("older", "first", "last")] == pytest.approx([0.3, 0.1, 0.4])
 
 
 def test_runs_without_checkpoints_are_left_out_and_counted(tmp_path: Path) -> None:

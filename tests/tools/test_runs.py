@@ -50,6 +50,13 @@ def test_seeds_trained_with_other_settings_are_refused_by_name(tmp_path: Path) -
         write(tmp_path / str(seed), "lru", "full", seed, 0.5, pqn={"gamma": gamma})
     with pytest.raises(ValueError, match=r"seeds of lru on CartPoleEasy-v0 \(full\) differ in pqn.gamma: 0.9 and 0.99"):
         find_runs([tmp_path])
+    write(tmp_path / "1", "lru", "full", 1, 0.5, total_frames=7, pqn={"gamma": 0.9})
+    with pytest.raises(ValueError, match="differ in total_frames: 350000 and 7"):
+        find_runs([tmp_path])
+    for seed, size in ((0, 128), (1, 256)):
+        write(tmp_path / str(seed), "lru", "full", seed, 0.5, obs_size=size)
+    with pytest.raises(ValueError, match="runs with obs_size 128 and 256 cannot be compared"):
+        find_runs([tmp_path])
 
 
 def test_names_say_no_more_than_is_needed_to_tell_agents_apart() -> None:

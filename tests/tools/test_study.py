@@ -258,6 +258,7 @@ def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_pa
     what = small_study()
     rows = carry_out(what, tmp_path / "s", Fabricator(what))
     assert "seconds" not in rows[0]
+    assert float(rows[0]["eval_std"]) == pytest.approx(0.02**0.5)  # of two returns .2 apart
     assert {row["run"]: row["seconds"] for row in read_csv(tmp_path / "s" / "timings.csv")} == {
         run.name: "95.0" for run in what.runs()
     }

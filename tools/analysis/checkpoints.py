@@ -14,7 +14,7 @@ import arcade_torch
 from arcade_torch.agents import load
 from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.files import cached_arrays
-from arcade_torch.tools.runs import AgentKey, agent_names, find_runs
+from arcade_torch.tools.runs import AgentKey, Runs, agent_names, check_comparable, find_runs, open_run
 
 Found = TypeVar("Found")
 
@@ -58,6 +58,8 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
             runs = find_runs([path])
             found += [run.path for run in runs.runs]
             notes += runs.notes
+    folders = [open_run(path) for path in found if (path / "config.json").exists()]
+    check_comparable(Runs(tuple(run for run in folders if run is not None)))
     return found, notes
 
 

@@ -2,8 +2,8 @@
 
 A greedy trajectory is recorded; frame j is replaced by itself plus noise (on the [0, 1] scale of pixels), the memory
 replays it, and k steps later the outputs are compared with those of the undisturbed replay. A memory-free agent is
-untouched for k >= 1; noise on the decision's own frame (k = 0) is the ceiling. ``shuffled_beginning`` permutes early
-frames instead, each of which stays a frame that training has seen.
+untouched for k >= 1; noise on the decision's own frame (k = 0) is the ceiling. ``shuffle`` permutes early frames
+instead, each of which stays a frame that training has seen.
 
 By default the recorded actions and start flags are replayed (teacher forcing), so that nothing but the observation
 reaches the memory; with ``feedback`` the previous action is the replay's own, as in the published code.
@@ -87,8 +87,10 @@ def contamination(
         starts: disturbed frames P, at most four an episode, drawn uniformly from the frames before its last.
         clip: keep noisy pixels in their range (the published code does not).
         feedback: let the replay choose the previous actions itself.
-        shuffle: permute early frames in place of adding noise, as `shuffled_beginning` does.
-        identity: permute none of them.
+        shuffle: permute frames 2 to 10 in place of adding noise, once a trajectory; actions and start flags stay in
+            their order, delays count from frame 10, ``sigmas`` becomes one NaN. On a POMDP another order may rightly
+            change what the agent believes: draw conclusions on MDPs only.
+        identity: permute none of them, which must change nothing.
         seed: of episodes, start points and noise.
         progress: called with (start points done, starts).
 
@@ -139,24 +141,6 @@ def contamination(
         raise ValueError(f"none of {skipped + len(parts)} episodes was long enough: {wanted}")
     flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Contamination(strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what)
-
-
-def shuffled_beginning(agent: Any, env: Any = None, *, identity: bool = False, **options: Any) -> Contamination:
-    """Permute frames 2 to 10 of a trajectory and keep all others.
-
-    Actions and start flags stay in their order. On a POMDP another order may rightly change what the agent believes:
-    draw conclusions on MDPs only.
-
-    Args:
-        agent: as for `contamination`, and so is ``env``.
-        identity: use the identity in place of random permutations, which must change nothing.
-        **options: those of `contamination`; delays count from frame 10, and ``starts`` is the number of permutations,
-            one a trajectory.
-
-    Returns:
-        Arrays; ``sigmas`` is one NaN.
-    """
-    return contamination(agent, env, shuffle=True, identity=identity, **options)
 
 
 def _compare(model: Any, what: str, raw: Tensor, decisions: Ints) -> tuple[Array, ...]:

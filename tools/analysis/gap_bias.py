@@ -90,12 +90,14 @@ class GapBias:
         require(agent in found, "an agent", agent, f"one of {', '.join(found)}")
         return found[agent]
 
-    def gap_difference(self, first: str, second: str) -> Interval:
-        """Gap(first) - Gap(second) with an interval from the same draws."""
-        return self.difference("gap", first, second)
+    @property
+    def coverage(self) -> dict[int, float]:
+        """Fewest seeds -> measured coverage of the intervals of Gap, the smallest of the agents with so few."""
+        known = [(row.seeds, -row.coverage) for row in self.rows if row.coverage == row.coverage]
+        return {seeds: -share for seeds, share in sorted(known)}
 
     def difference(self, name: str, first: str, second: str) -> Interval:
-        """The same of any number of the rows, ``pomdp`` for one."""
+        """A number of the table, such as ``gap``, of one agent minus another's, its interval from the same draws."""
         known = min(self.row(first).seeds, self.row(second).seeds) > 1
         values = self._values[first][name] - self._values[second][name]
         return percentile_interval(values[0], values[1:], self.confidence, known)
@@ -145,7 +147,7 @@ def gap_and_bias(
     cells = _cells([score for score in read_scores(runs, metric) if score.observability not in BOTH_TWINS])
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
     if not (found := find_baselines(agents, baseline)):
-        raise ValueError(f"no scores for the memory-free agent {baseline!r}; there are {', '.join(agents) or 'none'}")
+        raise ValueError(f"no scores for the memory-free agent {baseline!r}, only for {', '.join(agents) or 'nobody'}")
     baselines = {agent: found.get(agent) for agent in [*found.values(), *agents]}
     every = list(dict.fromkeys(game for _, game, _ in cells))
     tasks = [game for game in every if all((agent, game, twin) in cells for agent in agents for twin in TWINS)]

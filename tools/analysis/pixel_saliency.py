@@ -81,6 +81,8 @@ def saliency(
         ValueError: a shape does not fit, n is out of range, or an option has an unknown value.
         TypeError: ``model`` has none of the forms above.
     """
+    if (reduce, resolve(model, target)) == ("sum", "probs"):
+        raise ValueError("the sum of all probabilities is always 1: take reduce per_action, or target logits")
     for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
         require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
     require(chunk >= 1, "chunk", chunk, "at least 1")

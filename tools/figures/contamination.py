@@ -34,11 +34,12 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
     for (game, twin), agents in style.agents_by_task(pool(by_task(measured), options.confidence)).items():
         figure = _figure(agents, first, options)
         figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
-        seeds = {agent: len(value["flip"].seeds) for agent, value in agents.items()}
+        seeds = {agent: np.isfinite(value["flip"].seeds).sum(0) for agent, value in agents.items()}
+        counts = [count for each in seeds.values() for count in each.ravel().tolist() if count]
         label, item = next(pair for pair in measured if pair[0].task[1:] == (game, twin))
         ceiling = "last shuffled frame" if options.shuffle else "decision's own frame"
         note = (
-            f"{style.seeds_note(list(seeds.values()), options.confidence)}; {len(item.points)} start points each, "
+            f"{style.seeds_note(counts, options.confidence)}; {len(item.points)} start points each, "
             f"{'replay chooses its actions' if options.feedback else 'recorded actions'};\n"
             f"0 steps: the {ceiling}; dashed: without memory nothing changes after it"
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.envs_jax.registry import DIFFICULTIES
-from arcade_torch.tools.analysis.bootstrap import Interval, seed_coverage
+from arcade_torch.tools.analysis.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.analysis.gap_bias import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
@@ -67,8 +67,8 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     for axis, (game, table) in zip(axes[0], tables.items(), strict=True):
         plot(table.rows, axis)
         axis.set_title(game)
-    seeds = seeds_note([int(row["seeds"]) for row in rows], options.confidence)
-    return Made([Picture("size-sweep", figure, f"labels: layers x width; {options.metric}, {seeds}", rows)], notes)
+    note = f"labels: layers x width; {options.metric}, {_seeds(list(tables.values()), options)}"
+    return Made([Picture("size-sweep", figure, note, rows)], notes)
 
 
 def human(options: PaperOptions, progress: Progress | None) -> Made:
@@ -159,9 +159,10 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
     """The table of runs, of CSV files, or of the paper; what to say and print; what stands under a figure of it."""
     if options.paper:
         paper = paper_table()
+        seeds = (SEEDS,) * len(paper.table.tasks)
         note = (
-            f"published returns, {len(paper.table.tasks)} tasks, n = {SEEDS} seeds; bars: normal 95 % interval, tasks "
-            f"independent (a bootstrap over {SEEDS} seeds would cover {100 * seed_coverage(SEEDS):.0f} %)"
+            f"published returns, {len(seeds)} tasks, n = {SEEDS} seeds; bars: normal 95 % interval, tasks independent "
+            f"(bootstrap intervals of the gap would cover {100 * measured_coverage(seeds, seeds):.0f} %)"
         )
         return Made(tables=[paper.printed()]), paper.table, note
     if not options.runs:
@@ -170,18 +171,27 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
     found = find_runs(folders) if folders else Runs(())
     scores = read_scores(options.runs, options.metric)
     table, notes = _computed(scores, options), found.notes + found.single_seeds()
+    rows = [row for path in options.runs if path not in folders for row in read_csv(table_of(path) or path)]
+    if lost := sum(row.get("status", "finished") != "finished" for row in rows):
+        notes.append(f"left out, not finished: {lost} run{'s' * (lost > 1)}")
     if apart := sum(score.observability in BOTH_TWINS for score in scores):
         notes.append(f"left out, of no single twin: {apart} score{'s' * (apart > 1)} ({' or '.join(BOTH_TWINS)})")
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
-    note = f"{tasks}, {seeds_note([row.seeds for row in table.rows], options.confidence)}"
+    note = f"{tasks}, {_seeds([table], options)}"
     return Made(notes=notes, tables=[_printed(table, tasks)]), table, note
 
 
 def _computed(scores: list[Score], options: SweepOptions) -> GapBias:
     how: Any = {name: getattr(options, name) for name in ("metric", "baseline", "draws", "confidence")}
     return gap_and_bias(scores, **how)
+
+
+def _seeds(tables: Sequence[GapBias], options: SweepOptions) -> str:
+    """How many seeds, and the smallest coverage of an interval of Gap."""
+    share = min((share for table in tables for share in table.coverage.values()), default=None)
+    return seeds_note([row.seeds for table in tables for row in table.rows], options.confidence, share=share)
 
 
 def _printed(table: GapBias, what: str) -> Table:
@@ -196,8 +206,7 @@ def _printed(table: GapBias, what: str) -> Table:
         **{"pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"},
     }
     rows = [(row.agent, row.seeds, *(cell(getattr(row, name)) for name in head)) for row in table.rows]
-    coverage = {row.seeds: row.coverage for row in table.rows if row.coverage == row.coverage}
-    measured = ", ".join(f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in sorted(coverage.items()))
+    measured = ", ".join(f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in table.coverage.items())
     caption = (
         f"below: {100 * table.confidence:g} % bootstrap interval over seeds; measured coverage of the gap's: {measured}"
         if measured

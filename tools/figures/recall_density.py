@@ -67,9 +67,10 @@ def _measure(options: DensityOptions, progress: Progress | None) -> tuple[Densit
         notes.append(f"left out, no trajectory: {empty}")
     if short := sum(density.dropped for _, density in found):
         notes.append(f"{short} trajectories with fewer than 3 frames were left out")
+    agents, games, _ = map(dict.fromkeys, zip(*by_task(found), strict=True))
     cells = [f"{agent} on {game}" for agent, game, _ in by_task(found)]
-    if alone := [cell for cell in cells if cells.count(cell) < 2]:
-        notes.append(f"only one twin is there: {listed(alone)}")
+    if lacking := [cell for agent in agents for game in games if cells.count(cell := f"{agent} on {game}") < 2]:
+        notes.append(f"only one twin is there, or none, and bars are means over the others: {listed(lacking)}")
     return found, notes
 
 

@@ -82,8 +82,8 @@ def whiskers(value: Array, low: Array, high: Array) -> Any:
     return np.maximum([value - low, high - value], 0.0)
 
 
-def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> str:
-    """How many seeds, which interval, and what it is worth.
+def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars", share: float | None = None) -> str:
+    """How many seeds, which interval, and what it is worth: its coverage ``share``, that of one cell's mean by default.
 
     Example:
         >>> seeds_note([1], 0.95)
@@ -93,7 +93,7 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars") -> s
     count = f"n = {low} seed{'s' * (low > 1)}" if low == high else f"n = {low} to {high} seeds"
     if high < 2:
         return f"{count}, no interval (needs two)"
-    share = seed_coverage(max(low, 2), confidence)
+    share = seed_coverage(max(low, 2), confidence) if share is None else share
     return (
         f"{count}; {what}: {100 * confidence:g} % bootstrap interval over seeds, "
         f"measured coverage with {max(low, 2)} seeds {100 * share:.0f} %"

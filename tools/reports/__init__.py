@@ -27,7 +27,6 @@ from arcade_torch.tools.studies.grid import Study
 TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
 MANY_PANELS = 8  # from here on pictures of learning are small
 TRUSTED_COVERAGE = 0.85  # below this measured coverage a difference is one of the seeds that were run
-NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 # Number of the table -> the fact; then how it goes on: a single seed, an interval without zero, one with zero.
 SENTENCES = {
@@ -180,7 +179,7 @@ def score_sentence(table: GapBias, name: str, agent: str) -> str:
     value, low, high = found = row.bias if name == "bias" else difference
     fact, single, clear, vague = SENTENCES[name]
     ending = single if low != low else clear if found.excludes_zero else vague
-    seeds, weak = number_words(min(base.seeds, row.seeds)), min(base.coverage, row.coverage) < TRUSTED_COVERAGE
+    seeds, weak = min(base.seeds, row.seeds), min(base.coverage, row.coverage) < TRUSTED_COVERAGE
     near, far = sorted((abs(low), abs(high)))
     return f"{fact}{ending}".format(
         **{"agent": agent, "base": getattr(base, name).value, "own": getattr(row, name).value, "seeds": seeds},
@@ -192,20 +191,14 @@ def score_sentence(table: GapBias, name: str, agent: str) -> str:
     )
 
 
-def number_words(count: int) -> str:
-    """Small numbers as words."""
-    return NUMBERS[count] if 0 <= count < len(NUMBERS) else str(count)
-
-
 def coverage_sentence(table: GapBias) -> str:
     """How much the intervals are worth with so few seeds."""
-    known = {row.seeds: row.coverage for row in table.rows if row.coverage == row.coverage}
-    if not known:
+    if not table.coverage:
         return "With a single seed there are no intervals: repeat with more seeds before believing a difference."
-    seeds, share = min(known.items())
+    seeds, share = min(table.coverage.items())
     return (
         f"Intervals are nominal {100 * table.confidence:g} % percentile bootstrap over seeds. "
-        f"With {number_words(seeds)} seeds such an interval held the true gap in {100 * share:.0f} % of simulated "
+        f"With {seeds} seeds such an interval held the true gap in {100 * share:.0f} % of simulated "
         "studies, so it is narrower than it claims."
     )
 

@@ -1,6 +1,6 @@
 """Contamination against models whose answer is known."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -10,9 +10,9 @@ from torch import Tensor
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import Policy, contamination, shuffled_beginning
+from arcade_torch.tools import Policy, contamination
 from arcade_torch.tools.analysis.contamination import contamination_example, disturbed_frames, replayed, shuffle_order
-from arcade_torch.tools.analysis.windows import greedy_window
+from arcade_torch.tools.analysis.windows import greedy_window, greedy_windows
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
@@ -43,6 +43,36 @@ def test_the_relative_change_is_rho_to_the_delay_over_the_spread_of_values() -> 
     torch.testing.assert_close(after[:2], before[:2])
 
 
+@pytest.mark.parametrize("target", ["q", "probs"])
+def test_flip_change_and_divergence_are_those_of_a_slow_replay(
+    target: Literal["q", "probs"], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, env = linear_policy(0.8, dtype=torch.float32, gain=2e-4), ToyEnv([9, 12])
+    monkeypatch.setattr(
+        "arcade_torch.tools.analysis.contamination.disturbed_frames",
+        lambda frames, places, *rest: 255 - frames[torch.as_tensor(places)].float(),
+    )
+    found = contamination(policy, env, sigmas=(0.1,), delays=(0, 2), starts=12, seed=1, target=target)
+    windows = list(greedy_windows(policy, env, episodes=28, seed=1))
+    for point, (number, place) in enumerate(found.points):
+        w = windows[number]
+        dirty = w.frames.float()
+        dirty[place] = 255 - dirty[place]
+        clean, moved = (policy.remember(policy.encode(o)[None], None, w.is_init[None], None)[0][0].double().numpy()
+                        for o in (w.frames, dirty))  # fmt: skip
+        for k, t in enumerate((place, place + 2)):
+            if t > w.n:
+                assert np.isnan(found.change[point, 0, k])
+                continue
+            p, q = (np.exp(y[t]) / np.exp(y[t]).sum() for y in (clean, moved))
+            a, b = (p, q) if target == "probs" else (clean[t], moved[t])
+            difference = (b - b.mean()) - (a - a.mean())
+            assert found.change[point, 0, k] == pytest.approx(abs(difference).max() / (a.max() - a.min()), rel=1e-4)
+            assert found.flip[point, 0, k] == (a.argmax() != b.argmax())
+            if target == "probs":
+                assert found.kl[point, 0, k] == pytest.approx((p * np.log(p / q)).sum(), rel=1e-3)
+
+
 def test_delays_beyond_the_end_of_an_episode_are_missing_and_counted_so() -> None:
     found = contamination(linear_policy(0.9, dtype=torch.float32), ToyEnv([10]), delays=(0, 5, 9, 50), starts=40)
     left = 9 - found.points[:, 1]
@@ -63,6 +93,7 @@ def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode()
     lengths = np.array(ENV)[found.points[:, 0] % len(ENV)]
     assert (found.points[:, 1] < lengths - 1).all()
     assert np.bincount(found.points[:, 0]).max() <= 4
+    assert len(np.unique(found.points, axis=0)) == 50
 
 
 def test_noise_has_the_asked_strength_its_draw_is_shared_and_clipping_keeps_the_range() -> None:
@@ -87,9 +118,9 @@ def test_a_shuffle_moves_the_named_frames_only_and_always_moves_some() -> None:
 
 def test_a_memory_that_adds_up_does_not_notice_the_order_and_one_that_forgets_does() -> None:
     sums, fades = (linear_policy(rho, dtype=torch.float32) for rho in (1.0, 0.9))
-    same, moved = (shuffled_beginning(p, ToyEnv(ENV), delays=(0, 3), starts=12) for p in (sums, fades))
+    same, moved = (contamination(p, ToyEnv(ENV), delays=(0, 3), starts=12, shuffle=True) for p in (sums, fades))
     assert same.mean("change").max() < 1e-4 < moved.mean("change").min()
-    short = shuffled_beginning(fades, ToyEnv([5, 20]), starts=4, delays=(0,))
+    short = contamination(fades, ToyEnv([5, 20]), starts=4, delays=(0,), shuffle=True)
     assert short.skipped >= 3 and len(short.points) == 4
 
 
@@ -135,6 +166,8 @@ def test_an_example_holds_the_clean_outputs_and_differs_in_the_hit_frames_alone(
     changed = (found.frames != found.frames[0]).any((2, 3, 4))
     assert [np.flatnonzero(row).tolist() for row in changed] == [[], [1], [5], [9]]
     assert (abs(found.values[1:] - found.values[0]).max(1) > 1e-3).all()
+    shares = contamination_example(linear_policy(0.9, gain=2e-4), ToyEnv([30]), horizon=4, target="probs").values
+    np.testing.assert_allclose(shares.sum(1), 1)  # probabilities stay as they are
 
 
 def test_the_shuffled_example_shows_the_same_frames_in_another_order() -> None:
@@ -181,7 +214,7 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         contamination(policy, ToyEnv([5]), **options)
     with pytest.raises(ValueError, match="long enough: 11 frames are needed"):
-        shuffled_beginning(policy, ToyEnv([5]), starts=1)
+        contamination(policy, ToyEnv([5]), starts=1, shuffle=True)
 
 
 def test_measuring_leaves_the_mode_and_the_weights_of_a_network_alone() -> None:

@@ -3,21 +3,39 @@
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.colors import to_hex
 
-from arcade_torch.agents import preset, train
+from arcade_torch.agents import Agent, preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
+from arcade_torch.tools.analysis import checkpoints
+from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.checkpoints import Label
-from arcade_torch.tools.analysis.contamination import Example
-from arcade_torch.tools.figures import FIGURES, contamination
-from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing
-from arcade_torch.tools.runs import AgentKey
+from arcade_torch.tools.analysis.contamination import Contamination, Example
+from arcade_torch.tools.analysis.gap_bias import gap_and_bias
+from arcade_torch.tools.analysis.paper import PAPER_RETURNS
+from arcade_torch.tools.analysis.recall_density import RecallDensity
+from arcade_torch.tools.figures import (
+    FIGURES,
+    ContaminationOptions,
+    CurveOptions,
+    DensityOptions,
+    PaperOptions,
+    contamination,
+    gap_bias,
+    logs,
+    recall_density,
+)
+from arcade_torch.tools.figures.logs import Curve
+from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
+from arcade_torch.tools.runs import AgentKey, Run, Score
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import write_run
 
@@ -86,6 +104,65 @@ def test_run_folders_make_pictures_and_tables(name: str, tmp_path: Path, capsys:
         assert float(lru["gap_low"]) < 0.1 < float(lru["gap_high"]) and lru["seeds"] == "3"
     if name == "curves":
         assert {row["agent"] for row in rows} == set(AGENTS) and {row["seeds"] for row in rows} == {"3"}
+
+
+def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit_of_its_axis(tmp_path: Path) -> None:
+    spec = RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 0)
+    for name, frames in (("short", 3_000_000), ("long", 6_000_000)):
+        write_run(tmp_path / name, spec, 0.5, frames)
+    runs = [Run(tmp_path / "short"), Run(tmp_path / "long")]
+    for kind, first in (("eval", 1_200_000), ("train", 2048)):
+        ((task, curve),) = logs.curves_of_runs({("lru", "CartPoleEasy-v0", "full"): runs}, kind).items()
+        assert (curve.frames[0], curve.frames[-1]) == (first, 3_000_000) and curve.returns.seeds.shape[0] == 2
+    rows = [[float(row["mean"]) for row in run.table("eval.csv")] for run in runs]
+    curve = logs.curves_of_runs({task: runs}, "eval")[task]
+    assert curve.returns.mean[0] == pytest.approx((rows[0][1] + rows[1][0]) / 2)
+    assert curve.returns.mean[-1] == pytest.approx((rows[0][4] + (rows[1][1] + rows[1][2]) / 2) / 2)
+    for scale, unit in ((1, "million frames"), (0.1, "thousand frames")):
+        with drawing("light"):
+            axis = panels(1, 1, (3, 3))[1][0, 0]
+            logs.plot({"lru": Curve(scale * curve.frames, curve.returns)}, axis, ["lru"])
+        assert axis.get_xlabel() == unit and axis.lines[0].get_xdata()[-1] == (3 if scale == 1 else 300)
+
+
+def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    three = pooled([[[0.5, 0.0], [0.1, 0.9]], [[0.5, 0.0], [0.1, 0.0]], [[0.5, 0.0], [0.1, 0.0]]])
+    runs = [Score(agent, "CartPoleEasy", twin, seed, value + 0.1 * spread * (seed == 2))
+            for agent, twin, value, spread in (("mlp", "full", 0.5, 0), ("mlp", "partial", 0.2, 0),
+                                               ("lru", "full", 0.4, 1), ("lru", "partial", 0.3, 5))
+            for seed in range(3)]  # fmt: skip
+    row = gap_and_bias(runs, draws=500).row("lru")
+    parts = {("lru", "A", "full"): pooled([[0.2, 0.3, 0.5]]), ("mlp", "A", "full"): pooled([[0.0, 0.0, 1.0]])}
+    with drawing("light"):
+        axis, other = panels(1, 2, (6, 3))[1][0]
+        contamination.plot({"lru": {"flip": three}}, axis, "flip", 1, [0, 1])
+        gap_bias.plot([row], other)
+        stacked, _ = recall_density._stacked_bars(parts, 3)
+    assert axis.lines[0].get_ydata().tolist() == pytest.approx([0.1, 0.3])
+    ((_, at_one),) = [bars[2][0].get_segments() for bars in axis.containers]
+    assert at_one[:, 1].tolist() == pytest.approx([three.low[1, 1], three.high[1, 1]])
+    across, up = (bars.get_segments()[0] for bars in other.containers[0][2])
+    assert across[:, 0].tolist() == pytest.approx([row.bias.low, row.bias.high])
+    assert up[:, 1].tolist() == pytest.approx([row.gap.low, row.gap.high])
+    agents = {("lru", "A"): 1, ("lru", "B"): 2, ("gru", "A"): 2}  # of so many twins
+    labels = [Label(AgentKey("pqn", agent), game, twin, 0, Path("run"), agent)
+              for (agent, game), twins in agents.items() for twin in ("full", "partial")[:twins]]  # fmt: skip
+    dense = RecallDensity(np.array([0.1, 0.2, 0.7]), np.array([3]), np.array([True]), 0, 0, "q")
+    monkeypatch.setattr(recall_density, "checkpoints_of", lambda paths: ([], []))
+    monkeypatch.setattr(recall_density, "measure_runs", lambda *words: [(label, dense) for label in labels])
+    (note,) = recall_density._measure(DensityOptions(), None)[1]
+    assert note.endswith(": lru on A, gru on B")
+    bars = [(bar.get_y(), bar.get_height()) for bar in stacked.axes[0].patches]
+    assert np.array(bars) == pytest.approx(np.array([[0, 0.2], [0.2, 0.3], [0.5, 0.5]]))  # without the memory-free one
+
+
+def test_people_stand_beside_the_memory_free_agent_of_the_same_twin() -> None:
+    with drawing("light"):
+        (picture,) = gap_bias.human(PaperOptions(), None).pictures
+    for axis in picture.figure.axes:
+        (line,) = [line for line in axis.lines if line.get_label() == "memory-free agent"]
+        rows = [row for row in read_csv(PAPER_RETURNS) if (row["model"], row["env"]) == ("MLP", axis.get_title())]
+        assert line.get_ydata().tolist() == [float(row["pomdp_mean"]) for row in rows]
 
 
 def test_a_size_sweep_names_layers_and_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -294,12 +371,71 @@ def test_the_bars_of_an_example_say_where_the_best_action_changed() -> None:
     assert "sigma = 0.3" in note and [row["value"] for row in rows] == values.ravel().tolist()
 
 
+@dataclass
+class Weight:
+    weight: float
+
+
+def weight_of(agent: Any) -> Weight:
+    return Weight(agent.network.weight.item())
+
+
+def test_other_weights_in_the_same_folder_are_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
+    monkeypatch.setattr(checkpoints, "load", lambda path: agent)
+    (tmp_path / "config.json").write_text("{}")
+    for value in (1.0, 2.0, 1.0):
+        torch.nn.init.constant_(agent.network.weight, value)
+        assert checkpoints.measure_run(tmp_path, weight_of, {})[1] == Weight(value)
+    assert len(list((tmp_path / "analysis").iterdir())) == 2
+
+
+def test_the_confidence_that_is_asked_for_is_that_of_bands_and_bars(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three seeds the middle tenth of all draws lies well inside their 95 %."""
+    labels = [Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", seed, Path("run"), "lru") for seed in range(3)]
+    shares = [np.array([0.1 * seed, 0.3, 0.7 - 0.1 * seed]) for seed in range(3)]
+    dense = [RecallDensity(share, np.array([3]), np.array([True]), 0, 0, "q") for share in shares]
+    flips = [np.array([[[1.0, 0.4 * seed if seed else np.nan]]]) for seed in range(3)]  # one episode ended before
+    noisy = [Contamination(np.array([0.3]), np.array([0, 1]), flip, flip, np.nan * flip, np.zeros((1, 2), np.int64),
+                           0.0, 0, "q") for flip in flips]  # fmt: skip
+
+    def no_example(*words: Any) -> None:
+        raise ValueError("too short")
+
+    monkeypatch.setattr(recall_density, "_measure", lambda *words: (list(zip(labels, dense, strict=True)), []))
+    monkeypatch.setattr(contamination, "checkpoints_of", lambda paths: ([], []))
+    monkeypatch.setattr(contamination, "measure_runs", lambda *words: list(zip(labels, noisy, strict=True)))
+    monkeypatch.setattr(contamination, "measure_run", no_example)
+    runs = (fabricate(tmp_path),)
+
+    def widths(confidence: float) -> list[float]:
+        with drawing("light"):
+            density = recall_density.densities(DensityOptions(bins=(3,), confidence=confidence), None).pictures[0]
+            noise = contamination.by_delay(ContaminationOptions(confidence=confidence), None).pictures[0]
+            curve = logs.curves(CurveOptions(runs, confidence=confidence), None).pictures[0]
+        assert [row["seeds"] for row in noise.rows] == [3, 2] and "n = 2 to 3 seeds" in noise.note
+        rows = density.rows[0], curve.rows[0]
+        return [*(row["high"] - row["low"] for row in rows), noise.rows[1]["flip_high"] - noise.rows[1]["flip_low"]]
+
+    assert all(wide > 2 * narrow >= 0 for wide, narrow in zip(widths(0.95), widths(0.1), strict=True))
+
+
 def test_two_checkpoints_of_one_seed_are_not_pooled_as_two_seeds(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = str(trained / "gru-0")
     words = ["analyze", "contamination", run, run, "--starts", "2", "--delays", "0", "--out", str(tmp_path)]
-    assert "are both gru on MineSweeperEasy-v0 (full), seed 0" in refused(capsys, *words)
+    assert "gru-0 are the same cell: give one of them" in refused(capsys, *words)
+
+
+def test_runs_named_one_by_one_are_compared_like_those_of_a_folder(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
+    change(runs[1], seed=1, total_frames=7)
+    assert "differ in total_frames: " in refused(capsys, "analyze", "recall-density", *map(str, runs))
 
 
 def test_saliency_of_runs_has_a_row_for_every_agent(

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.models import memory_names
-from arcade_torch.tools import Policy, contamination, recall_density, saliency, shuffled_beginning
+from arcade_torch.tools import Policy, contamination, recall_density, saliency
 from arcade_torch.tools.analysis.bootstrap import pooled, seed_coverage
-from arcade_torch.tools.analysis.paper import paper_table
+from arcade_torch.tools.analysis.paper import PAPER_RETURNS, paper_table
 from arcade_torch.tools.analysis.recall_density import density_of_windows
 from arcade_torch.tools.analysis.windows import greedy_windows
 from arcade_torch.tools.figures.style import seeds_note
@@ -197,6 +198,8 @@ def test_law_08_probabilities_of_two_actions_give_the_density_of_their_log_odds(
     np.testing.assert_allclose(probs.shares(), odds.shares(), rtol=1e-9)
     p = 1 / (1 + np.exp(-float(odds.output[0])))
     np.testing.assert_allclose(probs.per_frame, 2 * p * (1 - p) * odds.per_frame, rtol=1e-5)  # both actions, alike
+    with pytest.raises(ValueError, match="the sum of all probabilities is always 1: take reduce per_action"):
+        saliency(policy, frames(2), reduce="sum", target="probs")
 
 
 @given(
@@ -235,7 +238,9 @@ def test_law_09_no_window_holds_a_start_but_its_own_and_n_is_where_the_ending_ac
 def test_law_10_no_noise_and_the_identity_permutation_reproduce_the_clean_outputs(name: str, feedback: bool) -> None:
     player = Policy(*(getattr(Net(name, torch.float32), part) for part in ("encode", "remember", "initial_state")))
     still = contamination(player, ToyEnv([14, 20]), sigmas=(0.0,), delays=(0, 1, 5), starts=12, feedback=feedback)
-    same = shuffled_beginning(player, ToyEnv([14, 20]), delays=(0, 1, 3), starts=6, identity=True, feedback=feedback)
+    same = contamination(
+        player, ToyEnv([14, 20]), delays=(0, 1, 3), starts=6, shuffle=True, identity=True, feedback=feedback
+    )
     for found in (still, same):
         assert np.nanmax(found.flip) == 0 and np.nanmax(found.change) < 1e-5 and found.clean_error < 1e-5
 
@@ -250,6 +255,13 @@ def test_law_11_the_published_table_comes_out_to_three_decimals(agent: str) -> N
     errors = [paper.mdp[agent].sem, paper.pomdp[agent].sem]
     errors += [paper.mdp[agent].half_width, paper.pomdp[agent].half_width]
     assert errors == pytest.approx(TABLE[agent][7:], abs=6e-5)
+    mdp, pomdp, free = paper.mdp[agent].half_width, paper.pomdp[agent].half_width, paper.mdp["MLP"].half_width
+    halves = [x.high - x.value for x in (row.mdp, row.pomdp, row.gap, row.bias)]
+    bias = 0.0 if agent == "MLP" else np.hypot(mdp, free)
+    assert halves == pytest.approx([mdp, pomdp, np.hypot(mdp, pomdp), bias], abs=1e-9)
+    tetris = [each for each in read_csv(PAPER_RETURNS) if (each["model"], each["env"]) == (agent, "Tetris")]
+    without = (30 * mdp / 1.96) ** 2 - sum((float(each["mdp_std"]) / 2) ** 2 / 5 for each in tetris)
+    assert rest.mdp.high - rest.mdp.value == pytest.approx(1.96 * without**0.5 / 27, abs=1e-9)
     assert f"{row.gap.value:+.3f}" in str(paper.printed().rows)
 
 
@@ -266,6 +278,8 @@ def test_law_12_identical_seeds_have_no_width_and_the_measured_coverage_stands_o
     assert (mean == 0.25).all() and (low == 0.25).all() and (high == 0.25).all()
     assert seed_coverage(5) == pytest.approx(0.84, abs=0.03)  # a nominal 95 % interval
     assert f"measured coverage with 5 seeds {100 * seed_coverage(5):.0f} %" in seeds_note([5, 5], 0.95)
+    assert seeds_note([5, 2], 0.95).endswith(f"measured coverage with 2 seeds {100 * seed_coverage(2):.0f} %")
+    assert pooled([0.0, 0.0, 3.0]).mean == 1
     assert np.isnan(seed_coverage(1)) and np.isnan(pooled(np.ones((1, 2))).low).all()
     assert "no interval" in seeds_note([1], 0.95)
 

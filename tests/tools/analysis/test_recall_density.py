@@ -13,7 +13,7 @@ from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import recall_density, saliency
 from arcade_torch.tools.analysis.recall_density import binned, density_of_windows, no_memory, point_sampled
-from arcade_torch.tools.analysis.windows import greedy_windows
+from arcade_torch.tools.analysis.windows import _end, greedy_windows
 from tests.tools.analysis.toys import Net, ToyEnv, linear_policy, window
 
 RHO = linear_policy(0.8, dtype=torch.float32)
@@ -49,6 +49,7 @@ def test_reference_lines_are_those_of_uniform_memory_and_of_none() -> None:
     np.testing.assert_allclose(uniform.mass(16), 1 / 16, rtol=1e-4)
     free = density_of_windows(linear_policy(0.0, dtype=torch.float32), [window(20), window(7)])
     np.testing.assert_allclose(free.mass(16), no_memory([20, 7], 16), rtol=1e-6)
+    assert free.last_share() == 1
     assert no_memory([7], 16)[-2:].sum() < 1  # one of 7 frames is longer than two of 16 bins
 
 
@@ -66,6 +67,12 @@ def test_long_episodes_give_windows_of_the_cap_with_random_ends_and_short_ones_e
     ends = [int(w.frames[-1, 0, 0, 0]) for w in windows if w.row == 0]
     assert min(ends) >= 9 and len(set(ends)) > 8 and all(w.n == 9 for w in windows if w.row == 0)
     assert all(w.ended and w.n == 7 for w in windows if w.row == 1)
+
+
+def test_every_frame_that_a_window_may_end_with_is_drawn() -> None:
+    rng = np.random.default_rng(0)
+    for length, end, wanted in ((12, "last", {9, 10, 11}), (5, "random", {2, 3, 4}), (10, "last", {9})):
+        assert {_end(length, end, 10, rng) for _ in range(200)} == wanted  # type: ignore[arg-type]
 
 
 def test_random_ends_are_uniform_from_the_third_frame_on() -> None:
