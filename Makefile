@@ -14,7 +14,7 @@ PAGE    ?= $(if $(filter cuda,$(DEVICE)),results,$(OUT))/gpu.md
 VENV := .venv
 OLDEST := .venv-oldest
 OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
-  models/test_memory_models.py agents/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
+  models/test_memory_models.py agents/runs/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
 RUN  := $(VENV)/bin/python
 GPU_PYTHON := $(if $(wildcard $(RUN)),$(RUN),$(PYTHON))
 PIP  := $(RUN) -m pip install --quiet -c constraints.txt

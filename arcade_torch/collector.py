@@ -25,7 +25,7 @@ class ArcadeCollector(BaseCollector):
     Two products. ``collect()`` gives **sequences**: TensorDict [N] of entries [N, L, ...] with L = overlap + T, and the
     recurrent state before index 0 (``initial_state``). **Iteration** gives the T new steps in the layout of TorchRL's
     collectors, TensorDict [N, T], so that TorchRL's losses and trainers take it. Both are the data that ``env.rollout``
-    and TorchRL's ``Collector`` give, to the bit.
+    and TorchRL's ``Collector`` give, to the bit; only ``state`` (of an env with ``state_in_td=True``) is left out.
 
     The first window acts ``overlap`` more steps, to fill the overlap; they are not counted as frames. The same happens
     after somebody else stepped, reset or loaded the env: no window holds steps from both sides of such a change, and
@@ -149,25 +149,23 @@ class ArcadeCollector(BaseCollector):
         Raises:
             RuntimeError: The collector has been shut down, or a game truncated before its time limit.
         """
-        initial_state = self._collect_window(random, dense=self._final_frames == "all")
-        assert self._buffer is not None
-        return self._buffer.sequences(initial_state)
+        buffer, initial_state = self._collect_window(random, dense=self._final_frames == "all")
+        return buffer.sequences(initial_state)
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield TensorDict [N, T] in TorchRL's layout until ``total_frames`` have been collected."""
         while self._frames < self.total_frames:
             compact = self.compact_obs or self._final_frames != "all"
-            self._collect_window(random=False, dense=not compact)
-            assert self._buffer is not None
-            batch = self._buffer.transitions(compact)
-            batch["collector"] = TensorDict({"traj_ids": self._trajectories()}, batch_size=batch.batch_size)
+            buffer, _ = self._collect_window(random=False, dense=not compact)
+            batch = buffer.transitions(compact)
+            batch["collector"] = TensorDict({"traj_ids": self._trajectories(buffer)}, batch_size=batch.batch_size)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             yield batch
 
     @torch.no_grad()
-    def _collect_window(self, random: bool, dense: bool) -> TensorDict:
-        """Act the steps of one window; returns the recurrent state before its first step."""
+    def _collect_window(self, random: bool, dense: bool) -> tuple[RolloutBuffer, TensorDict]:
+        """Act the steps of one window; returns its storage, and the recurrent state before its first step."""
         if self.closed:
             raise RuntimeError("the collector has been shut down: make a new one")
         if self.pre_collect_hook is not None:
@@ -189,7 +187,7 @@ class ArcadeCollector(BaseCollector):
             buffer.write_final(rows, steps, self._compressed(frames))
         self._frames += self._num_envs * self._steps
         self._iter += 1
-        return self._window_starts.popleft()
+        return buffer, self._window_starts.popleft()
 
     def _look(self) -> tuple[RolloutBuffer, dict[str, torch.Tensor]]:
         """Have a current observation and a place to store it, whatever happened to the env since the last window."""
@@ -253,10 +251,9 @@ class ArcadeCollector(BaseCollector):
         first = TERMINATED if self._final_frames == "all" else TRUNCATED
         return not is_host(numbers.device) or bool(numbers.numpy()[:, first:].any())
 
-    def _trajectories(self) -> torch.Tensor:
+    def _trajectories(self, buffer: RolloutBuffer) -> torch.Tensor:
         """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them."""
-        assert self._buffer is not None
-        done = self._buffer.done[:, self._overlap :].T  # [T, N]: numbered in order of time
+        done = buffer.done[:, self._overlap :].T  # [T, N]: numbered in order of time
         new = torch.cumsum(done.reshape(-1), 0).reshape(done.shape) - 1 + self._next_traj_id
         ids = torch.cat([self._traj_ids.unsqueeze(0), new * done]).cummax(0).values
         self._traj_ids = ids[-1].clone()
@@ -294,16 +291,14 @@ class ArcadeCollector(BaseCollector):
         numbers that a policy draws from torch's global generator are the caller's to save.
         """
         out: OrderedDict[str, Any] = OrderedDict(frames=self._frames, iter=self._iter)
-        out["acted"] = self._acted if self.env.generation[0] == self._seen[0] else 0  # 0: see _look
+        out["acted"], out["moved"] = self._acted, self.env.generation[0] != self._seen[0]  # by others: see _look
         out["sizes"] = [self._num_envs, self._steps, self._overlap]
         out["generator"] = self._generator.get_state()
         if isinstance(self.policy, nn.Module):
             out["policy_state_dict"] = self.policy.state_dict()
-        if self._obs is None:
-            out["env_state_dict"] = self.env.get_state().to_dict()
+        out["env_state_dict"] = self.env.get_extra_state()
+        if self._obs is None or self._buffer is None:
             return out
-        assert self._buffer is not None
-        out["env_state_dict"] = self.env.get_state().to_dict()
         out["recurrent_state"] = self._state.clone().to_dict()
         out["window_starts"] = [state.clone().to_dict() for state in self._window_starts]
         out["overlap"] = self._buffer.overlap_state()
@@ -319,14 +314,12 @@ class ArcadeCollector(BaseCollector):
             **kwargs: Ignored.
 
         Raises:
-            ValueError: It is of a collector with other sizes, or of another game.
+            ValueError: It is of another game, or of other sizes, or has an overlap with other ``final_frames``.
         """
-        sizes = [self._num_envs, self._steps, self._overlap]
-        if list(state_dict["sizes"]) != sizes:
-            raise ValueError(
-                f"the saved collector has (envs, steps, overlap) {list(state_dict['sizes'])}, this one has {sizes}"
-            )
-        self.env.set_state(TensorDict(state_dict["env_state_dict"], batch_size=[self._num_envs]))
+        saved, sizes = list(state_dict["sizes"]), [self._num_envs, self._steps, self._overlap]
+        if saved != sizes:
+            raise ValueError(f"the saved collector has (envs, steps, overlap) {saved}, this one has {sizes}")
+        self.env.set_extra_state(state_dict["env_state_dict"])
         if isinstance(self.policy, nn.Module) and (strict or "policy_state_dict" in state_dict):
             self.policy.load_state_dict(state_dict["policy_state_dict"], strict=strict)
         self._generator.set_state(state_dict["generator"].cpu())
@@ -340,19 +333,18 @@ class ArcadeCollector(BaseCollector):
         self._window_starts.extend(self._as_state(state) for state in state_dict["window_starts"])
         self._traj_ids = state_dict["traj_ids"].to(self.env.device)
         self._next_traj_id = int(state_dict["next_traj_id"])
-        self._observe(self.env.observe())
-        self._buffer = None  # somebody may still hold its batches
+        self._obs, self._buffer = {}, None  # somebody may still hold batches of the old storage
+        if not state_dict.get("moved", self._acted == 0):  # where others had moved the env, _look begins anew
+            self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
 
     def _as_state(self, state: dict[str, Any]) -> TensorDict:
         return TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
 
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
-        """Give the storage back, and close the env if ``close_env``; the rest is ignored, there is no other process."""
+        """Give the storage back. The arguments are ignored: no process has to end, the env has nothing to close."""
         self.closed = True
         self._buffer = self._obs = None
-        if close_env and not self.env.is_closed:
-            self.env.close()
 
     def __repr__(self) -> str:
         """Sizes and env."""
@@ -370,9 +362,10 @@ def _check_arguments(env: Any, policy: Any, frames_per_batch: int, overlap: int,
         raise TypeError(
             f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or None for random actions"
         )
-    if frames_per_batch < env.num_envs or frames_per_batch % env.num_envs:
-        raise ValueError(f"frames_per_batch is {frames_per_batch}, expected a multiple of num_envs ({env.num_envs})")
-    if overlap < 0:
-        raise ValueError(f"overlap is {overlap}, expected 0 or more")
+    num_envs = env.num_envs
+    if isinstance(frames_per_batch, float) or frames_per_batch < num_envs or frames_per_batch % num_envs:
+        raise ValueError(f"frames_per_batch is {frames_per_batch}, expected an int multiple of num_envs ({num_envs})")
+    if isinstance(overlap, float) or overlap < 0:
+        raise ValueError(f"overlap is {overlap}, expected an int of 0 or more")
     if final_frames not in get_args(FinalFrames):
         raise ValueError(f"final_frames is {final_frames!r}, allowed: {', '.join(map(repr, get_args(FinalFrames)))}")

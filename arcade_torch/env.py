@@ -206,13 +206,13 @@ class ArcadeEnv(EnvBase):
         return self._live.generation, self._live.view
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The env's part of ``state_dict``."""
-        state: dict[str, Any] = self.get_state().to_dict()
-        return state
+        """The env's part of ``state_dict``: its state, and which episodes have ended."""
+        return {**self.get_state().to_dict(), "ends": self._live.ends.clone()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        self._go_on(self._snapshots.load(TensorDict(state, batch_size=self.batch_size)))
+        saved = TensorDict(state, batch_size=self.batch_size, device=self.device).clone()
+        self._go_on(self._snapshots.load(saved), saved.get("ends", None))
 
     def step_raw(
         self, action: torch.Tensor, while_computing: Callable[[], object] | None = None, into: Place | None = None
@@ -273,7 +273,7 @@ class ArcadeEnv(EnvBase):
         if self.one_hot:
             if action.shape != (*shape, num_actions):
                 raise ValueError(f"action has shape {tuple(action.shape)}, expected one-hot {(*shape, num_actions)}")
-            return action.to(torch.uint8).argmax(-1)
+            return action.to(torch.float32).argmax(-1)
         unsigned = _INTEGERS.get(action.dtype)
         if unsigned is None:
             raise TypeError(f"action has dtype {action.dtype}, expected integers such as torch.int64")
@@ -346,7 +346,7 @@ class ArcadeEnv(EnvBase):
         if not isinstance(action, torch.Tensor):
             validation.tensor(tensordict, "action")
         raw = self.step_raw(action)
-        last_action = action.to(torch.uint8).argmax(-1) if self.one_hot else action
+        last_action = action.to(torch.float32).argmax(-1) if self.one_hot else action
         following = self._next(raw.pixels, last_action, raw.numbers)
         if following["done"].any():  # all envs are drawn again, which is no dearer than to copy their frames
             ended = self._live.batch._replace(state=raw.final[0])

@@ -287,13 +287,13 @@ class RolloutBuffer:
             parts = tuple(name.split("/"))
             if parts[0] == "extras" and parts[1:] not in map(path_of, self._extras):
                 self._add_extra(parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype)
-            if parts[0] == "dense" and self._dense is None:
-                self._dense = self._new_dense.take()
-        buffers = {"/".join(path_of(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
-        pairs = [(name, buffers.get(name), saved) for name, saved in state["buffers"].items()]
-        for name, target, saved in [*pairs, ("final", self._final, state["final"])]:
-            if target is None or target.shape != saved.shape:
-                here = None if target is None else tuple(target.shape)
-                raise ValueError(f"saved overlap {name!r} is {tuple(saved.shape)}, this collector's {here}")
-            target.copy_(saved)
+        if self.final_frames == "all":
+            self._dense = self._new_dense.take()
+        here = {"/".join(path_of(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
+        here, there = {**here, "final": self._final}, {**state["buffers"], "final": state["final"]}
+        for name in here | there:
+            shapes = [tuple(each[name].shape) if name in each else None for each in (there, here)]
+            if shapes[0] != shapes[1]:
+                raise ValueError(f"saved overlap {name!r} is {shapes[0]}, this collector's {shapes[1]}")
+            here[name].copy_(there[name])
         self._wanted = state["wanted"].cpu().numpy().copy()

@@ -38,7 +38,7 @@ class _Entry(NamedTuple):
 
 
 _ENTRIES: dict[str, _Entry] = {}  # by versioned id
-_ALIASES: dict[str, str] = {}  # from bare name to bare name
+_ALIASES: dict[str, str] = {}  # bare names and aliases: which bare name each means
 _LISTENERS: list[Callable[[str], object]] = []
 _VERSIONED = re.compile(r"^(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>\d+)$")
 
@@ -55,15 +55,19 @@ def register(id: str, factory: Factory | str, aliases: Iterable[str] = (), *, pr
             benchmark's, listed by :func:`registered_ids` and known to Gymnasium.
 
     Raises:
-        ValueError: The id has no version, or is taken.
+        ValueError: The id has no version or is taken, or one of the names is another game's.
     """
     match = _VERSIONED.match(id)
     if match is None:
         raise ValueError(f"id {id!r} has no version: write it as 'NameDifficulty-v0'")
     if id in _ENTRIES:
         raise ValueError(f"id {id!r} is registered already: raise its version or choose another name")
+    names = dict.fromkeys((match["name"], *aliases), match["name"])
+    for each, name in names.items():
+        if (owner := _ALIASES.get(each.partition("-v")[0], name)) != name:
+            raise ValueError(f"the name {each!r} belongs to the game {owner!r} already: choose another")
     _ENTRIES[id] = _Entry(factory, probe)
-    _ALIASES.update(dict.fromkeys(aliases, match["name"]))
+    _ALIASES.update(names)
     for listener in () if probe else _LISTENERS:
         listener(id)
 
@@ -123,7 +127,7 @@ def resolve_id(id: str) -> str:
         return wanted
     if name in newest:
         raise ValueError(f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}")
-    known = {known.lower(): known for known in (*newest, *_ALIASES)}
+    known = {known.lower(): known for known in _ALIASES}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
     raise ValueError(

@@ -8,7 +8,8 @@ import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.gym.batch import Frames, Info, NumpyBatch, seed_keys
+from arcade_torch.envs_jax.batch import env_keys
+from arcade_torch.gym.batch import Frames, Info, NumpyBatch
 from arcade_torch.gym.window import Window
 from arcade_torch.observability import Observability, partial_flags
 
@@ -103,15 +104,16 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
             Frame and info.
 
         Raises:
-            ValueError: A seed out of range or an unknown option.
+            ValueError: A seed out of range (TypeError: no whole number), or an unknown option.
         """
         options = check_reset_options(options, ("observability",))
-        super().reset(seed=seed)
+        keys = None if seed is None else env_keys(seed, 1)  # a seed is refused before anything changes
         if "observability" in options:
             self.set_observability(options["observability"])
+        super().reset(seed=None if seed is None else int(seed))
         if seed is None and self._frame is None:
-            seed = int(self.np_random.integers(2**32))
-        self._batch.reset(np.ones(1, bool), None if seed is None else seed_keys(seed, 1))
+            keys = env_keys(int(self.np_random.integers(2**32)), 1)
+        self._batch.reset(np.ones(1, bool), keys)
         self._running = True
         return self._look(self._batch.draw()), self._info(self._batch.info)
 

@@ -111,10 +111,11 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
             ValueError: A seed out of range (TypeError: no whole number), an unknown option, a mask that does not fit.
         """
         mask = self._reset_mask(check_reset_options(options, ("reset_mask",)))
+        keys = None if seed is None else seed_keys(seed, self.num_envs)  # a seed is refused before anything changes
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         if seed is None and not self._started:
-            seed = int(self.np_random.integers(2**32))
-        self._batch.reset(mask, None if seed is None else seed_keys(seed, self.num_envs))
+            keys = seed_keys(int(self.np_random.integers(2**32)), self.num_envs)
+        self._batch.reset(mask, keys)
         self._started = True
         self._ended &= ~mask
         return self._batch.draw(copy=self._copy), _masked(self._batch.info, mask)

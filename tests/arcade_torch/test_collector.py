@@ -87,6 +87,12 @@ def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: Com
     assert_same(ours.exclude("collector"), rollout)
 
 
+def test_batches_of_an_env_with_its_state_in_the_tensordict_lack_only_the_state() -> None:
+    rollout = stub_env(state_in_td=True).rollout(T, scripted, break_when_any_done=False)
+    ours = next(ArcadeCollector(stub_env(state_in_td=True), scripted, N * T).iterator())
+    assert_same(ours.exclude("collector"), rollout.exclude("state", ("next", "state")))
+
+
 def test_compact_batches_lack_only_the_next_frames() -> None:
     full = list(stub_collector(scripted, total_frames=3 * N * T))
     compact = list(stub_collector(scripted, total_frames=3 * N * T, compact_obs=True))
@@ -303,6 +309,32 @@ def test_the_stored_state_at_a_start_is_the_primers() -> None:
     assert (batch["initial_state", "memory", "sum"] == 0.5).all()
 
 
+class Unaware(Recurrent):
+    """Does not read where an episode begins: the collector puts the primer's values back."""
+
+    in_keys = ("pixels", "last_action", ("memory", "sum"))
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        return super().forward(td.set("is_init", torch.zeros(N, 1, dtype=torch.bool)))
+
+
+def test_a_policy_that_does_not_read_is_init_begins_anew_whether_its_states_are_stored_or_not() -> None:
+    aware = stub_collector(Recurrent(), LOCKSTEP).collect()["total"]
+    for stored in (True, False):
+        assert torch.equal(stub_collector(Unaware(), LOCKSTEP, store_states=stored).collect()["total"], aware)
+
+
+def test_a_policy_may_write_all_its_actions_into_one_tensor() -> None:
+    own = torch.zeros(N, dtype=torch.int64)
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        return td.set("action", own.copy_(scripted_small(td)["action"]))
+
+    one, two = stub_collector(policy), stub_collector(scripted_small)
+    for _ in range(3):
+        assert_same(one.collect(), two.collect())
+
+
 def test_what_is_stored_of_a_frame_is_what_the_policy_saw() -> None:
     seen = []
 
@@ -340,6 +372,22 @@ def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, game: CompiledGame,
         assert_same(other.collect(), collector.collect())
 
 
+def test_a_resumed_collector_has_the_final_frames_of_its_overlap_and_leaves_earlier_batches_alone(
+    tmp_path: Any,
+) -> None:
+    options: dict[str, Any] = {"overlap": T + 3, "final_frames": "truncated"}
+    collector, other = (stub_collector(scripted_small, LOCKSTEP, seed, **options) for seed in (3, 77))
+    collector.collect()
+    held = other.collect()
+    before = held.clone()
+    resumed(collector, other, tmp_path / "collector.pt")
+    assert_same(held, before)
+    for _ in range(2):
+        ours, theirs = other.collect(), collector.collect()
+        assert_same(ours.exclude("final_pixels"), theirs.exclude("final_pixels"))
+        assert torch.equal(dense_next_pixels(ours), dense_next_pixels(theirs))
+
+
 def test_a_collector_that_has_not_begun_can_be_resumed(tmp_path: Any) -> None:
     collector, other = stub_collector(None, seed=1), stub_collector(None, seed=2)
     resumed(collector, other, tmp_path / "collector.pt")
@@ -369,6 +417,11 @@ def test_seeding_starts_over_and_repeats() -> None:
     assert_same(other.collect(), first)
 
 
+def test_random_actions_differ_from_collector_to_collector() -> None:
+    one, two = (stub_collector(None).collect()["action"] for _ in range(2))
+    assert not torch.equal(one, two)
+
+
 def test_iteration_ends_after_total_frames() -> None:
     collector = stub_collector(scripted, total_frames=2 * N * T + 1)
     assert len(list(collector)) == 3
@@ -377,10 +430,11 @@ def test_iteration_ends_after_total_frames() -> None:
 
 
 def test_random_frames_come_first_and_the_env_took_them() -> None:
-    collector = stub_collector(lambda td: td.set("action", torch.full((N,), 4)), init_random_frames=N * T + 1)
-    first, second, third = (collector.collect()["action"].clone() for _ in range(3))
-    assert first.unique().numel() == second.unique().numel() == 5
-    assert (third == 4).all()
+    for frames, windows in ((N * T, 1), (N * T + 1, 2)):
+        collector = stub_collector(lambda td: td.set("action", torch.full((N,), 4)), init_random_frames=frames)
+        actions = [collector.collect()["action"] for _ in range(windows + 1)]
+        assert [action.unique().numel() for action in actions] == [5] * windows + [1]
+        assert (actions[-1] == 4).all()
 
 
 def test_a_random_window_is_random_and_the_policy_runs_for_its_state() -> None:
@@ -456,6 +510,33 @@ def test_what_others_did_to_the_env_leaks_into_no_window(interfere: Callable[[Ar
     assert torch.equal(inside, done)
 
 
+@pytest.mark.parametrize("interfere", [rollout_of, reset_some, step_raw, load])
+def test_a_collector_saved_after_others_moved_the_env_is_resumed_as_it_goes_on(interfere: Any, tmp_path: Any) -> None:
+    """And it goes on as one that was never saved."""
+    collector, unsaved, other = (stub_collector(Recurrent(), seed=seed, overlap=3) for seed in (3, 3, 77))
+    for one in (collector, unsaved):
+        one.collect()
+        torch.manual_seed(0)  # of the actions that others take
+        interfere(one.env)
+    resumed(collector, other, tmp_path / "collector.pt")
+    assert_same(collector.env.observe(), unsaved.env.observe())
+    for window in (ArcadeCollector.collect, lambda one: next(one.iterator())):
+        expected = window(unsaved)
+        assert_same(window(collector), expected)
+        assert_same(window(other), expected)
+
+
+def test_an_episode_number_is_given_once_also_when_others_moved_the_env() -> None:
+    collector, numbers = stub_collector(scripted, HASTY), set()
+    for batch in itertools.islice(collector.iterator(), 3):
+        ids = batch["collector", "traj_ids"]
+        own = [set(row) for row in ids.tolist()]
+        assert len(set().union(*own)) == sum(map(len, own)), "two envs have the same number"
+        assert not numbers & set().union(*own)
+        numbers |= set().union(*own)
+        step_raw(collector.env)
+
+
 def test_two_collectors_that_take_turns_on_one_env_both_go_on_from_where_it_is() -> None:
     env = stub_env()
     collectors = [ArcadeCollector(env, scripted, N * T) for _ in range(2)]
@@ -471,8 +552,9 @@ def test_hooks_are_called_and_statistics_counted() -> None:
     collector = stub_collector(
         scripted, total_frames=2 * N * T, post_collect_hook=lambda batch: seen.append(batch.numel())
     )
+    collector.pre_collect_hook = lambda: seen.append(0)
     list(collector)
-    assert seen == [N * T, N * T]
+    assert seen == [0, N * T, 0, N * T]
     assert collector.stats()["frames"] == 2 * N * T
 
 
@@ -483,14 +565,17 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
     collector.shutdown()
     with pytest.raises(RuntimeError, match="the collector has been shut down"):
         collector.collect()
+    collector.env.rollout(3)  # the env can still be used
 
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"frames_per_batch": 7}, ValueError, "frames_per_batch is 7, expected a multiple of num_envs (6)"),
-        ({"frames_per_batch": 0}, ValueError, "frames_per_batch is 0, expected a multiple"),
-        ({"overlap": -1}, ValueError, "overlap is -1, expected 0 or more"),
+        ({"frames_per_batch": 7}, ValueError, "frames_per_batch is 7, expected an int multiple of num_envs (6)"),
+        ({"frames_per_batch": 0}, ValueError, "frames_per_batch is 0, expected an int multiple"),
+        ({"frames_per_batch": 48.0}, ValueError, "frames_per_batch is 48.0, expected an int multiple"),
+        ({"overlap": -1}, ValueError, "overlap is -1, expected an int of 0 or more"),
+        ({"overlap": 2.0}, ValueError, "overlap is 2.0, expected an int of 0 or more"),
         ({"final_frames": "some"}, ValueError, "final_frames is 'some', allowed: 'all', 'truncated', 'none'"),
         ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
     ],
@@ -505,6 +590,14 @@ def test_wrong_envs_are_explained() -> None:
         ArcadeCollector(TransformedEnv(stub_env()), scripted, N * T)
     with pytest.raises(ValueError, match="make the env with categorical_actions=True"):
         ArcadeCollector(stub_env(categorical_actions=False), scripted, N * T)
+
+
+@pytest.mark.parametrize("mode", ["truncated", "none"])
+def test_an_overlap_without_the_next_frames_that_batches_show_is_refused(mode: Any) -> None:
+    collector = stub_collector(scripted, overlap=2, final_frames=mode)
+    collector.collect()
+    with pytest.raises(ValueError, match="saved overlap 'dense' is None"):
+        stub_collector(scripted, overlap=2).load_state_dict(collector.state_dict())
 
 
 def test_a_state_of_other_sizes_is_refused() -> None:

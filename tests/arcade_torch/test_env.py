@@ -106,6 +106,10 @@ def test_last_action_is_the_action_that_led_here_also_over_an_end() -> None:
     assert torch.equal(data["last_action"][:, 1:], data["action"][:, :-1])
     assert torch.equal(data["next", "last_action"], data["action"])
     assert (data["last_action"][:, 0] == 0).all()
+    env, action = stub_env(), torch.full((N,), 3)
+    taken, root = env.step_and_maybe_reset(env.reset().set("action", action))
+    action.zero_()  # a policy may write its next actions there
+    assert (taken["next", "last_action"] == 3).all() and (root["last_action"] == 3).all()
 
 
 @pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
@@ -192,6 +196,14 @@ def test_the_first_reset_after_seeding_is_the_games_own_first_state() -> None:
     assert np.array_equal(env.reset()["pixels"].numpy(), np.asarray(GAME.batched.render(batch)))
 
 
+def test_without_a_seed_torch_draws_one() -> None:
+    torch.manual_seed(0)
+    one, two = (stub_env(seed=None).reset()["pixels"] for _ in range(2))
+    assert not torch.equal(one, two)
+    torch.manual_seed(0)
+    assert torch.equal(stub_env(seed=None).reset()["pixels"], one)
+
+
 def test_set_seed_returns_another_seed_unless_static() -> None:
     env = stub_env()
     assert env.set_seed(3) != 3
@@ -235,6 +247,13 @@ def test_what_is_observed_after_an_end_says_so_until_it_is_reset_or_loaded() -> 
         assert env.observe()["done"].squeeze(-1).tolist() == (~odd).tolist()
         env.step(scripted(env.observe()).set("_step", odd))
     assert env.observe()["done"].all()
+    env.reset()
+    for step in range(5):  # at the last all would end, and the odd ones do
+        env.step(scripted(env.observe()).set("_step", odd | (step < 4)))
+    assert env.observe()["done"].squeeze(-1).tolist() == odd.tolist()
+    other = stub_env(LOCKSTEP)
+    other.load_state_dict(env.state_dict())
+    assert_same(other.observe(), env.observe())
     assert not env.set_state(env.get_state())["done"].any()  # a snapshot does not say what has ended
 
 
@@ -242,7 +261,11 @@ def test_a_snapshot_is_a_private_copy() -> None:
     env = stub_env(seed=1)
     env.reset()
     before = env.observe()["pixels"].clone()
+    snapshot = env.get_state()
     env.get_state().zero_()
+    assert torch.equal(env.observe()["pixels"], before)
+    env.set_state(snapshot)
+    snapshot.zero_()
     assert torch.equal(env.observe()["pixels"], before)
 
 
@@ -263,7 +286,10 @@ def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compi
     flags = torch.arange(N) % 2 == 0
     for time, action in enumerate(actions):
         if time == 10:
-            env.set_observability(flags)
+            given = flags.clone()
+            env.set_observability(given)
+            given.logical_not_()  # the caller's own, as is what the property gives
+            env.observability.logical_not_()
             assert torch.equal(env.observability, flags)
         taken, ours = env.step_and_maybe_reset(ours.set("action", action))
         other, theirs = twin.step_and_maybe_reset(theirs.set("action", action))
@@ -295,10 +321,15 @@ def test_a_step_from_the_state_in_the_tensordict_shows_the_twin_that_was_set_las
 def test_one_hot_actions_mean_the_same_as_integers() -> None:
     integer, one_hot = stub_env(seed=3), stub_env(seed=3, categorical_actions=False)
     action = torch.arange(N) % 5
-    hot = torch.nn.functional.one_hot(action, 5).bool()
-    ours = integer.step_and_maybe_reset(integer.reset().set("action", action))[0]
-    theirs = one_hot.step_and_maybe_reset(one_hot.reset().set("action", hot))[0]
-    assert_same(ours.exclude("action"), theirs.exclude("action"))
+    hot = torch.nn.functional.one_hot(action, 5)
+    for written in (hot.bool(), 0.9 * hot):  # a softmax may miss the 1
+        ours = integer.step_and_maybe_reset(integer.reset().set("action", action))[0]
+        theirs = one_hot.step_and_maybe_reset(one_hot.reset().set("action", written))[0]
+        assert_same(ours.exclude("action"), theirs.exclude("action"))
+        assert_same(
+            integer.step(integer.reset().set("action", action))["next"],
+            one_hot.step(one_hot.reset().set("action", written))["next"],
+        )
 
 
 @given(
@@ -318,7 +349,8 @@ def test_any_integer_type_is_taken_and_may_be_overwritten_at_once(action: list[i
 
 def test_what_the_policy_wrote_beside_the_action_is_kept_as_on_the_stock_path() -> None:
     def run(env: ArcadeEnv, stock: bool) -> tuple[TensorDictBase, TensorDictBase]:
-        root = scripted(env.reset()).set("next", TensorDict({"memory": torch.arange(N)}, [N]))
+        stale = torch.full((N, 1), 9.0)  # of the step before, in a tensordict that is used again
+        root = scripted(env.reset()).set("next", TensorDict({"memory": torch.arange(N), "reward": stale}, [N]))
         root["value"] = torch.ones(N)
         if stock:
             taken = env.step(root)
@@ -339,6 +371,11 @@ def test_real_games_pass_through(id: str) -> None:
     assert make(id, num_envs=3)._compiled is env._compiled
 
 
+def test_make_hands_on_what_the_env_is_told() -> None:
+    env = make("MineSweeperEasy", num_envs=3, categorical_actions=False, state_in_td=True, task_in_td=True)
+    assert env.one_hot and {"state", "task"} <= set(env.observation_spec.keys())
+
+
 @pytest.mark.parametrize("options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=["plain", "state", "mixed"])
 def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
     """TorchRL hands ``_step`` to envs of a fixed batch size and trusts that they heed it."""
@@ -347,7 +384,8 @@ def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
     marked = torch.arange(N) % 3 != 0
     for _ in range(3):  # the envs left alone keep their state, their frames and their dice
         whole = twin.step(scripted(other.clone()))["next"]
-        stepped = env.step(scripted(td.clone()).set("_step", marked))["next"]
+        before = td.clone().set("reward", torch.ones(N, 1))  # of an earlier step
+        stepped = env.step(scripted(before).set("_step", marked))["next"]
         assert_same(stepped[marked], whole[marked])
         assert (stepped["reward"][~marked] == 0).all()
         assert_same(stepped.exclude("reward")[~marked], td.select(*stepped.exclude("reward").keys(True, True))[~marked])

@@ -115,7 +115,7 @@ def test_the_vector_env_is_gymnasium_s_own_to_the_bit(mode: AutoresetMode) -> No
     assert ours.metadata["autoreset_mode"] is mode
     assert ours.observation_space == sync.observation_space and ours.action_space == sync.action_space
     assert equal(ours.reset(seed=seeds), sync.reset(seed=seeds))
-    kinds = np.zeros(2, bool)
+    kinds, resets = np.zeros(2, bool), set()
     for action in random_actions(80, num_envs):
         action = np.where(np.arange(num_envs) == 0, 0, action)  # the first runs into the time limit
         mine, theirs = ours.step(action), sync.step(action)
@@ -124,8 +124,10 @@ def test_the_vector_env_is_gymnasium_s_own_to_the_bit(mode: AutoresetMode) -> No
         kinds |= [terminated.any(), truncated.any()]
         if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
             mask = {"reset_mask": terminated | truncated}
-            assert equal(ours.reset(options=dict(mask)), sync.reset(options=dict(mask)))
-    assert kinds.all()
+            seed = seeds if terminated[1] else None  # seeds count in the envs that are reset
+            assert equal(ours.reset(seed=seed, options=dict(mask)), sync.reset(seed=seed, options=dict(mask)))
+            resets.add("without a seed" if seed is None else "seeded")
+    assert kinds.all() and len(resets) == (2 if mode is AutoresetMode.DISABLED else 0)
 
 
 @pytest.mark.parametrize("mode", MODES, ids=[mode.value for mode in MODES])
@@ -174,6 +176,11 @@ def test_the_twin_of_a_running_episode_can_be_changed() -> None:
     assert equal(one.step(4)[0], frames["partial"][0])
     one.set_observability("full")
     assert equal(one.step(3)[0], frames["full"][1])
+    many = ArcadeVectorEnv("MineSweeperEasy", 1, partial_obs=True)
+    many.reset(seed=3)
+    assert equal(many.step(np.array([4]))[0][0], frames["partial"][0])
+    many.set_observability("full")
+    assert equal(many.step(np.array([3]))[0][0], frames["full"][1])
 
 
 def test_without_a_seed_np_random_decides_and_with_one_nothing_else() -> None:
@@ -191,6 +198,12 @@ def test_without_a_seed_np_random_decides_and_with_one_nothing_else() -> None:
     seeded = shots(one, seed=9)
     assert not all(equal(a, b) for a, b in zip(seeded, shots(two, seed=10), strict=True))
     assert all(equal(a, b) for a, b in zip(seeded, shots(two, seed=9), strict=True))
+    alone = [ArcadeGymEnv("MineSweeperEasy") for _ in range(3)]
+    for env, number in zip(alone, (7, 7, 8), strict=True):
+        env.np_random = np.random.default_rng(number)
+        env.reset()
+    keys = [env._batch._batch.key.tolist() for env in alone]
+    assert keys[0] == keys[1] != keys[2]
 
 
 def test_rules_sizes_and_game_options_reach_the_game() -> None:
@@ -207,7 +220,11 @@ def test_render_gives_the_frame_that_is_seen() -> None:
     frame, _ = env.reset(seed=0)
     assert equal(env.render(), frame)
     frame = env.step(4)[0]
-    assert equal(env.render(), frame)
+    kept = frame.copy()
+    for given in (frame, env.render()):  # the caller's own
+        assert equal(given, kept)
+        given[:] = 0
+    assert equal(env.render(), kept)
     envs = gymnasium.make_vec(GAME, num_envs=3, render_mode="rgb_array")
     envs.reset(seed=0)
     frames = envs.step(np.array([4, 0, 3]))[0]
@@ -270,6 +287,22 @@ def test_a_seed_that_is_no_whole_number_is_refused_in_one_line(seed: object) -> 
 def test_seeds_of_numpy_mean_what_those_of_python_mean() -> None:
     assert (seed_keys(np.array([3, 4]), 2) == seed_keys([3, 4], 2)).all()
     assert (seed_keys(np.int64(3), 2) == seed_keys(3, 2)).all()  # type: ignore[arg-type]
+
+
+def test_a_refused_seed_changes_nothing() -> None:
+    one, many = ArcadeGymEnv("MineSweeperEasy"), ArcadeVectorEnv("MineSweeperEasy", 2)
+
+    def found() -> tuple[object, ...]:
+        return tuple((env._batch.draw(), env.np_random.bit_generator.state) for env in (one, many))
+
+    one.reset(seed=1), many.reset(seed=1)
+    before = found()
+    for seed, error in ((2**32, ValueError), (-1, ValueError), (1.5, TypeError)):
+        with pytest.raises(error, match=f"seed is {seed}"):
+            one.reset(seed=seed, options={"observability": "partial"})
+        with pytest.raises(error, match=f"seed is {seed}"):
+            many.reset(seed=seed)
+    assert equal(found(), before)
 
 
 def test_the_vector_env_refuses_what_does_not_fit() -> None:

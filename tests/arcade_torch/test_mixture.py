@@ -134,14 +134,18 @@ def test_each_env_of_a_mixed_batch_shows_the_twin_it_was_told_also_from_mid_epis
 
 
 def test_the_collector_follows_when_twins_are_switched_between_two_windows() -> None:
-    flags = torch.tensor([True, False, True, False, True, False])
+    """In the frames that are acted on and in those at ends; the games begin with different twins."""
+    flags = torch.tensor([True, False, True, False, False, True])
+
+    def frames(batch: TensorDictBase) -> torch.Tensor:
+        return torch.cat([batch["pixels"], batch["next", "pixels"]], 1)
 
     def windows(start: Any) -> tuple[torch.Tensor, torch.Tensor]:
         env = ArcadeEnv(MIXED, 6, start, seed=4)
         collector = ArcadeCollector(env, random_policy, frames_per_batch=48, return_same_td=False)
-        first = collector.collect()["pixels"]
+        first = frames(collector.collect())
         env.set_observability(~flags if isinstance(start, torch.Tensor) else start)
-        return first, collector.collect()["pixels"]
+        return first, frames(collector.collect())
 
     ours, full, partial = windows(flags), windows("full"), windows("partial")
     for window, shown in enumerate((flags, ~flags)):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import make
+from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT
 from arcade_torch.envs_jax.cartpole.picture import Geometry, arrow_level, arrow_pictures, pole_span
 from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK
 
@@ -156,6 +157,34 @@ def test_the_pole_is_exactly_the_pixels_near_its_segment(size, theta):
     disagree = drawn != (distance <= geo.pole_radius)
     assert np.abs(distance[disagree] - geo.pole_radius).max(initial=0) < 1e-3
     assert drawn.sum() > geo.pole_length * geo.pole_radius
+
+
+@pytest.mark.parametrize(("size", "radius", "head"), [(128, 3, 6), (256, 5, 8)])
+def test_cart_pole_and_arrows_stand_where_the_published_ones_do(size, radius, head):
+    """The upright pole over the middle of the cart; each arrow in its box, as thick and with as long a head as its
+    speed says (classes 0 to 3). The ring of the bent one begins at its top, for it turns clockwise."""
+    game, unit = make("CartPoleEasy", obs_size=size), size // 128
+    pole = [(24 * unit - radius, 56 * unit + radius + 1), (48 * unit - radius, 48 * unit + radius + 1)]
+    for number, (speed, thickness) in enumerate(((0.5, 2), (1.0, 2), (3.0, 4), (4.0, 4))):
+        frame = draw(game, one(game, x=0.0, theta=0.0, x_dot=speed, theta_dot=speed), False)
+        field = frame[16 * unit : 112 * unit, 16 * unit : 112 * unit]
+        places = [np.nonzero((field == colour).all(-1)) for colour in ((245, 74, 140), (191, 120, 69))]
+        cart, copper = ([(at.min(), at.max() + 1) for at in place] for place in places)
+        assert cart == [(48 * unit, 64 * unit), (32 * unit, 64 * unit)] and copper == pole
+        ink = (field == (204, 204, 204)).all(-1)
+        flat, bent = (ink[69 * unit : 91 * unit, left : left + 22 * unit] for left in (5 * unit, 69 * unit))
+        assert ink.sum() == flat.sum() + bent.sum(), "nothing beside the boxes"
+        across, shaft, middle = flat.sum(0), 22 * unit - head - number, 11 * unit
+        assert (across[:shaft] == thickness).all() and across[shaft] > thickness and across[-2:].any()
+        assert bent[0].any() and not bent[:, :middle].any() and bent[:, middle].sum() == thickness, "its ring begins"
+
+
+def test_noise_beyond_the_limits_is_drawn_at_the_limits():
+    game = make("NoisyCartPoleHard")
+    for sign in (-1, 1):
+        edge = one(game, x=2.4 * sign, theta=THETA_LIMIT * sign, noise=np.zeros(4))
+        beyond = edge._replace(noise=jnp.array([1.0, 0.0, 0.5, 0.0]) * sign)
+        assert np.array_equal(draw(game, beyond, False), draw(game, edge, False))
 
 
 def test_a_pole_to_the_right_leans_to_the_right():

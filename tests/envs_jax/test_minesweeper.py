@@ -121,7 +121,7 @@ def test_a_mine_ends_the_game(options, expected):
     new, reward, terminated, truncated = step(game, board(game, [(2, 1)], x=2, y=1), 4)
     assert (reward, terminated, truncated) == (expected, True, False)
     assert int(new.score) == 0 and int(new.grid[2, 1]) == SWEPT
-    assert game.return_range[0] <= expected
+    assert game.return_range[0] == pytest.approx(1 / 14 - 7 / 8 + min(expected, -1 / 8)), "a mine in place of a repeat"
 
 
 @pytest.mark.parametrize("id", LEVELS)
@@ -149,6 +149,20 @@ def test_the_time_limit_truncates_but_does_not_terminate(rules, action):
     assert not terminated and truncated is (rules == "default" or action != 4)
     assert step(game, board(game, [(3, 3)], timestep=32), action)[3] is True
     assert step(game, board(game, [(3, 3)], timestep=30), action)[3] is False
+
+
+@pytest.mark.parametrize(("rules", "repeats", "action", "ends"), [
+    ("default", 7, 4, True),
+    ("default", 7, 0, False),
+    ("reference", 7, 4, False),
+    ("reference", 8, 4, True),
+    ("reference", 8, 0, False),
+])  # fmt: skip
+def test_the_repeats_are_judged_after_the_sweep_or_late_in_the_reference(rules, repeats, action, ends):
+    game = make("MineSweeperEasy", rules=rules)
+    state = board(game, [(3, 3)], repeats=repeats, timestep=20)
+    state = state._replace(grid=state.grid.at[0, 0].set(SWEPT))
+    assert step(game, state, action)[2] is ends
 
 
 def test_sweeping_the_last_safe_cell_terminates_with_return_one():

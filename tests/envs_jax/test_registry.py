@@ -90,3 +90,17 @@ def test_registering_needs_a_version_and_a_free_name():
         register("Mine", lambda **_: None)
     with pytest.raises(ValueError, match="registered already"):
         register("CartPoleEasy-v0", lambda **_: None)
+
+
+@pytest.mark.parametrize("taken", ["MineSweeperEasy", "MineSweeperEasy-v0", "NoisyPoleEasy"])
+def test_no_name_of_a_game_can_be_given_to_another(monkeypatch, taken):
+    forget_games(monkeypatch)
+    before, meant = registered_ids(), resolve_id(taken)
+    with pytest.raises(ValueError, match=f"the name '{taken}' belongs to the game '{meant[:-3]}' already"):
+        register("FooEasy-v0", "cartpole:CartPole", ["Foo", taken])
+    with pytest.raises(ValueError, match="the name 'NoisyPoleEasy' belongs"):
+        register("NoisyPoleEasy-v1", "cartpole:CartPole")
+    assert registered_ids() == before and resolve_id(taken) == meant
+    for version in (0, 1):
+        register(f"FooEasy-v{version}", "cartpole:CartPole", ["Foo"])
+    assert resolve_id("Foo") == "FooEasy-v1"

@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from arcade_torch.envs_jax import make
+from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.envs_jax.render import (
     DIGITS,
     LETTERS,
@@ -82,6 +84,26 @@ def test_numbers_are_centred_distinct_and_inside_their_field(size):
     width = 3 * {128: 10, 256: 15}[size] + 2 * 2
     assert len(range(columns[0], columns[-1] + 1)) == width
     assert columns[0] == (pictures.shape[2] - width) // 2
+
+
+HIGHEST = {
+    "AutoEncode": (27, 53, 79),  # the reference pays one card twice
+    "BattleShip": (12,) * 3,
+    "Breakout": (60,) * 3,
+    "CartPole": (200, 400, 600),
+    "CountRecall": (26, 52, 78),
+    "MineSweeper": (14, 30, 54),
+    "NoisyCartPole": (200,) * 3,
+    "Skittles": (100,) * 3,
+    "Tetris": (10 + 3,) * 3,  # nine lines, then four at once
+}
+
+
+@pytest.mark.parametrize("name", HIGHEST)
+def test_the_highest_number_of_a_game_can_be_shown(name):
+    """It is seen in final frames alone."""
+    for difficulty, highest in zip(DIFFICULTIES, HIGHEST[name], strict=True):
+        assert len(make(name + difficulty, rules="reference").screen.score.pictures) > highest
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ import pytest
 from arcade_torch.envs_jax import make, probe_ids, registered_ids
 from arcade_torch.envs_jax.game import RIGHT
 from arcade_torch.envs_jax.oracles import make_oracle, oracle_return, play, random_return
-from arcade_torch.envs_jax.signpost.picture import BLANK, GATE, KINDS, OPEN
+from arcade_torch.envs_jax.render.palette import YELLOW
+from arcade_torch.envs_jax.signpost.picture import BLANK, GATE, KINDS, OPEN, sign_pictures
 
 from .conftest import Walk, draw, one, random_actions
 
@@ -91,6 +92,14 @@ def test_the_pomdp_shows_the_sign_in_the_first_frame_alone(id, size):
             cells = game.screen.corridor.read(full, 1, game.level.cells)[0, 0]
             np.testing.assert_array_equal(cells, game.screen.corridor.read(partial, 1, game.level.cells)[0, 0])
             assert cells.tolist().index(max(cells)) == x and (cells % KINDS)[-1] == GATE
+
+
+def test_the_arrow_of_a_sign_points_where_its_action_goes():
+    """Its head, where most of it is, lies there."""
+    ink = (sign_pictures(32)[:4] == np.array(YELLOW)).all(-1)
+    up = ink[:, :16].sum((1, 2)) > ink[:, 16:].sum((1, 2))
+    left = ink[:, :, :16].sum((1, 2)) > ink[:, :, 16:].sum((1, 2))
+    assert up.tolist()[:2] == [True, False] and left.tolist()[2:] == [True, False]
 
 
 def test_an_open_gate_looks_open_and_counts():

@@ -1,5 +1,9 @@
 """Tetris, checked against a plain simulation of single cells and against what its pictures ought to tell."""
 
+import re
+from dataclasses import astuple
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -223,6 +227,12 @@ def test_a_soft_drop_is_one_cell_at_the_step_of_the_spawn_and_replaces_gravity()
         assert step(game, one(game), DROP)[0].py == 1
         assert step(game, one(game, frames_since_spawn=1), DROP)[0].py == drop
         assert step(game, one(game), WAIT)[0].py == LEVELS[id].fall
+
+
+def test_the_levels_are_those_of_the_page():
+    page = (Path(__file__).parents[2] / "docs/games/tetris.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (?:previews|cells .*) \| (\d) \| (\d) \| (\d) \|$", page, re.MULTILINE)
+    assert [tuple(map(int, level)) for level in zip(*rows, strict=True)] == list(map(astuple, LEVELS.values()))
 
 
 @pytest.mark.parametrize(("action", "edge"), [(LEFT, -1), (RIGHT, 8)])
