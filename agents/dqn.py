@@ -19,7 +19,8 @@ class DQNLoss(PQNLoss):
     """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without a target network.
 
     Keys and arguments as in :class:`PQNLoss`, but ``lmbda`` of :meth:`make_value_estimator` is 0 by default; where a
-    batch holds ``stored_target`` [N, L], these are the targets. Sequences start from their stored state.
+    batch holds ``stored_target`` [N, L], these are the targets. Sequences, and their burn-in, start from their stored
+    state; with ``store="step"`` every step that has ``is_init`` set starts from the state stored there.
     """
 
     def _default_value_estimator(self) -> None:
@@ -69,10 +70,9 @@ class DQN(Learner):
             self.updates += 1
             drawn = self.replay.sample(config.batch_sequences, self.training.generator, self.training.device)
             data = self.loss.prepare(drawn)
-            for _ in range(config.epochs):
-                for minibatch in self.minibatches(data):
-                    self.gradient_step(minibatch, frames)
-                    frames += self.frames_per_step
+            for minibatch in self.minibatches(data):
+                self.gradient_step(minibatch, frames)
+                frames += self.frames_per_step
         return self.take_metrics() | {"replay_frames": self.replay.frames}
 
     @torch.no_grad()

@@ -1,6 +1,7 @@
 """What PQN, PPO and DQN share: schedules, the order of minibatches, the gradient step, the check for NaN."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -68,11 +69,12 @@ class Learner:
         self._step = CudaGraphModule(self._plain_step) if training.cuda_graphs else self._plain_step
         self._metrics: list[TensorDictBase] = []
 
-    def minibatches(self, data: TensorDictBase) -> tuple[TensorDictBase, ...]:
-        """The minibatches of one pass over the rows of ``data``, in random order."""
-        order = torch.randperm(len(data), generator=self.training.generator)
-        shuffled = data[order.to(self.training.device, non_blocking=True)]
-        return shuffled.split(-(-len(data) // self.config.minibatches))  # type: ignore[no-any-return]
+    def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
+        """The minibatches of all epochs, each epoch over the rows of ``data`` in a random order of its own."""
+        for _ in range(self.config.epochs):
+            order = torch.randperm(len(data), generator=self.training.generator)
+            shuffled = data[order.to(self.training.device, non_blocking=True)]
+            yield from shuffled.split(-(-len(data) // self.config.minibatches))
 
     def gradient_step(self, minibatch: TensorDictBase, frames: float) -> None:
         """One step of the optimiser, with the step size after ``frames`` frames."""
@@ -118,10 +120,9 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment; the weights are loaded elsewhere."""
-        rates = [group["lr"] for group in self.optimizer.param_groups]
+        rate = self.optimizer.param_groups[0]["lr"]  # on CUDA a tensor, which a checkpoint would put on the CPU
         self.optimizer.load_state_dict(state["optimizer"])
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate  # set before every step; on CUDA a tensor, which a checkpoint would put on the CPU
+        self.optimizer.param_groups[0]["lr"] = rate  # its value is set before every step
         self.grad_steps = state["grad_steps"]
 
 
@@ -175,7 +176,4 @@ class FusedRAdam(torch.optim.Adam):
 def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:
     """Give every parameter group the same step size; in place where it is a tensor."""
     for group in optimizer.param_groups:
-        if isinstance(group["lr"], Tensor):
-            group["lr"].fill_(learning_rate)
-        else:
-            group["lr"] = learning_rate
+        group["lr"] = group["lr"].fill_(learning_rate) if isinstance(group["lr"], Tensor) else learning_rate

@@ -40,15 +40,15 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
         The score, in units of the undiscounted return.
 
     Raises:
-        ValueError: the history is empty, its two parts differ in length, or ``frames`` does not increase.
+        ValueError: the history is empty, its two parts differ in length, or ``frames`` is not finite and increasing.
 
     Source: POPGym Arcade (ICML 2026), plotting of the reference implementation.
     """
     x, y = np.asarray(frames, dtype=np.float64), np.asarray(returns, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape or len(x) == 0:
         raise ValueError(f"frames and returns must be two histories of one length >= 1; got {x.shape} and {y.shape}")
-    if np.any(np.diff(x) <= 0):
-        raise ValueError("frames must increase from row to row")
+    if not (np.isfinite(x).all() and np.all(np.diff(x) > 0)):
+        raise ValueError("frames must be finite and increase from row to row")
     grid = np.linspace(0.0, x[-1] if max_frames is None else max_frames, CURVE_POINTS)
     return float(ewm(np.interp(grid, x, y)).max())
 

@@ -26,7 +26,7 @@ Network = MemoryNetwork | ActorCriticNetwork
 
 
 def make_policy(
-    network: Network, explore: bool = True, epsilon: float = 1.0, num_actions: int = 5
+    network: Network, explore: bool = True, epsilon: float = 1.0, num_actions: int | None = None
 ) -> TensorDictSequential:
     """How a network acts.
 
@@ -34,7 +34,7 @@ def make_policy(
         network: of Q-values (``action_value``), or an actor-critic (``logits``).
         explore: for Q-values, append TorchRL's ``EGreedyModule``; for an actor-critic, sample.
         epsilon: probability of a random action; move it by ``policy[-1].eps.fill_(...)``.
-        num_actions: A.
+        num_actions: A; None: the outputs of the last linear layer in the network's ``head``, 5 if it has none.
 
     Returns:
         A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it samples. Random numbers
@@ -44,7 +44,9 @@ def make_policy(
         return make_actor(network, deterministic=not explore)
     parts: list[Any] = [network, QValueModule(action_space="categorical")]
     if explore:
-        parts.append(EGreedyModule(Categorical(num_actions), eps_init=float(epsilon), eps_end=0.0))
+        head = network.head if isinstance(network, MemoryNetwork) else nn.Identity()
+        sizes = [layer.out_features for layer in head.modules() if isinstance(layer, nn.Linear)]
+        parts.append(EGreedyModule(Categorical(num_actions or [5, *sizes][-1]), eps_init=float(epsilon), eps_end=0.0))
     return TensorDictSequential(*parts)
 
 

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
-from arcade_torch.agents.config import PPOConfig, TimeLimit
+from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.sequences import (
     NetworkInputs,
@@ -58,7 +58,7 @@ def gae(
         float [B, T], in the dtype of ``reward``.
 
     Raises:
-        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+        ValueError: as :func:`q_lambda_return`.
 
     Source: Schulman et al., arXiv 1506.02438, equation 16.
 
@@ -95,7 +95,8 @@ class SequenceGAE(nn.Module):
         super().__init__()
         self.__dict__["critic"] = critic  # its parameters belong to the loss
         self.inputs = NetworkInputs(critic)
-        self.gamma, self.lmbda, self.time_limit, self.chunks = gamma, lmbda, time_limit, chunks
+        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
+        self.gamma, self.lmbda, self.chunks = gamma, lmbda, chunks
         self.reads: dict[str, Any] = {"reward": "reward", "terminated": "terminated"}
         self.writes = {"advantage": "advantage", "value_target": "value_target", "value": "state_value"}
 
@@ -160,7 +161,8 @@ class PPOLoss(ClipPPOLoss):
     ) -> None:
         options = {"loss_critic_type": "l2", "clip_value": True, "log_explained_variance": False} | kwargs
         super().__init__(actor_network, critic_network, critic_coeff=0.5 * critic_coeff, **options)
-        self.time_limit, self.prediction_coeff = time_limit, prediction_coeff
+        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
+        self.prediction_coeff = prediction_coeff
         self.normalize_advantage = True
         self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
         self.out_keys = [*self.out_keys, *["loss_prediction"] * bool(prediction_coeff)]  # type: ignore[has-type]
@@ -195,6 +197,7 @@ class PPOLoss(ClipPPOLoss):
         if value_type is None:
             hyperparams = {"critic": self.critic_network, "time_limit": self.time_limit} | hyperparams
             self._value_estimator = SequenceGAE(**hyperparams)
+            self._forward_value_estimator_keys()
         else:
             super().make_value_estimator(value_type, **hyperparams)
 
@@ -255,27 +258,18 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
 
 
 class PPO(Learner):
-    """Estimates advantages once a window, then goes over it for some epochs.
+    """Estimates advantages once a window, then goes over it for some epochs; arguments as in :class:`PQN`.
 
-    Args:
-        network: with ``actor`` (writes ``logits``) and ``critic`` (writes ``state_value``).
-        config: numbers of PPO.
-        training: of the run.
+    The network has an ``actor`` (writes ``logits``), a ``critic`` (``state_value``) and the critic's ``estimator``.
     """
 
     config: PPOConfig
     loss: PPOLoss
 
     def __init__(self, network: Any, config: PPOConfig, training: Training) -> None:
-        loss = PPOLoss(
-            make_actor(network.actor),
-            network.critic,
-            time_limit=config.time_limit,
-            clip_epsilon=config.clip,
-            entropy_coeff=config.entropy_coeff,
-            critic_coeff=config.critic_coeff,
-            prediction_coeff=config.prediction_coeff,
-        )
+        names = ("time_limit", "entropy_coeff", "critic_coeff", "prediction_coeff")
+        options: Any = {name: getattr(config, name) for name in names}
+        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=config.clip, **options)
         loss.make_value_estimator(
             gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches, critic=network.estimator
         )
@@ -285,12 +279,11 @@ class PPO(Learner):
         """Learn from one window, with ``action_log_prob``; see `PQN.update`."""
         config = self.config
         data = self.loss.value_estimator(batch)
-        for _ in range(config.epochs):
-            for minibatch in self.minibatches(data):
-                left = config.entropy_end ** (frames / self.training.total_frames)
-                self.loss.entropy_coeff.fill_(config.entropy_coeff * left)
-                self.gradient_step(minibatch, frames)
-                frames += self.frames_per_step
+        for minibatch in self.minibatches(data):
+            left = config.entropy_end ** (frames / self.training.total_frames)
+            self.loss.entropy_coeff.fill_(config.entropy_coeff * left)
+            self.gradient_step(minibatch, frames)
+            frames += self.frames_per_step
         metrics = self.take_metrics()
         return metrics | {
             "policy_loss": metrics["loss_objective"],

@@ -1,7 +1,7 @@
 """PQN: Q-learning with lambda-returns, no replay buffer, no target network; with memory or without."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import TDLambdaEstimator, ValueEstimatorBase
 
-from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit, require
+from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit, coerce, require
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.sequences import (
     Key,
@@ -60,7 +60,7 @@ def q_lambda_return(
         float [B, T], in the dtype of ``reward``.
 
     Raises:
-        ValueError: shapes differ or are not [B, T], ``gamma`` or ``lam`` lie outside [0, 1], ``time_limit`` is unknown.
+        ValueError: shapes differ or are not [B, T]; integer rewards; ``gamma``, ``lam`` or ``time_limit`` not as above.
 
     Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade (ICML 2026), PQN.
 
@@ -127,7 +127,7 @@ class PQNLoss(LossModule):
         time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
         bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its value.
         delay_value: keep target parameters, which then give the next values (``SoftUpdate``, ``HardUpdate``).
-        burn_in: first steps of a sequence that only bring the memory up to date, without gradient.
+        burn_in: first steps that only bring the memory up to date, without gradient; memories with one ``store`` only.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         functional: hold the parameters apart from the network, as TorchRL's losses do; False saves that time.
 
@@ -178,8 +178,10 @@ class PQNLoss(LossModule):
             require(not delay_value, "functional", functional, "True with delay_value")
             self.value_network = value_network
         self.inputs = NetworkInputs(value_network)
-        self.time_limit, self.bootstrap, self.delay_value = time_limit, bootstrap, delay_value
-        self.burn_in, self.reduction = burn_in, reduction
+        require(not burn_in or len(self.inputs.stores) < 2, "burn_in", burn_in, "0 with memories that differ in store")
+        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
+        self.bootstrap = coerce("bootstrap", bootstrap, Bootstrap)
+        self.delay_value, self.burn_in, self.reduction = delay_value, burn_in, reduction
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:
@@ -235,7 +237,8 @@ class PQNLoss(LossModule):
             ValueError: a needed next observation or recurrent state is not in the batch.
         """
         data = tensordict if "position" in tensordict else self.prepare(tensordict)
-        with self._online():
+        params: Any = self.value_network_params if self.functional else None
+        with nullcontext() if params is None else params.to_module(self.value_network, preserve_module_state=False):
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
         position, action = data["position"][:, :steps], data["action"][:, :steps]
@@ -248,11 +251,6 @@ class PQNLoss(LossModule):
         error, chosen = error.detach(), chosen.detach()
         means = {"q_mean": chosen.mean(), "target_mean": target.mean(), "td_error": error.abs().mean()}
         return TensorDict(loss=loss, **means, batch_size=[])
-
-    def _online(self) -> AbstractContextManager[Any]:
-        if not self.functional:
-            return nullcontext()
-        return self.value_network_params.to_module(self.value_network, preserve_module_state=False)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
@@ -308,8 +306,7 @@ class PQN(Learner):
             NonFiniteError: the loss, the gradient or a weight is not finite.
         """
         data = self.loss.prepare(batch)
-        for _ in range(self.config.epochs):
-            for minibatch in self.minibatches(data):
-                self.gradient_step(minibatch, frames)
-                frames += self.frames_per_step
+        for minibatch in self.minibatches(data):
+            self.gradient_step(minibatch, frames)
+            frames += self.frames_per_step
         return self.take_metrics()

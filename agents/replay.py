@@ -18,6 +18,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
 
+from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import CheckpointError, checksum
 
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
@@ -36,13 +37,12 @@ class SequenceReplay:
     """Draws sequences uniformly, in the form in which they were added.
 
     Args:
-        capacity: most sequences to keep, at least 1 (else ValueError); whole windows are dropped to stay within.
+        capacity: most sequences to keep, at least 1 (else ValueError); old windows leave whole, the newest stays.
         folder: where windows are written, made when first needed; None for a temporary folder.
     """
 
     def __init__(self, capacity: int, folder: Path | None = None) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1 sequence, got {capacity}")
+        require(capacity >= 1, "capacity", capacity, "at least 1 sequence")
         self.capacity = capacity
         self._temporary = tempfile.TemporaryDirectory() if folder is None else None
         self._folder = folder or Path(self._temporary.name)  # type: ignore[union-attr]
@@ -98,16 +98,12 @@ class SequenceReplay:
             Sequences [B], in the order of age.
         """
         held = len(self)
-        if not 1 <= count <= held:
-            raise ValueError(f"cannot draw {count} of {held} sequences")
-        chosen = torch.randperm(held, generator=generator)[:count].sort().values
-        first, parts = 0, []
-        for segment in self._segments:
-            last = first + len(segment.data)
-            parts.append(segment.data[chosen[(chosen >= first) & (chosen < last)] - first])
-            first = last
-        drawn: TensorDict = TensorDict.cat(parts).to(device).unflatten_keys("/")
-        return drawn
+        require(1 <= count <= held, "count", count, f"from 1 to the {held} sequences at hand")
+        drawn_rows = torch.zeros(held, dtype=torch.bool)
+        drawn_rows[torch.randperm(held, generator=generator)[:count]] = True
+        rows_of = drawn_rows.split([len(segment.data) for segment in self._segments])
+        parts = [segment.data[rows] for segment, rows in zip(self._segments, rows_of, strict=True)]
+        return TensorDict.cat(parts).to(device).unflatten_keys("/")
 
     def state_dict(self) -> dict[str, Any]:
         """Name everything at hand, with checksums; call it when a checkpoint is made.

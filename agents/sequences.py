@@ -31,8 +31,8 @@ class NetworkInputs:
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
         self.observation_keys = [key for key in keys if key not in self.state_keys]
-        memories = [m for m in network.modules() if isinstance(m, MemoryModule | MemoryNetwork)]
-        self.reads_first_state_only = bool(memories) and all(m.store == "sequence" for m in memories)
+        self.stores = {m.store for m in network.modules() if isinstance(m, MemoryModule | MemoryNetwork)}
+        self.reads_first_state_only = self.stores == {"sequence"}
 
 
 def insert_final_observations(
@@ -68,6 +68,7 @@ def insert_final_observations(
     if batch.ndim == 1 and _get(batch, "is_init").ndim == 2:  # one sequence [L] of a stock batch
         batch = batch.unsqueeze(0)
     is_init = _flat(batch, "is_init")
+    batch["is_init"] = is_init.unsqueeze(-1)
     terminated, truncated = _flat(batch, ("next", "terminated")), _flat(batch, ("next", "truncated"))
     done = terminated | truncated
     seam = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
@@ -92,8 +93,6 @@ def insert_final_observations(
         batch_size=[len(is_init)],
     )
     roots = {key: _get(batch, key) for key in inputs.observation_keys}
-    if "is_init" in roots:
-        roots["is_init"] = is_init.unsqueeze(-1)
     both = {key: torch.cat((root[:, burn_in:], places(key)), dim=1) for key, root in roots.items()}
     out["extended"] = TensorDict({key: _rows(value, order) for key, value in both.items()}, batch_size=order.shape)
     if burn_in:
@@ -114,14 +113,14 @@ def unroll(network: TensorDictModuleBase, inputs: NetworkInputs, sequences: Tens
     Returns:
         float [B, L + K, ...], the output along the extended sequence.
     """
-    state = sequences.get("initial_state", None)
+    state, extended = sequences.get("initial_state", None), sequences["extended"]
     burn_in = sequences.get("burn_in", None)
     if burn_in is not None and inputs.state_keys:  # no gradient: it only brings the state up to date (R2D2)
         with torch.no_grad(), set_recurrent_mode(False):
             for t in range(burn_in.shape[1]):
-                step = burn_in[:, t].copy() if state is None else burn_in[:, t].copy().update(state)
+                step = _with_state(burn_in[:, t], state, inputs)
                 state = network(step).get("next").select(*inputs.state_keys)
-    extended = sequences["extended"]
+            state = _with_state(extended[:, 0], state, inputs).select(*inputs.state_keys)
     if isinstance(network, MemoryNetwork) and network.store == "sequence" and network.out_key == key:
         return network.read_sequences(extended, state)  # the same without a TensorDict in between
     extended = extended.copy()
@@ -167,6 +166,8 @@ def values_and_traces(
     shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
     if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
         raise ValueError(f"rewards, values, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
+    if not reward.is_floating_point():  # gamma times lambda would be rounded to 0
+        raise ValueError(f"the dtype of rewards must be a floating one; got {reward.dtype}")
     if not 0.0 <= gamma <= 1.0 or not 0.0 <= lam <= 1.0:
         raise ValueError(f"gamma and lambda must lie in [0, 1]; got gamma={gamma}, lambda={lam}")
     if time_limit not in ("bootstrap", "terminal"):
@@ -187,6 +188,16 @@ def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
             trace = trace[:, : trace.shape[1] - reach] * trace[:, reach:]
         reach *= 2
     return base
+
+
+def _with_state(step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs) -> TensorDictBase:
+    """A step [B] that goes on from a state [B]; memories that store every step load what is stored at a start."""
+    step = step.copy()
+    if state is not None and not inputs.reads_first_state_only and "is_init" in step:
+        stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
+        state = stored.where(step["is_init"].squeeze(-1), state)
+        step["is_init"] = torch.zeros_like(step["is_init"])  # which would drop what was loaded
+    return step if state is None else step.update(state)
 
 
 def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
@@ -229,7 +240,7 @@ def _next(batch: TensorDictBase, key: Key) -> Tensor:
     if value is None and key == "last_action":
         value = _get(batch, "action")
     if value is None:
-        raise KeyError(f"next observations are needed, but the batch has neither 'final_pixels' nor ('next', {key!r})")
+        raise KeyError(f"no next observations: neither 'final_pixels' nor ('next', {key!r}); take collect() or 'all'")
     return value  # type: ignore[no-any-return]
 
 
@@ -242,6 +253,8 @@ def _add_state(
     first = batch.get("initial_state", None)
     if first is not None:
         out["initial_state"] = first.select(*inputs.state_keys)
+        if burn_in and not inputs.reads_first_state_only:
+            _begin_with(out["burn_in"], first, inputs)
         return
     per_step = {key: batch.get(key, None) for key in inputs.state_keys}
     if missing := [key for key, value in per_step.items() if value is None]:
@@ -253,6 +266,8 @@ def _add_state(
         for key, value in per_step.items():
             nothing = value.new_zeros(len(value), order.shape[1] - value.shape[1] + burn_in, *value.shape[2:])
             out["extended"][key] = _rows(torch.cat((value[:, burn_in:], nothing), 1), order)
+            if burn_in:
+                out["burn_in"][key] = value[:, :burn_in]
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:

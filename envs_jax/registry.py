@@ -171,7 +171,7 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     allowed = option_names(full_id)
     unknown = sorted(set(options) - set(allowed))
     if unknown:
-        has = f"its options are {', '.join(allowed)}" if allowed else "it has no options"
+        has = f"its options are {', '.join(allowed)}" if allowed else "it has none of its own"
         raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has}")
     from arcade_torch.envs_jax.checks import check_made
 

@@ -10,8 +10,8 @@ tensors; ``is_init`` marks the steps that open an episode, before which everythi
   is wrong with it.
 * :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of ``LSTMModule``.
 * :func:`make_network`, :class:`MemoryNetwork`: pixels to Q-values, presets "paper" and "small".
-* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, two separate towers. Both
-  networks are TensorDict modules.
+* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, by two networks ("paper") or by
+  one for both ("small"). All these networks are TensorDict modules.
 * :class:`MemoryBlock`: the stack of cells between encoder and head.
 * :func:`linear_scan`: the recurrence h_t = a_t h_{t-1} + b_t as a torch operator; :func:`matrix_scan`: the delta rule
   S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T in chunks.

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
@@ -50,7 +50,7 @@ def check_memory(
 
     Raises:
         MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
-        ValueError: the input size is not known.
+        ValueError, TypeError: the input size is not known; there is no ``initial_state``.
 
     Example:
         >>> from arcade_torch.models import check_memory, make_memory
@@ -60,6 +60,8 @@ def check_memory(
     size = input_size if input_size is not None else getattr(module, "input_size", None)
     if not isinstance(size, int):
         raise ValueError("input size unknown: pass check_memory(module, input_size=...) or set module.input_size")
+    if not hasattr(module, "initial_state"):
+        raise TypeError(f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         subject = _Subject(copy.deepcopy(module).double().eval(), size, tolerance)
@@ -120,31 +122,28 @@ def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
 
 def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
     """Tensors of two states side by side, as floats."""
-    theirs = _leaves(q)
-    return [(leaf.double(), theirs[key].double()) for key, leaf in _leaves(p).items()]
+    return [(leaf.double(), q.get(key).double()) for key, leaf in _leaves(p).items()]
 
 
 def _shapes(s: _Subject, law: str) -> float:
     for batch, steps in ((1, 1), (3, 1), (2, 5)):
-        x = s.random(batch, steps)
-        y, after = s.module(x, s.initial(batch), torch.zeros_like(x[..., 0], dtype=torch.bool))
-        if y.shape[:2] != (batch, steps) or y.ndim != 3:
-            raise MemoryLawError(
-                law, f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]", "time and batch are exchanged"
-            )
-        expected = {k: (list(v.shape), v.dtype) for k, v in _leaves(s.initial(batch)).items()}
-        got = {k: (list(v.shape), v.dtype) for k, v in _leaves(after).items()}
+        x, begin = s.random(batch, steps), s.initial(batch)
+        out = s.module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
+        parts = (begin, *(out if isinstance(out, tuple) else (out,)))
+        if [isinstance(part, TensorDictBase) for part in parts] != [True, False, True]:
+            found = f"initial_state and forward gave {', '.join(type(part).__name__ for part in parts)}"
+            raise MemoryLawError(law, found, "a state is no TensorDict, or forward does not return (y, state)")
+        y, after = out
+        if y.shape[:2] != (batch, steps) or y.ndim != 3 or y.shape[2] != getattr(s.module, "hidden_size", y.shape[2]):
+            found = f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]"
+            raise MemoryLawError(law, found, "time and batch are exchanged, or hidden_size is not the width of y")
+        expected, got = ({k: (list(v.shape), v.dtype) for k, v in _leaves(each).items()} for each in (begin, after))
         if expected != got:
-            raise MemoryLawError(
-                law,
-                f"initial_state({batch}) has {expected} but forward returned {got}",
-                "the state grows with time, lacks the batch dimension, or has a dtype of its own "
-                "(take dtype and device from the parameters)",
-            )
+            found = f"initial_state({batch}) has {expected} but forward returned {got}"
+            cause = "the state grows, lacks the batch dimension, or does not take dtype and device from the parameters"
+            raise MemoryLawError(law, found, cause)
         if y.dtype != torch.float64:
-            raise MemoryLawError(
-                law, f"float64 parameters and inputs gave {y.dtype}", "a constant or a cast in another dtype"
-            )
+            raise MemoryLawError(law, f"float64 inputs gave {y.dtype}", "a constant or a cast in another dtype")
     x, state, flags = s.inputs(2, 5, 0.3)
     before = state.clone()
     s.module(x, state, flags)
@@ -205,27 +204,21 @@ def _calls_equal_one(s: _Subject, law: str) -> float:
 @torch.no_grad()
 def _packed_equals_apart(s: _Subject, law: str) -> float:
     worst = 0.0
-    lengths = (1, 4, 2, 6)
-    x, state, flags = s.inputs(2, sum(lengths))
-    begin = 0
-    for length in lengths:
-        flags[:, begin] = True
-        begin += length
+    starts = [0, 1, 5, 7]
+    x, state, flags = s.inputs(2, 13)
+    flags[:, starts] = True
     y, _ = s.module(x, state, flags)
-    begin = 0
-    for length in lengths:
-        part = x[:, begin : begin + length]
-        alone, _ = s.module(part, s.initial(2), torch.zeros_like(flags[:, :length]))
+    for begin, end in zip(starts, (*starts[1:], 13), strict=True):
+        alone, _ = s.module(x[:, begin:end], s.initial(2), torch.zeros_like(flags[:, begin:end]))
         worst = max(
             worst,
             s.compare(
                 law,
-                f"an episode of {length} steps packed behind others at index {begin} and run on its own differ",
+                f"an episode of {end - begin} steps packed behind others at index {begin} and run on its own differ",
                 "the start flag does not restore initial_state, or restores it after reading the first step",
-                (y[:, begin : begin + length], alone),
+                (y[:, begin:end], alone),
             ),
         )
-        begin += length
     return worst
 
 

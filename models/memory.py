@@ -209,10 +209,10 @@ class MemoryModule(TensorDictModuleBase):
         is_init_key: start flags, bool [*batch, 1].
         default_recurrent_mode: mode outside of ``set_recurrent_mode``.
         store: "step": a stored sequence holds the state of every step; "sequence": that of its first step; None: "step"
-            unless a state takes more than 49,152 bytes, the size of a frame, or does not begin with zeros.
+            unless a state takes more than 49,152 bytes, the size of a frame, or its start is not zeros, or learned.
 
     Raises:
-        ValueError: unknown ``store``, or "step" for a memory that does not begin with zeros.
+        ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
 
     Source: TorchRL's recurrent-state life cycle, ``LSTMModule`` and ``GRUModule``.
 
@@ -255,9 +255,9 @@ class MemoryModule(TensorDictModuleBase):
         leaves = [path for path in paths if isinstance(example.get(path), Tensor)]
         self._empty = [p for p in paths if p not in leaves and not any(leaf[: len(p)] == p for leaf in leaves)]
         self._state_keys = {(*prefix, *leaf): leaf for leaf in leaves}
-        zeros = not any(example.get(leaf).any() for leaf in leaves)
+        zeros = not any(example.get(leaf).any() or example.get(leaf).requires_grad for leaf in leaves)
         if store == "step" and not zeros:
-            raise ValueError("store='step' needs a memory that begins with zeros, as primers write: take 'sequence'")
+            raise ValueError("store='step' needs a memory that begins with zeros and learns no start: take 'sequence'")
         state_bytes = sum(example.get(leaf).nbytes for leaf in leaves)
         self.store = store or ("step" if zeros and state_bytes <= LARGE_STATE else "sequence")
         self.in_keys = [self.in_key, *self._state_keys, self.is_init_key]

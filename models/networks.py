@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MemoryBlock", "MemoryNetwork"]
 
+SKIPS = ("residual", "none")
+
 
 class MemoryBlock(nn.Module):
     """x = W u; then per layer y = cell(x), z = LeakyReLU(LayerNorm(V y)), and x + z (skip "residual") or z ("none").
@@ -49,8 +51,8 @@ class MemoryBlock(nn.Module):
         memory_options: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if skip not in ("residual", "none"):
-            raise ValueError(f"skip must be 'residual' or 'none', got {skip!r}")
+        if skip not in SKIPS:
+            raise ValueError(f"skip must be one of {', '.join(SKIPS)}, got {skip!r}")
         if layers < 1:
             raise ValueError(f"layers must be at least 1, got {layers}")
         options = memory_options or {}

@@ -11,7 +11,7 @@ from torch import nn
 
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
 from arcade_torch.models.memory import Key, Store
-from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
+from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork
 from arcade_torch.models.stateless import FeedForward
 
 __all__ = ["FEED_FORWARD", "HEADS", "PRESETS", "NetworkPreset", "make_head", "make_network", "preset_of"]
@@ -117,7 +117,7 @@ def make_network(
 
     Raises:
         ValueError: unknown preset, memory, size, or value of an option.
-        TypeError: unknown option.
+        TypeError: unknown option, or ``memory_options`` of "feedforward".
 
     Example:
         >>> network = make_network("small", "mingru")
@@ -130,17 +130,22 @@ def make_network(
         torch.Size([2, 7, 5])
     """
     chosen = preset_of(preset)
-    if unknown := set(options) - set(NetworkPreset.__dataclass_fields__):
-        allowed = ", ".join(NetworkPreset.__dataclass_fields__)
-        raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {allowed}")
+    fields = NetworkPreset.__dataclass_fields__
+    if unknown := set(options) - set(fields):
+        raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {', '.join(fields)}")
+    if memory == FEED_FORWARD and memory_options:
+        raise TypeError(f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got {memory_options}")
     chosen = replace(chosen, **options)
-    for name in ("hidden_size", "layers", "feedforward_size", "towers"):
-        if not isinstance(size := getattr(chosen, name), int):
-            raise ValueError(f"{name} must be a whole number, got {size!r}")
-        if size < 1:
-            raise ValueError(f"{name} must be at least 1, got {size}")
-    if chosen.towers not in (1, 2):
-        raise ValueError(f"towers must be 2 (actor and critic apart) or 1 (one network for both), got {chosen.towers}")
+    kinds = {int: "a whole number", bool: "True or False"}
+    for name in fields:
+        value, kind = getattr(chosen, name), fields[name].type
+        if kind in kinds and type(value) is not kind:
+            raise ValueError(f"{name} must be {kinds[kind]}, got {value!r}")
+        if kind is int and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    for name, allowed in {"skip": SKIPS, "head": HEADS, "actor_critic_head": HEADS, "towers": (1, 2)}.items():
+        if (value := getattr(chosen, name)) not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
     encoder = chosen.encoder(obs_size)
     block: nn.Module
     if memory == FEED_FORWARD:  # its two layers take the place of a deep head's as well

@@ -71,9 +71,9 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     """
     name = ALIASES.get(name, name)
     if name not in _FACTORIES:
-        near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
+        near, known = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1), ", ".join(_FACTORIES)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"unknown memory {name!r}: {hint}known are {', '.join(_FACTORIES)}; add with register_memory")
+        raise ValueError(f"unknown memory {name!r}: {hint}known are {known}; register_memory or --import adds others")
     try:
         inspect.signature(_FACTORIES[name]).bind(input_size, hidden_size, **options)
     except TypeError as error:
@@ -96,8 +96,8 @@ def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = Fals
     """
     if not name.isidentifier() or name != name.lower():
         raise ValueError(f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}")
-    if not callable(factory):
-        raise TypeError(f"factory must be callable as factory(input_size, hidden_size, **options), got {factory!r}")
+    if not callable(factory) or isinstance(factory, nn.Module):
+        raise TypeError(f"factory must be a class or function of (input_size, hidden_size, **options), got {factory!r}")
     if (name in _FACTORIES or name in ALIASES) and not overwrite:
         raise ValueError(f"memory {name!r} is registered already; choose another name or pass overwrite=True")
     _FACTORIES[ALIASES.get(name, name)] = factory

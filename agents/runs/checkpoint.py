@@ -134,9 +134,8 @@ def load_latest(
         if problems:
             warnings.warn(f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2)
         return found
-    if problems:
-        raise CheckpointError(f"no whole checkpoint in {folder}: {'; '.join(problems)}")
-    raise CheckpointError(f"no checkpoint in {folder}")
+    wanted, why = ("whole checkpoint", f": {'; '.join(problems)}") if problems else ("checkpoint", "")
+    raise CheckpointError(f"no {wanted} in {folder}{why}")
 
 
 def refuse_format(what: object, found: Any) -> str | None:

@@ -56,7 +56,7 @@ class RunFolder:
         if self._config.is_file() and resume:
             self._check_same(config)
         elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
-            hint = "pass resume=True to continue it, or " if self._config.is_file() else ""
+            hint = "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
             raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
         existing = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
         if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):

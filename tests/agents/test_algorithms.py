@@ -8,12 +8,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import NonFiniteError, Trainer, preset
+from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, make_actor, preset
 from arcade_torch.agents.config import GROUPS
+from arcade_torch.agents.learner import Training
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS
+from arcade_torch.agents.training import LEARNERS
 from arcade_torch.models import memory_names
-from tests.agents.fakes import chosen, look_into
+from tests.agents.fakes import (
+    GAMMA,
+    LAM,
+    chosen,
+    look_into,
+    stream,
+    toy_actor_critic,
+    toy_network,
+    with_two_states,
+)
 
 MEMORIES = [*memory_names(), "feedforward"]
 ENVS, STEPS = 4, 12
@@ -99,6 +110,94 @@ def test_updates_of_another_game_are_finite_and_train_every_parameter(algorithm,
     assert all(torch.tensor(float(value)).isfinite() for value in row.values() if value is not None)
     still = [name for name, value in trainer.network.named_parameters() if torch.equal(value, before[name])]
     assert not still
+
+
+UPDATE = {"num_envs": 4, "num_steps": 6, "epochs": 2, "minibatches": 2, "gamma": GAMMA, "lam": LAM}
+UPDATE |= {"learning_rate": 1e-2, "learning_rate_end": 1e-3, "lr_decay_fraction": 1.0, "max_grad_norm": 0.05}
+UPDATE_OF = {
+    "pqn": {"overlap": 1, "bootstrap": "last"},
+    "ppo": {"clip": 0.1, "critic_coeff": 0.7, "entropy_coeff": 0.3, "entropy_end": 0.5},
+    "dqn": {"overlap": 0, "burn_in": 1, "batch_sequences": 4, "learning_starts": 4, "replay_frames": 24},
+}
+
+
+def written_out(algorithm, network, limits, burn_in=0):
+    """The loss that an update should use, every number spelled out."""
+    if algorithm == "ppo":
+        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=0.1, critic_coeff=0.7, **limits)
+    elif algorithm == "pqn":
+        loss = PQNLoss(network, bootstrap="last", **limits)
+    else:
+        loss = DQNLoss(network, burn_in=burn_in, **limits)
+    loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    return loss
+
+
+@pytest.mark.parametrize("time_limit", ["bootstrap", "terminal"])
+@pytest.mark.parametrize(("algorithm", "targets"), [("pqn", ""), ("ppo", ""), ("dqn", "recompute"), ("dqn", "stored")])
+def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(algorithm, targets, time_limit):
+    """Rows in the order of the run's generator, fresh and clipped gradients, each step's own size, means of it all."""
+    limits, two = {"time_limit": time_limit}, algorithm == "ppo"
+    numbers = UPDATE | UPDATE_OF[algorithm] | limits | ({"targets": targets} if targets else {})
+    s, (network, same) = stream(4, 6, seed=6), ((toy_actor_critic if two else toy_network)(3) for _ in range(2))
+    batch = (with_two_states(s) if two else s).sequences()
+    if two:
+        batch["action_log_prob"] = torch.full((4, 6), -1.6)
+    training = Training(96, torch.Generator().manual_seed(3), torch.device("cpu"))
+    row = LEARNERS[algorithm](network, GROUPS[algorithm](**numbers), training).update(batch.clone(), 24)
+
+    loss, generator = written_out(algorithm, same, limits, burn_in=1), torch.Generator().manual_seed(3)
+    optimizer = torch.optim.Adam(loss.parameters(), eps=1e-5) if two else torch.optim.RAdam(loss.parameters())
+    if targets:
+        torch.randperm(4, generator=generator)  # the draw from the replay: all there is
+    if targets == "stored":
+        batch["stored_target"] = look_into(written_out("dqn", same, limits), batch)[1]
+    data, steps = loss.value_estimator(batch) if two else batch, []
+    for k, rows in enumerate(rows for _ in range(2) for rows in torch.randperm(4, generator=generator).split(2)):
+        frames = 24 + 6 * k
+        if two:
+            loss.entropy_coeff.fill_(0.3 * 0.5 ** (frames / 96))
+        out = loss(data[rows])
+        total = sum(value for key, value in out.items() if key.startswith("loss"))
+        parameters = list(loss.parameters())
+        gradients = torch.autograd.grad(total, parameters)
+        norm = sum(g.square().sum() for g in gradients).sqrt()
+        assert norm > 0.05, "clipping must matter"
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient * (0.05 / norm)
+        optimizer.param_groups[0]["lr"] = 1e-2 + (1e-3 - 1e-2) * frames / 96
+        optimizer.step()
+        steps.append({key: float(value.detach().mean()) for key, value in out.items()})
+        steps[-1] |= {"loss": float(total.detach()), "grad_norm": float(norm)}
+    for mine, theirs in zip(network.parameters(), same.parameters(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
+    wanted = {key: sum(step[key] for step in steps) / 4 for key in steps[0]}
+    wanted["lr"] = 1e-2 + (1e-3 - 1e-2) * frames / 96
+    if two:
+        wanted |= {"policy_loss": wanted["loss_objective"], "value_loss": wanted["loss_critic"] / 0.7}
+        wanted |= {"kl": wanted["kl_approx"], "q_mean": float(data["state_value"].mean())}
+        wanted["td_error"] = float(data["advantage"].abs().mean())
+    assert {key: row[key] for key in wanted} == pytest.approx(wanted, rel=1e-3, abs=1e-6)
+
+
+def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is_counted_once(monkeypatch):
+    trainer, seen = Trainer(config("pqn", pqn={"overlap": 6, "warmup_steps": STEPS + 7})), []
+    collect = trainer.collector.collect
+
+    def look(random=False):
+        batch = collect(random=random)
+        seen.append((random, batch["pixels"][:, 6:].flatten(0, 1).clone(), int(batch["next", "done"][:, 6:].sum())))
+        return batch
+
+    monkeypatch.setattr(trainer.collector, "collect", look)
+    trainer.warm_up()
+    assert [random for random, *_ in seen] == [True, True]  # the overlap and 13 steps more
+    frames = torch.cat([pixels for _, pixels, _ in seen]).float()
+    torch.testing.assert_close(trainer.network.encoder.mean, frames.mean(0).permute(2, 0, 1))
+    rows = [trainer.update() for _ in range(4)]
+    assert rows[-1]["episodes"] == sum(ends for *_, ends in seen[2:]) > 0
+    assert not any(random for random, *_ in seen[2:])
+    assert [float(explorer.eps) for explorer in trainer.explorers] == pytest.approx([rows[-1]["epsilon"]])
 
 
 @algorithms

@@ -2,10 +2,13 @@
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.modules import GRUModule
 
 from arcade_torch.agents import DQNConfig, DQNLoss
 from arcade_torch.agents.learner import epsilon_at
-from tests.agents.fakes import GAMMA, chosen, look_into, play, stream, toy_network
+from tests.agents.fakes import ACTIONS, GAMMA, WIDTH, chosen, look_into, play, stream, toy_network
 
 
 def make_loss(network, **options):
@@ -65,6 +68,59 @@ def test_burn_in_carries_no_gradient():
     found = torch.autograd.grad(burnt(s.sequences())["loss"], list(network.parameters()))
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
+
+
+def gru_of_torchrl():
+    """A recurrent network without anything of ours."""
+    keys = {"in_keys": ["flat", ("memory", "h"), "is_init"], "out_keys": ["remembered", ("next", "memory", "h")]}
+    return TensorDictSequential(
+        TensorDictModule(lambda pixels: pixels.flatten(-3) / 255, ["pixels"], ["flat"]),
+        GRUModule(12, WIDTH, **keys),
+        TensorDictModule(nn.Linear(WIDTH, ACTIONS), ["remembered"], ["action_value"]),
+    )
+
+
+def with_states(s, network):
+    """A stock batch with a state at every step: random at the first, zeros behind it."""
+    batch = s.stock()
+    states = batch["memory", "h"].nan_to_num(0.0)
+    batch["memory", "h"] = states.unsqueeze(2) if isinstance(network, TensorDictSequential) else states
+    return batch
+
+
+@pytest.mark.parametrize("start", [2, 3, 4])
+@pytest.mark.parametrize("kind", ["sequence", "step", "collected step", "TorchRL"])
+def test_nothing_of_the_episode_before_comes_through_a_burn_in(kind, start):
+    """Where an episode begins among the steps of the burn-in or right behind them; where one begins later, it does."""
+    network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind.split()[-1])
+    s = stream(2, 8, seed=1, ends=0.0)
+    s.is_init[:], s.is_init[:, start] = False, True
+    loss, found = make_loss(network, burn_in=3), []
+    for _ in range(2):
+        batch = s.sequences() if kind == "collected step" else with_states(s, network)
+        found.append(loss(batch)["loss"])
+        before = slice(0, min(start, 3))
+        s.pixels[:, before] = 255 - s.pixels[:, before]
+    assert torch.equal(*found) == (start <= 3)
+
+
+@pytest.mark.parametrize("burn_in", [0, 2])
+@pytest.mark.parametrize("kind", ["step", "TorchRL"])
+def test_a_slice_of_an_episode_starts_from_its_stored_state(kind, burn_in):
+    """Samplers set ``is_init`` where they cut."""
+    network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind)
+    s = stream(2, 8, seed=1, ends=0.0)
+    s.is_init[:], s.is_init[:, 0] = False, True
+    loss, batch = make_loss(network, burn_in=burn_in), with_states(s, network)
+    found = loss(batch.clone())["loss"]
+    batch["memory", "h"].zero_()
+    assert not torch.equal(loss(batch)["loss"], found)
+
+
+def test_a_burn_in_of_memories_that_store_in_two_ways_is_refused():
+    towers = toy_network(store="step"), toy_network(state_key=("memory", "other"), out_key="other", store="sequence")
+    with pytest.raises(ValueError, match="burn_in must be 0 with memories that differ in store; got 1"):
+        DQNLoss(TensorDictSequential(*towers), burn_in=1)
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import arcade_torch
-from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_eval_env
+from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_env, make_eval_env
 from arcade_torch.agents.presets import preset
 
 EPISODES = 6
@@ -82,3 +82,13 @@ def test_numbers_about_the_returns(env):
     assert result.mean == pytest.approx(r.mean().item())
     assert result.std == pytest.approx(r.std().item(), abs=1e-6)
     assert result.ci == pytest.approx(1.96 * r.std().item() / EPISODES**0.5, abs=1e-6)
+
+
+def test_an_environment_is_all_that_the_config_says_about_it(monkeypatch):
+    options = {"obs_size": 256, "rules": "reference", "device": "cuda:1"}
+    config = preset("smoke", env="MineSweeperEasy", observability="mixed", env_options={"mine_reward": -1.0}, **options)
+    monkeypatch.setattr(arcade_torch, "make", lambda *names, **asked: (names, asked))
+    names, asked = make_env(config, 4, 7)
+    assert names == ("MineSweeperEasy",) and asked.pop("observability").tolist() == [False, False, True, True]
+    assert asked == {"num_envs": 4, "seed": 7, "mine_reward": -1.0} | options
+    assert make_env(config, 4, 7, "partial")[1]["observability"] == "partial"

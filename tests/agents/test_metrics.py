@@ -43,7 +43,10 @@ def test_beyond_the_history_the_curve_is_constant():
     assert late > 0.99
 
 
-@pytest.mark.parametrize("history", [([], []), ([1, 2], [0.0]), ([2, 1], [0.0, 0.0])])
+@pytest.mark.parametrize(
+    "history",
+    [([], []), ([1, 2], [0.0]), ([2, 1], [0.0, 0.0]), ([1, np.nan, 3], [0.0] * 3), ([1, np.inf], [0.0, 0.0])],
+)
 def test_a_history_that_is_none_is_refused(history):
     with pytest.raises(ValueError):
         paper_score(*history)
@@ -68,7 +71,7 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
         running = running + reward[:, t]
         so_far[:, t] = running
         running = torch.where(done[:, t], 0.0, running)
-    stats, seen = EpisodeStats(np.full(envs, np.nan)), []
+    stats, seen, means = EpisodeStats(np.full(envs, np.nan)), [], []  # means of the windows in which an episode ended
     for part in (slice(0, min(cut, steps)), slice(min(cut, steps), steps)):
         if reward[:, part].shape[1]:
             mean = stats.update(so_far[:, part], done[:, part])
@@ -77,10 +80,13 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
             else:
                 assert mean == pytest.approx(last[:, part].mean(), abs=1e-6)
             seen += stats.finished.tolist()
+            if len(stats.finished):
+                means.append(stats.finished.mean())
         saved, stats = stats.state_dict(), EpisodeStats(np.full(envs, np.nan))
         stats.load_state_dict(saved)
     np.testing.assert_allclose(sorted(seen), sorted(expected), atol=1e-6)
     assert stats.episodes == len(expected)
+    assert stats.smooth == (pytest.approx(ewm(means, span=100)[-1], abs=1e-6) if means else None)
 
 
 def test_an_environment_that_has_not_ended_yet_is_no_success():

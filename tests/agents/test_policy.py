@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import arcade_torch
 from arcade_torch.agents import Agent, build_network, evaluate, load, make_actor, make_policy, preset
 from arcade_torch.agents.runs.checkpoint import save_checkpoint
+from arcade_torch.models import make_network
 from arcade_torch.tools.analysis.windows import resolve_agent
 from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
 
@@ -144,6 +145,36 @@ def test_an_agent_of_a_gpu_is_loaded_and_plays_where_there_is_none(tmp_path, mon
     assert len(evaluate(agent, episodes=2).returns) == 2
     _, env = resolve_agent(agent, num_envs=2)
     assert env.device.type == "cpu"
+
+
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
+def test_a_network_is_of_its_configs_seed_and_size_whatever_was_drawn_before(algorithm):
+    weights = []
+    for seed, draws in ((1, 5), (1, 6), (2, 6)):
+        torch.manual_seed(draws)
+        before = torch.get_rng_state()
+        network = build_network(preset("smoke", algorithm=algorithm, seed=seed, obs_size=256))
+        assert torch.equal(torch.get_rng_state(), before)
+        assert network.compress(torch.zeros(1, 256, 256, 3, dtype=torch.uint8)).shape == (1, 32, 32, 3)
+        weights.append(torch.cat([p.flatten() for p in network.parameters()]))
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+
+
+@pytest.mark.parametrize("memory", ["gru", "feedforward"])
+def test_a_policy_has_as_many_actions_as_its_network_has_outputs(memory):
+    network = make_network("small", memory, num_outputs=3, num_actions=3)
+    roots = {"pixels": torch.zeros(200, 32, 32, 3, dtype=torch.uint8), "is_init": torch.ones(200, 1, dtype=torch.bool)}
+    step = TensorDict(roots | {"last_action": torch.zeros(200, dtype=torch.int64)}, [200])
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert set(make_policy(network, epsilon=1.0)(step.clone())["action"].tolist()) == {0, 1, 2}
+        assert set(make_policy(network, epsilon=1.0, num_actions=2)(step)["action"].tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize("name", ["use_last_action", "zero_action_on_reset", "predicts"])
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
+def test_an_option_that_is_true_or_false_takes_no_text(algorithm, name):
+    with pytest.raises(ValueError, match=rf"^{name} must be True or False, got 'false'$"):
+        build_network(preset("smoke", algorithm=algorithm, network_options={name: "false"}))
 
 
 @pytest.mark.parametrize("name", ["hidden_size", "layers"])

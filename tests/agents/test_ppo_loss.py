@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -119,6 +120,29 @@ def test_without_estimates_the_loss_makes_them_and_leaves_the_batch_alone():
     fresh = loss(batch)
     assert "advantage" not in batch
     torch.testing.assert_close(total(fresh), total(loss(loss.value_estimator(batch))))
+
+
+def test_a_misspelt_time_limit_is_refused_when_estimator_or_loss_is_made():
+    network = toy_actor_critic()
+    for make in (partial(SequenceGAE, network.critic), partial(PPOLoss, make_actor(network.actor), network.critic)):
+        with pytest.raises(ValueError, match=r"^time_limit must be 'bootstrap' or 'terminal'; got 'Terminal'$"):
+            make(time_limit="Terminal")
+
+
+@pytest.mark.parametrize("order", ["keys, estimator", "estimator, keys", "keys"])
+def test_other_names_reach_the_estimator_whenever_they_are_set(order):
+    network, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
+    if order == "keys":
+        loss.make_value_estimator()  # with the numbers of one that is made by itself
+    wanted = loss.value_estimator(batch.clone())["advantage"]
+    renamed = PPOLoss(make_actor(network.actor), network.critic)
+    for what in order.split(", "):
+        if what == "keys":
+            renamed.set_keys(reward="pay", advantage="edge")
+        else:
+            renamed.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    found = renamed.value_estimator(batch.rename_key_(("next", "reward"), ("next", "pay")))
+    assert torch.equal(found["edge"], wanted)
 
 
 def test_a_gradient_reaches_both_towers_and_clipped_ratios_give_none_to_the_actor():

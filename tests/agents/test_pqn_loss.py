@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.modules import LSTMModule, QValueActor
 from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
-from arcade_torch.agents import PQNLoss, q_lambda_return
+from arcade_torch.agents import DQNLoss, PQNLoss, q_lambda_return
 from tests.agents.fakes import GAMMA, LAM, chosen, lambda_return, look_into, play, stream, toy_network
 
 
@@ -42,8 +42,10 @@ def test_targets_equal_those_of_a_step_by_step_play(seed, rows, steps, ends, sea
         q, target, _ = look_into(loss, batch)
         torch.testing.assert_close(q, wanted_q, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(target, wanted, atol=1e-5, rtol=1e-5)
-        error = 0.5 * (chosen(wanted_q, s.action) - wanted).square().mean()
-        torch.testing.assert_close(loss(batch)["loss"].detach(), error, atol=1e-5, rtol=1e-5)
+        taken, out = chosen(wanted_q, s.action), loss(batch)
+        means = {"q_mean": taken, "target_mean": wanted, "td_error": (taken - wanted).abs()}
+        for key, each in ({"loss": 0.5 * (taken - wanted).square()} | means).items():
+            torch.testing.assert_close(out[key].detach(), each.mean(), atol=1e-5, rtol=1e-5)
 
 
 def test_a_seam_cuts_the_return_and_the_window():
@@ -161,6 +163,9 @@ def test_it_is_a_torchrl_loss():
     assert each.shape == (2, 5)
     torch.testing.assert_close(total, each.sum())
     torch.testing.assert_close(each.mean(), out["loss"])
+    weight = torch.rand(2, 5)
+    weighted = make_loss(network)(s.stock().set("priority_weight", weight))["loss"]
+    torch.testing.assert_close(weighted, (weight * each).sum() / weight.sum())
     loss.set_keys(reward="pay")
     torch.testing.assert_close(loss(s.stock().rename_key_(("next", "reward"), ("next", "pay")))["loss"], out["loss"])
 
@@ -207,6 +212,21 @@ def test_target_parameters_give_the_next_values_and_follow_slowly():
     assert not any(value.requires_grad for value in target.values(True, True))
     updater.step()
     torch.testing.assert_close(target["head", "weight"], 0.5 * (before + network.head.weight))
+
+
+@pytest.mark.parametrize("word", [{"time_limit": "terminate"}, {"bootstrap": "lst"}])
+@pytest.mark.parametrize("kind", [PQNLoss, DQNLoss])
+def test_a_misspelt_word_is_refused_when_the_loss_is_made(kind, word):
+    (name, value), *_ = word.items()
+    with pytest.raises(ValueError, match=f"^{name} must be '.*' or '.*'; got '{value}'$"):
+        kind(toy_network(), **word)
+
+
+def test_rewards_that_are_whole_numbers_are_refused():
+    s = stream(3, 6, seed=1)
+    s.reward = s.reward.long()
+    with pytest.raises(ValueError, match="the dtype of rewards must be a floating one"):
+        make_loss(toy_network())(s.stock())
 
 
 def test_training_on_one_window_lowers_its_loss():

@@ -75,7 +75,8 @@ def test_the_oldest_leaves_when_the_capacity_is_reached():
     batches = windows(5)
     replay = filled(batches, capacity=7)  # two windows of three
     assert len(replay) == 6 and (everything(replay) == torch.cat(batches[3:])).all()
-    with pytest.raises(ValueError, match="cannot draw 7 of 6"):
+    assert (everything(filled(batches, capacity=1)) == batches[4]).all()  # the newest window stays whole
+    with pytest.raises(ValueError, match=r"count must be from 1 to the 6 sequences at hand; got 7"):
         replay.sample(7, generator())
     with pytest.raises(ValueError, match="capacity"):
         SequenceReplay(0)
@@ -83,18 +84,19 @@ def test_the_oldest_leaves_when_the_capacity_is_reached():
 
 def test_it_goes_on_from_a_saved_moment(tmp_path):
     batches = windows(6)
-    replay = filled(batches[:3], capacity=9, folder=tmp_path)
+    replay = filled(batches[:4], capacity=9, folder=tmp_path)  # the first has left
     state = json.loads(json.dumps(replay.state_dict()))  # names and numbers only
-    for batch in batches[3:5]:
+    for batch in batches[4:]:
         replay.add(batch)
     again = SequenceReplay(9, tmp_path)
     again.load_state_dict(state)
-    assert (everything(again) == torch.cat(batches[:3])).all()
-    for batch in batches[3:5]:
+    assert (everything(again) == torch.cat(batches[1:4])).all()
+    for batch in batches[4:]:
         again.add(batch)
-    assert again.state_dict() == replay.state_dict()
     mine, theirs = again.sample(5, generator(1)), replay.sample(5, generator(1))
     assert (mine == theirs).all()
+    SequenceReplay(9, tmp_path).load_state_dict(state)  # until the next checkpoint one may have to begin here again
+    assert again.state_dict() == replay.state_dict()
 
 
 def test_files_stay_as_long_as_a_kept_checkpoint_names_them(tmp_path):
@@ -102,7 +104,7 @@ def test_files_stay_as_long_as_a_kept_checkpoint_names_them(tmp_path):
     for batch in windows(6):
         replay.add(batch)
         states.append(replay.state_dict())
-        for state in states[-2:]:  # what the last two checkpoints name can be loaded
+        for state in states[-3:]:  # of the newest, which may not be written yet, and the two before it
             SequenceReplay(ROWS, tmp_path).load_state_dict(state)
         assert len(list(tmp_path.iterdir())) <= 3
 

@@ -157,6 +157,8 @@ def test_bad_arguments_are_named(estimate, numbers, words):
     with pytest.raises(ValueError, match=words):
         estimate(*draw(0), *numbers)
     reward, value, after, *flags = draw(0)
+    with pytest.raises(ValueError, match=r"rewards must be a floating one; got torch.int64"):
+        estimate(reward.long(), value, after, *flags, 0.9, 0.8)
     with pytest.raises(ValueError, match="one shape"):
         estimate(reward, value, after[:, :-1], *flags, 0.9, 0.8)
 

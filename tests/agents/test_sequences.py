@@ -5,6 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from arcade_torch.agents.sequences import NetworkInputs, as_steps, insert_final_observations, unroll
@@ -74,7 +75,10 @@ def form_of(s, form):
     return batch.update({"final_pixels": frames, "final_index": index, "final_mask": mask})
 
 
-@pytest.mark.parametrize("form", ["sequences", "all", "stock"])
+@pytest.mark.parametrize(
+    ("form", "store"),
+    [("sequences", "sequence"), ("sequences", "step"), ("all", "sequence"), ("all", "step"), ("stock", "sequence")],
+)
 @given(
     seed=st.integers(0, 10**6),
     rows=st.integers(1, 4),
@@ -85,10 +89,12 @@ def form_of(s, form):
     terminal=st.booleans(),
 )
 def test_every_next_observation_is_read_by_the_state_that_led_to_it(
-    form, seed, rows, steps, ends, seams, burn_in, terminal
+    form, store, seed, rows, steps, ends, seams, burn_in, terminal
 ):
     s, burn_in = experience(seed, rows, steps, ends, seams), min(burn_in, steps - 1)
-    network = hash_network()
+    if store == "step":
+        s.state["memory", "h"][s.is_init[:, 0]] = 0  # as a reset leaves it
+    network = hash_network(store)
     inputs = NetworkInputs(network)
     time_limit = "terminal" if terminal else "bootstrap"
     data = insert_final_observations(form_of(s, form), inputs, time_limit, burn_in)
@@ -115,20 +121,28 @@ def test_rows_of_the_layout_are_the_layout_of_the_rows(seed, steps, ends):
     assert (data[rows] == insert_final_observations(form_of(s, "sequences")[rows], inputs)).all()
 
 
-def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given():
+@pytest.mark.parametrize("burn_in", [0, 2, 5, 6])
+def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(burn_in):
     """``store="step"``: a sampler may have cut an episode, then the state stored at the cut counts, not zeros."""
     s, network = experience(1, 3, 8, 0.0, 0.0), hash_network("step")
-    s.is_init[1, 5] = True
-    batch = s.stock()
-    states = torch.randint(1000, (3, 8, 1))
+    s.is_init[1, 5] = s.is_init[2, 0] = True
+    batch, states = s.stock(), torch.randint(1000, (3, 8, 1))
     batch["memory", "h"] = states
+    h, wanted = states[:, 0], []
+    for t in range(8):
+        h = torch.where(s.is_init[:, t, None], states[:, t], h)
+        h = (h * 48271 + s.pixels[:, t] + 1) % MODULUS
+        wanted.append(h)
     inputs = NetworkInputs(network)
-    data = insert_final_observations(batch, inputs)
+    data = insert_final_observations(batch, inputs, burn_in=burn_in)
     out = unroll(network, inputs, data, "out").gather(1, data["position"].unsqueeze(-1))
-    h = states[1, 5]
-    assert out[1, 5] == (h * 48271 + s.pixels[1, 5] + 1) % MODULUS
-    h = states[0, 0]
-    assert out[0, 0] == (h * 48271 + s.pixels[0, 0] + 1) % MODULUS
+    assert torch.equal(out, torch.stack(wanted, 1)[:, burn_in:])
+
+
+def test_only_memories_that_all_store_one_state_a_sequence_read_the_first_alone():
+    for stores in (["sequence"] * 2, ["sequence", "step"], ["step", "sequence"], ["step"] * 2):
+        pair = [MemoryModule(RunningHash(), "pixels", f"out{i}", f"m{i}", store=s) for i, s in enumerate(stores)]
+        assert NetworkInputs(TensorDictSequential(*pair)).reads_first_state_only == ("step" not in stores)
 
 
 def test_sequences_become_steps_that_begin_with_their_state():

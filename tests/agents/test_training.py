@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -27,6 +28,7 @@ from arcade_torch.agents import (
     train,
     training,
 )
+from arcade_torch.agents.metrics import paper_score
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS
@@ -98,6 +100,8 @@ def test_a_run_leaves_its_files(whole):
     final = json.loads((folder / "eval.json").read_text())
     assert final["status"] == "finished" and len(final["returns"]) == len(final["lengths"]) == 4
     assert result.evaluation.mean == pytest.approx(sum(final["returns"]) / 4)
+    points = [(int(r["frames"]), float(r["train_return_last"])) for r in rows if r["train_return_last"]]
+    assert result.train_max_ewm == pytest.approx(paper_score(*zip(*points, strict=True)))
     progress = json.loads((folder / "progress.json").read_text())
     assert (progress["frames"], progress["total_frames"], progress["status"]) == (640, 640, "finished")
     assert len(list_checkpoints(folder / "checkpoints")) == 2
@@ -164,6 +168,9 @@ def test_a_signal_ends_the_run_at_an_update_and_it_goes_on_to_the_bit(whole, tmp
     assert signal.getsignal(number) is handler
     assert train(CONFIG, tmp_path / "run", resume=True).status == "finished"
     assert_same_run(tmp_path / "run", whole[0])
+    rows = read_csv(tmp_path / "run" / "metrics.csv")
+    clock = np.cumsum([64 / float(row["fps"]) for row in rows])  # goes on where it stood
+    np.testing.assert_allclose([float(row["seconds"]) for row in rows], clock, rtol=1e-5)
 
 
 def test_a_run_with_overlap_goes_on_to_the_bit(tmp_path):
@@ -300,6 +307,15 @@ def test_a_killed_run_goes_on_to_the_bit(whole, tmp_path, seed):
 def test_a_run_killed_at_many_moments_goes_on_to_the_bit(whole, tmp_path, seed):
     kill_and_resume(tmp_path / "run", random.Random(seed))
     assert_same_run(tmp_path / "run", whole[0])
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_run_has_threads_and_draws_of_its_own_and_gives_back_those_it_found(threads):
+    before, draws = torch.get_num_threads(), torch.get_rng_state()
+    with training.own_settings(dataclasses.replace(CONFIG, seed=3, threads=threads)):
+        assert torch.get_num_threads() == (threads or before) and torch.initial_seed() == 3
+        torch.rand(1)
+    assert torch.get_num_threads() == before and torch.equal(torch.get_rng_state(), draws)
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(whole, tmp_path):

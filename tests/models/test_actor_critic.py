@@ -127,7 +127,7 @@ def test_wrong_names_get_one_clear_line():
         make_actor_critic("smal")
     with pytest.raises(TypeError, match=r"width.*allowed are encoder"):
         make_actor_critic("small", "gru", width=3)
-    with pytest.raises(ValueError, match=r"towers must be 2 .* got 3"):
+    with pytest.raises(ValueError, match=r"towers must be one of 1, 2, got 3"):
         make_actor_critic("small", "gru", towers=3)
     with pytest.raises(ValueError, match="actor_critic"):
         make_head("none", 4, 5)

@@ -21,7 +21,8 @@ class LeakyAverage(nn.Module):
         self.flaw = flaw
 
     def initial_state(self, batch_size):
-        return TensorDict({"h": self.linear.weight.new_zeros(batch_size, 4)}, batch_size=[batch_size])
+        state = {"h": self.linear.weight.new_zeros(batch_size, 4)}
+        return state if self.flaw == "dictionary" else TensorDict(state, batch_size=[batch_size])
 
     def forward(self, x, state, is_init):
         flaw, h = self.flaw, state["h"]
@@ -44,6 +45,8 @@ class LeakyAverage(nn.Module):
             if flaw == "only at index 0" and t:
                 begins = torch.zeros_like(begins)
             h = h * (1 - begins.to(h.dtype)) if flaw == "multiplies" else torch.where(begins, 0, h)
+            if flaw == "carries a gradient":
+                h = torch.where(begins, state["h"] - state["h"].detach(), h)
             if flaw == "leaks":
                 h = h + 1e-3 * state["h"]
             previous = h
@@ -58,6 +61,10 @@ class LeakyAverage(nn.Module):
             return y, TensorDict({"h": previous}, batch_size=[len(x)])
         if flaw == "float32":
             y = y.float()
+        if flaw == "no state":
+            return y
+        if flaw == "wider":
+            self.hidden_size = 3
         return (y.transpose(0, 1) if flaw == "time first" else y), TensorDict({"h": h}, batch_size=[len(x)])
 
 
@@ -73,6 +80,9 @@ def test_a_third_partys_lawful_module_passes():
         ("grows", "shapes are fixed", "grows"),
         ("time first", "shapes are fixed", "exchanged"),
         ("float32", "shapes are fixed", "float32"),
+        ("wider", "shapes are fixed", "hidden_size is not the width of y"),
+        ("no state", "shapes are fixed", "initial_state and forward gave TensorDict, Tensor.* return .y, state."),
+        ("dictionary", "shapes are fixed", "gave dict, Tensor, TensorDict. Likely cause: a state is no TensorDict"),
         ("ignores state", "scan equals step by step", "differ"),
         ("looks ahead", "scan equals step by step", "future"),
         ("late flag", "scan equals step by step", "late"),
@@ -80,6 +90,7 @@ def test_a_third_partys_lawful_module_passes():
         ("returns the state before", "scan equals step by step", "without resets"),
         ("leaks", "scan equals step by step", "differ"),
         ("multiplies", "nothing leaks over a start", "torch.where"),
+        ("carries a gradient", "nothing leaks over a start", "gradients flow backward"),
         ("batch statistics", "batch rows are independent", "statistics"),
         ("any row", "batch rows are independent", "flag of one row"),
         ("detach", "gradients are right", "detach"),
@@ -90,6 +101,11 @@ def test_a_flaw_is_named_with_the_law_it_breaks(flaw, law, word):
         check_memory(LeakyAverage(flaw))
     assert caught.value.law == law
     assert law in str(caught.value) and "Likely cause" in str(caught.value)
+
+
+def test_a_module_without_a_first_state_is_no_memory():
+    with pytest.raises(TypeError, match=r"LSTM has no initial_state\(batch_size\)"):
+        check_memory(nn.LSTM(3, 4))
 
 
 def test_the_size_of_the_discrepancy_is_reported():
@@ -189,9 +205,18 @@ class ForgetfulReplay(MinGRU):
         return y, TensorDict({"h": h}, batch_size=x.shape[:2])
 
 
-def test_a_wrong_replay_is_caught():
+class StaleReplay(MinGRU):
+    """Returns the states before each step."""
+
+    def replay(self, x, stored, is_init):
+        y, states = super().replay(x, stored, is_init)
+        return y, states.apply(lambda h: h.roll(1, 1))
+
+
+@pytest.mark.parametrize("model", [ForgetfulReplay, StaleReplay])
+def test_a_wrong_replay_is_caught(model):
     with pytest.raises(MemoryLawError, match="stored") as caught:
-        check_memory(ForgetfulReplay(3, 4))
+        check_memory(model(3, 4))
     assert caught.value.law == "replay loads stored states"
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from arcade_torch.models import linear_scan, make_memory, memory_names, register_memory
+from arcade_torch.models import linear_scan, make_memory, memory_names, register_memory, registry
 from arcade_torch.models.checks import check_memory
 from arcade_torch.models.memory import Memory, MemoryContract, ReplayableMemory
 
@@ -262,10 +262,13 @@ def test_lru_is_the_papers_equation_in_complex_numbers():
 
 
 def test_lru_starts_inside_the_ring_and_normalised():
-    memory = make_memory("lru", 8, 1000, r_min=0.5, r_max=0.9)
-    radius = torch.exp(-memory.nu.exp())
+    memory = make_memory("lru", 8, 1000, r_min=0.5, r_max=0.9, max_phase=0.3)
+    radius, phase = torch.exp(-memory.nu.exp()), memory.theta.exp()
     assert 0.5 <= radius.min() < 0.52 and 0.88 < radius.max() <= 0.9
+    assert 0 < phase.min() < 0.01 and 0.29 < phase.max() <= 0.3
     torch.testing.assert_close(memory.gamma.exp(), torch.sqrt(1 - radius**2))
+    size = memory.input.detach().square().sum((1, 2)).mean()  # with gamma: white noise has states of size 1
+    assert float(size) == pytest.approx(1, abs=0.05)
     assert all(torch.isfinite(p).all() for p in make_memory("lru", 8, 1000).parameters())
 
 
@@ -274,7 +277,9 @@ def test_an_unknown_name_is_answered_with_the_nearest_and_the_list():
         make_memory("minigru", 3, 4)
 
 
-def test_names_are_registered_once_and_must_be_identifiers():
+def test_names_are_registered_once_and_must_be_identifiers(monkeypatch):
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+
     def factory(input_size, hidden_size, width=1):
         return make_memory("gru", input_size, hidden_size * width)
 
@@ -284,10 +289,15 @@ def test_names_are_registered_once_and_must_be_identifiers():
     with pytest.raises(ValueError, match="already"):
         register_memory("tests_wide_gru", factory)
     register_memory("tests_wide_gru", factory, overwrite=True)
+    with pytest.raises(ValueError, match="already"):
+        register_memory("fart", factory)
+    register_memory("fart", factory, overwrite=True)  # the paper's name of another
+    assert make_memory("fart", 3, 4, width=2).hidden_size == 8
     with pytest.raises(ValueError, match="identifier"):
         register_memory("Wide GRU", factory)
-    with pytest.raises(TypeError, match="callable"):
-        register_memory("tests_number", 3)
+    for number in (3, make_memory("gru", 3, 4)):  # a number, a memory in the place of its class
+        with pytest.raises(TypeError, match="a class or function"):
+            register_memory("tests_number", number)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -52,14 +52,15 @@ class Countdown(EnvBase):
 
 
 class OnlyTwoMethods(nn.Module):
-    """A third party's memory: no base class, no replay; episodes may begin with another constant than zero."""
+    """A third party's memory: no base class, no replay; episodes may begin with another constant, or one that learns."""
 
     def __init__(self, start=0.0):
         super().__init__()
-        self.cell, self.start = nn.GRUCell(8, 8), start
+        self.cell, self.start = nn.GRUCell(8, 8), nn.Parameter(torch.zeros(8)) if start is None else start
 
     def initial_state(self, batch_size):
-        return TensorDict({"deep": {"h": torch.full((batch_size, 8), self.start)}}, batch_size=[batch_size])
+        start = torch.as_tensor(self.start).expand(batch_size, 8).clone()
+        return TensorDict({"deep": {"h": start}}, batch_size=[batch_size])
 
     def forward(self, x, state, is_init):
         h, outputs = state["deep", "h"], []
@@ -247,13 +248,16 @@ def test_wrong_flags_and_missing_time_get_one_clear_line():
         MemoryModule(make_memory("gru", 3, 4), store="sequence").begin_with(TensorDict({}, [2, 5]), TensorDict({}, [2]))
 
 
-def test_a_memory_that_does_not_begin_with_zeros_learns_from_what_it_acted():
-    policy = make_policy(OnlyTwoMethods(start=1.0))
+@pytest.mark.parametrize("start", [1.0, None])
+def test_a_memory_that_does_not_begin_with_zeros_or_learns_its_start_learns_from_what_it_acted(start):
+    policy = make_policy(OnlyTwoMethods(start))
+    if start is None:  # it begins with zeros, and moves
+        nn.init.constant_(policy[1].memory.start, 0.5)
     data = make_env(policy).rollout(20, policy, break_when_any_done=False)
     assert policy[1].store == "sequence" and data["is_init"][:, 1:].any()
     torch.testing.assert_close(replayed(policy, data)["action_value"], data["action_value"], rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="zeros"):
-        MemoryModule(OnlyTwoMethods(start=1.0), store="step")
+        MemoryModule(OnlyTwoMethods(start), store="step")
 
 
 @pytest.mark.parametrize("name", MEMORIES)

@@ -249,6 +249,9 @@ def test_a_network_runs_under_one_compiled_graph(memory):
         ({"memory": "lur"}, "mean 'lru'"),
         ({"head": "big"}, "one of reference, paper, .*linear.*got 'big'"),
         ({"skip": "dense"}, "residual"),
+        ({"memory": "feedforward", "head": "big"}, "one of reference, paper, .*linear.*got 'big'"),
+        ({"memory": "feedforward", "skip": "dense"}, "residual"),
+        ({"memory": "feedforward", "actor_critic_head": "big"}, "actor_critic_head must be one of .*got 'big'"),
         ({"layers": 0}, "at least 1"),
         ({"obs_size": 100}, "128 and 256"),
     ],
@@ -261,6 +264,11 @@ def test_wrong_options_get_one_clear_line(options, message):
 def test_an_unknown_option_is_refused_by_name():
     with pytest.raises(TypeError, match=r"width.*allowed are encoder, hidden_size"):
         make_network("small", "gru", width=3)
+
+
+def test_options_of_cells_are_refused_where_there_is_no_memory():
+    with pytest.raises(TypeError, match=r"'feedforward' has no memory, .* got \{'foo': 1\}$"):
+        make_network("small", "feedforward", memory_options={"foo": 1})
 
 
 @pytest.mark.parametrize("name", ["hidden_size", "layers", "feedforward_size"])

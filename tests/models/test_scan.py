@@ -235,5 +235,8 @@ def test_a_back_end_can_be_chosen_for_a_while_and_a_wrong_one_is_refused():
         torch.testing.assert_close(found, expected)
         for ours, theirs in zip(torch.autograd.grad(found.sum(), (a, b, h0)), grads, strict=True):
             torch.testing.assert_close(ours, theirs)
+        with back_end("serial"):
+            pass
+        assert scan_ops._back_end_of(b) == "doubling"
         raise KeyError
     assert scan_ops._back_end_of(b) == "serial"

@@ -124,6 +124,19 @@ def test_nothing_crosses_a_start_not_even_rounding(kind):
     assert (grads[-1] == 0).all() and all((grad[:, :21] == 0).all() for grad in grads[:-1])
 
 
+@pytest.mark.parametrize("where", ["key", "value", "erase", "log_decay"])
+def test_a_nan_in_what_a_step_does_loses_the_rest_of_its_episode_and_nothing_else(where):
+    steps, start, h0 = problem("gated delta", length=12, resets=0.0)
+    start[:, 7] = True
+    clean, clean_last = matrix_scan(steps, start, h0, chunk=5)
+    given = getattr(steps, where).clone()
+    given[0, 3] = torch.nan
+    o, last = matrix_scan(steps._replace(**{where: given}), start, h0, chunk=5)
+    assert o[0, 3:7].isnan().all() and o.isnan().any(-1).sum() == 4
+    kept = ~o.isnan()
+    assert torch.equal(o[kept], clean[kept]) and torch.equal(last, clean_last)
+
+
 def test_a_nan_in_the_state_does_not_come_through_a_start():
     steps, start, h0 = problem("gated delta", length=9)
     start[:, 0] = True
