@@ -52,7 +52,7 @@ class Countdown(EnvBase):
 
 
 class OnlyTwoMethods(nn.Module):
-    """A third party's memory: no base class, no replay; episodes may begin with another constant, or one that learns."""
+    """A third party's memory: no base class, no replay; episodes begin with a constant, or with a learned start."""
 
     def __init__(self, start=0.0):
         super().__init__()
