@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import TDLambdaEstimator, ValueEstimatorBase
 
-from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit, coerce, require
+from arcade_torch.agents.config import Bootstrap, CountOrZero, PQNConfig, TimeLimit, coerce, require
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.sequences import (
     Key,
@@ -181,7 +181,7 @@ class PQNLoss(LossModule):
         require(not burn_in or len(self.inputs.stores) < 2, "burn_in", burn_in, "0 with memories that differ in store")
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.bootstrap = coerce("bootstrap", bootstrap, Bootstrap)
-        self.delay_value, self.burn_in, self.reduction = delay_value, burn_in, reduction
+        self.delay_value, self.burn_in, self.reduction = delay_value, coerce("burn_in", burn_in, CountOrZero), reduction
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:

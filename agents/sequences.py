@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.agents.config import TimeLimit
+from arcade_torch.agents.config import TimeLimit, require
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 
@@ -72,8 +72,8 @@ def insert_final_observations(
     terminated, truncated = _flat(batch, ("next", "terminated")), _flat(batch, ("next", "truncated"))
     done = terminated | truncated
     seam = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
-    if time_limit == "terminal":
-        terminated = done
+    require(burn_in < is_init.shape[1], "burn_in", burn_in, f"less than the {is_init.shape[1]} steps of the batch")
+    terminated = done if time_limit == "terminal" else terminated
     needed = (done | seam) & ~terminated
     index, mask, places = _final_places(batch, needed)
 

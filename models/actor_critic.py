@@ -131,8 +131,7 @@ def make_actor_critic(
         num_actions: A.
         memory_options: options of the cells, over those of the preset.
         store: see :func:`make_network`.
-        **options: see :func:`make_network`. ``use_last_action=False`` is the published network, which differs from
-            the published table in this.
+        **options: see :func:`make_network`; ``use_last_action=False`` is the published code, unlike its table.
 
     Returns:
         The module; states stand under ``("memory", "actor")`` and ``("memory", "critic")``, or ``("memory", "both")``.
@@ -150,8 +149,9 @@ def make_actor_critic(
         [(2, 7, 5), (2, 7)]
     """
     chosen = preset_of(preset)
+    options.setdefault("head", options.pop("actor_critic_head", chosen.actor_critic_head))
     make: Any = partial(make_network, preset, memory, obs_size=obs_size, num_actions=num_actions, store=store)
-    make = partial(make, memory_options=memory_options, **{"head": chosen.actor_critic_head} | options)
+    make = partial(make, memory_options=memory_options, **options)
     if options.get("towers", chosen.towers) == 1:
         both = make(num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both"))
         return ActorCriticNetwork(both)

@@ -116,6 +116,11 @@ def test_an_output_is_read_by_name():
         network.select(out, "q")
 
 
+def test_its_head_goes_by_both_names():
+    one, other = make_actor_critic("paper", "gru", head="linear"), make_actor_critic(actor_critic_head="linear")
+    assert type(one.actor.head) is type(other.actor.head) is nn.Linear
+
+
 def test_calibration_reaches_both_towers():
     network = make_actor_critic("small", "mlp", towers=2)
     network.calibrate(inputs(4, 3, 128)[0])
