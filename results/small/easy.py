@@ -13,14 +13,15 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from scipy.stats import ttest_ind
 
-from arcade_torch.tools.analysis.gap_bias import game_of
+from arcade_torch.tools.analysis.gap_bias import game_of, gap_and_bias, normalise
+from arcade_torch.tools.runs import Score
 
 HERE = Path(__file__).parent
 PAPER = HERE.parents[1] / "tools" / "data" / "paper_returns.csv"
 TABLE = HERE / "easy.csv"
 TWINS = {"full": "MDP", "partial": "POMDP"}
 MEMORIES = {"lru": "LRU", "mlp": "none"}
-PUBLISHED = ("AutoEncodeEasy", "NavigatorEasy")  # the games that count under the published rules
+RETURNS = ("eval_mean", "train_max_ewm")
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -71,14 +72,46 @@ def table(rows: list[dict[str, str]]) -> None:
     for (game, twin, rules, memory), runs in cells.items():
         models = paper()[game, twin]
         best = max(models, key=lambda model: models[model])
-        means = [sum(float(run[key]) for run in runs) / len(runs) for key in ("eval_mean", "train_max_ewm")]
+        means = [sum(float(run[key]) for run in runs) / len(runs) for key in RETURNS]
         enough = [round(mean, 2) >= models[best][0] for mean in means]
         reached = {(True, True): "yes", (True, False): "greedy only", (False, True): "training only"}
         columns = [game.removesuffix("Easy"), twin, rules, MEMORIES[memory], ", ".join(run["seed"] for run in runs)]
-        columns += [" ".join(number(float(run[key])) for run in runs) for key in ("eval_mean", "train_max_ewm")]
+        columns += [" ".join(number(float(run[key])) for run in runs) for key in RETURNS]
         columns.append(f"{number(models[best][0], 2)} ± {number(models[best][1], 2)} ({best})")
         columns.append(" / ".join(number(models[name][0], 2) if name in models else "-" for name in ("LRU", "MLP")))
         print("| " + " | ".join([*columns, reached.get((enough[0], enough[1]), "no")]) + " |")
+
+
+def difference(one: list[dict[str, str]], other: list[dict[str, str]], key: str) -> list[str]:
+    """The means of two cells, and their difference with Welch's 95 % interval where both have several seeds."""
+    values = [[float(run[key]) for run in runs] for runs in (one, other)]
+    means = [sum(cell) / len(cell) for cell in values]
+    found = number(means[0] - means[1])
+    if min(map(len, values)) > 1:
+        interval = ttest_ind(*values, equal_var=False).confidence_interval()
+        found += f" [{number(interval.low, 2)}, {number(interval.high, 2)}]"
+    return [", ".join(map(number, means)), found]
+
+
+def gaps(rows: list[dict[str, str]]) -> None:
+    """Print the observability gap of LRU, MDP minus POMDP, game by game and over all games."""
+    print("\n| game | seeds | greedy: MDP, POMDP | gap | training: MDP, POMDP | gap | paper: LRU's gap |")
+    print("|" + "---|" * 7)
+    rows, published = [row for row in rows if row["memory"] == "lru"], 0.0
+    for game in sorted({row["game"] for row in rows}):
+        twins = [[row for row in rows if (row["game"], row["twin"]) == (game, twin)] for twin in TWINS.values()]
+        columns = [game.removesuffix("Easy"), " and ".join(str(len(runs)) for runs in twins)]
+        columns += [column for key in RETURNS for column in difference(*twins, key)]
+        theirs = [paper()[game, twin]["LRU"][0] for twin in TWINS.values()]
+        print("| " + " | ".join([*columns, number(theirs[0] - theirs[1], 2)]) + " |")
+        published += normalise(game, theirs[0]) - normalise(game, theirs[1])
+    ends, back = ["all ten, in [0, 1]", ""], {twin: name for name, twin in TWINS.items()}
+    for key in RETURNS:
+        scores = [Score("lru", row["game"], back[row["twin"]], int(row["seed"]), float(row[key])) for row in rows]
+        suite = gap_and_bias(scores, baseline="lru").row("lru")
+        gap = f"{number(suite.gap.value)} [{number(suite.gap.low)}, {number(suite.gap.high)}]"
+        ends += [f"{number(suite.mdp.value)}, {number(suite.pomdp.value)}", gap]
+    print("| " + " | ".join([*ends, number(published / 10, 2)]) + " |")
 
 
 def compare(rows: list[dict[str, str]]) -> None:
@@ -90,13 +123,7 @@ def compare(rows: list[dict[str, str]]) -> None:
         if not all(runs.values()):
             continue
         columns = [game.removesuffix("Easy"), " and ".join(str(len(runs[m])) for m in MEMORIES)]
-        for key in ("eval_mean", "train_max_ewm"):
-            one, other = ([float(run[key]) for run in runs[m]] for m in MEMORIES)
-            means = sum(one) / len(one), sum(other) / len(other)
-            columns += [", ".join(map(number, means)), number(means[0] - means[1])]
-            if min(len(one), len(other)) > 1:
-                interval = ttest_ind(one, other, equal_var=False).confidence_interval()
-                columns[-1] += f" [{number(interval.low, 2)}, {number(interval.high, 2)}]"
+        columns += [column for key in RETURNS for column in difference(runs["lru"], runs["mlp"], key)]
         models = paper()[game, "POMDP"]
         columns.append(", ".join(number(models[name][0], 2) if name in models else "-" for name in ("LRU", "MLP")))
         print("| " + " | ".join(columns) + " |")
@@ -141,6 +168,7 @@ def main() -> None:
         writer.writerows(rows)
     table(rows)
     compare(rows)
+    gaps(rows)
     draw(rows)
 
 
