@@ -6,11 +6,12 @@ import io
 import json
 import os
 import sys
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
 
 from arcade_torch.agents.runs.files import read_csv as read_csv
 from arcade_torch.agents.runs.files import write_atomic
@@ -121,8 +122,6 @@ def measured_rows(
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
     """Write arrays atomically and compressed."""
-    import numpy as np
-
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     return write_atomic(path, buffer.getvalue())
@@ -136,8 +135,6 @@ def cached_arrays(
     ``options`` are JSON values and everything that decides the numbers, the checkpoint included; they stand as JSON in
     ``options`` of the arrays. What is no run folder (a single checkpoint), or cannot be written, keeps nothing.
     """
-    import numpy as np
-
     text = json.dumps(dict(options), sort_keys=True)
     file = run / "analysis" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.npz"
     try:
@@ -145,7 +142,7 @@ def cached_arrays(
             arrays = {key: kept[key] for key in kept.files}
         if str(arrays["options"]) == text:
             return arrays
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except Exception:
         pass  # there is none, or it is damaged: it is made anew
     arrays = {**compute(), "options": np.array(text)}
     if (run / "config.json").is_file() and os.access(run, os.W_OK):

@@ -165,7 +165,6 @@ class Run:
 
     def value(self, metric: str) -> float:
         """The score of the run."""
-        require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
         value = (self.final or {}).get("mean" if metric == "eval_final" else metric)
         if value is None:
             raise ValueError(f"{self.path} has no {metric}: choose another metric")
@@ -269,6 +268,11 @@ def check_comparable(found: Runs) -> None:
         values = sorted({str(run.config[key]) for run in found.runs if key in run.config})
         if len(values) > 1:
             raise ValueError(f"runs with {key} {' and '.join(values)} cannot be compared: give runs with one of them")
+    played: dict[str, Any] = {}
+    for run in found.runs:
+        own = run.config.get("env_options") or {}
+        if (first := played.setdefault(run.game, own)) != own:
+            raise ValueError(f"{run.game} was played with env_options {first} and {own}: give runs with one of them")
     for (agent, game, twin), runs in found.groups().items():
         for one, run in pairwise(runs):  # by seed
             if one.seed == run.seed:

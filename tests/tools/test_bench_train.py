@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from arcade_torch.agents import training
+from arcade_torch.agents.learner import Learner
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import train as bench
 
@@ -17,15 +18,19 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
     monkeypatch.setattr(
         bench, "preset", lambda name, **changes: bench.dataclasses.replace(smoke, **{**changes, "network": "small"})
     )
-    file = tmp_path / "speed.csv"
+    file, step, steps = tmp_path / "speed.csv", Learner.gradient_step, list[float]()
+    monkeypatch.setattr(
+        Learner, "gradient_step", lambda self, rows, frames: (steps.append(frames), step(self, rows, frames))
+    )
     monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")
-    words = ["--networks", "small", "--memories", "gru", "--env", "SignpostEasy", "--grad-steps", "2", "--repeats", "1"]
+    words = ["--networks", "small", "--memories", "gru", "--env", "SignpostEasy", "--grad-steps", "6", "--repeats", "1"]
     words += ["--forms", "amp", "compiled+amp"]
     assert cli.main(["bench", "train", *words, "--out", str(file)]) == cli.EXIT_OK
     with file.open(newline="") as stream:
         row, compiled = csv.DictReader(stream)
     assert (row["form"], compiled["form"]) == ("amp", "compiled+amp")
     assert float(compiled["train_fps"]) > 0
+    assert len(steps) == 2 * 4 * 6  # a warm-up, the timed pass and two of the profiler; an epoch has four steps
     assert (row["memory"], row["num_envs"], row["grad_steps"], row["device"]) == ("gru", "8", "8", "cpu")
     shares = [float(value) for key, value in row.items() if key.startswith("learning: ")]
     assert len(shares) >= 6 and sum(shares) == pytest.approx(1, abs=1e-2)
@@ -42,6 +47,10 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
         (["--out", "x.txt"], "must be a file that ends in .csv or .json"),
         (["--grad-steps", "0"], "--grad-steps must be at least 1, got 0"),
         (["--networks", "tiny"], "unknown preset 'tiny'"),
+        (
+            ["--networks", "small", "--grad-steps", "33"],
+            "--grad-steps must be at most 32 with the small network; got 33",
+        ),
         (["--threads", "-1"], "--threads must be at least 0"),
         (["--forms", "amp+fast"], "a form must be eager, amp, compiled, graphs, or several of them joined by '+'; got"),
         (["--forms", "graphs"], "cuda_graphs must be false on device 'cpu'; it needs a CUDA device"),

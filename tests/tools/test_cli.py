@@ -71,6 +71,12 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
         (["analyze", "gap-bias", "README.md", "--confidence", "2"], "between 0 and 1"),
         (["bench", "envs", "--out", "x.txt"], "--out must be a file that ends in .csv or .json; got 'x.txt'"),
         (["bench", "envs", "--batches", "0"], "--batches must be at least 1"),
+        (["bench", "envs", "--repeats", "0"], "--repeats must be at least 1"),
+        (["bench", "memory", "--repeats", "0"], "--repeats must be at least 1"),
+        (["bench", "recall", "--seed", "-1"], "--seed must be at least 0"),
+        (["bench", "recall", "--out", "x.json"], "--out must be a file that ends in .csv; got 'x.json'"),
+        (["analyze", "recall-density", ".", "--seed", "-1"], "--seed must be at least 0"),
+        (["analyze", "contamination", ".", "--seed", "-1"], "--seed must be at least 0"),
         (["demo", "--seeds", "0"], "give the number of seeds (1 to 10000)"),
     ],
 )

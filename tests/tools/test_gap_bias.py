@@ -14,7 +14,6 @@ from arcade_torch.tools.analysis.bootstrap import (
     measured_coverage,
     percentile_interval,
     resampled,
-    seed_coverage,
 )
 from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
 from arcade_torch.tools.figures import ScoreOptions
@@ -140,7 +139,7 @@ def test_confidence_decides_intervals_differences_and_their_measured_coverage() 
     of = [(table.row("lru").gap, table.difference("gap", "lru", "mlp")) for table in (wide, narrow)]
     assert all(a.low < b.low and b.high < a.high for a, b in zip(*of, strict=True))
     assert narrow.row("lru").coverage == measured_coverage((4,), (4,), 0.5) < wide.row("lru").coverage - 0.2
-    assert seed_coverage(5, 0.5) < seed_coverage(5) - 0.2
+    assert measured_coverage((5,), (), 0.5) < measured_coverage((5,), ()) - 0.2
 
 
 def test_the_least_coverage_stands_under_figure_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

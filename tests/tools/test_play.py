@@ -95,6 +95,8 @@ def test_restart_begins_the_same_episode_and_counts_the_attempt() -> None:
     assert (player.frame == first).all() and (player.seed, player.steps, player.total) == (5, 0, 0.0)
     press(player, "r")  # nothing was played: nothing to report
     to_the_end(player)
+    press(player, "r")  # an episode that has ended counts
+    assert player.end == "truncated" and not player.closed
     assert [(a.attempt, a.end, a.actions[:2]) for a in found] == [(1, "abandoned", "31"), (3, "truncated", "00")]
 
 

@@ -126,6 +126,8 @@ def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles:
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no part 'strips' to skip; parts: saliency, recall"):
         report(tmp_path / "s", skip=("strips",))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="metric must be one of eval_final, train_max_ewm; got 'return'"):
+        report(tmp_path / "s", metric="return")
 
 
 def test_nothing_finished_is_an_error(tmp_path: Path) -> None:

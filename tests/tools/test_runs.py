@@ -59,6 +59,13 @@ def test_seeds_trained_with_other_settings_are_refused_by_name(tmp_path: Path) -
         find_runs([tmp_path])
 
 
+def test_two_versions_of_a_game_by_its_options_are_refused_also_between_agents(tmp_path: Path) -> None:
+    write(tmp_path / "0", "lru", "full", 0, 0.5, env_options={"mine_reward": -1})
+    write(tmp_path / "1", "mlp", "full", 0, 0.5)
+    with pytest.raises(ValueError, match=r"CartPoleEasy-v0 was played with env_options \{'mine_reward': -1\} and \{\}"):
+        find_runs([tmp_path])
+
+
 def test_names_say_no_more_than_is_needed_to_tell_agents_apart() -> None:
     plain, ppo = AgentKey("pqn", "lru"), AgentKey("ppo", "lru")
     big, skip = AgentKey("pqn", "lru", size="2x128"), AgentKey("pqn", "lru", options=(("skip", "none"),))
@@ -77,6 +84,8 @@ def test_two_players_share_one_file_of_human_scores(tmp_path: Path) -> None:
     assert [score.value for score in read_scores(tmp_path / "human.csv")] == [0.5, 0.5, 0.7, 0.7]
     table = gap_and_bias(tmp_path / "human.csv", baseline="human", draws=10)
     assert table.row("human").seeds == 2 and table.row("human").mdp.value == pytest.approx(0.6)
+    words = ["figure", "returns", str(tmp_path / "human.csv"), "--baseline", "human", "--out", str(tmp_path / "f")]
+    assert cli.main(words) == 0 and (tmp_path / "f" / "returns.png").exists()  # nobody has a bias
 
 
 def test_episodes_that_people_played_on_both_twins_are_left_out_and_counted(

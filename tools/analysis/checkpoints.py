@@ -63,9 +63,6 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     return found, notes
 
 
-MODEL = ("agent", "env")  # arguments of a measure that are no options
-
-
 def measure_run(
     path: Path, measure: Callable[..., Found], options: Mapping[str, Any], progress: Progress | None = None
 ) -> tuple[Label, Found]:
@@ -78,7 +75,7 @@ def measure_run(
     config, key = agent.config, AgentKey.of(agent.config.to_dict())
     twin = options.get("observability") or config.observability
     label = Label(key, config.env, twin, config.seed, path, key.memory)
-    known = {name: given.get(name, item.default) for name, item in how.parameters.items() if name not in MODEL}
+    known = {name: given.get(name, one.default) for name, one in how.parameters.items() if name not in ("agent", "env")}
     weights = hashlib.sha256()
     for name, value in sorted(agent.network.state_dict().items()):
         weights.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())

@@ -71,7 +71,6 @@ def contamination(
     clip: bool = False,
     feedback: bool = False,
     shuffle: bool = False,
-    identity: bool = False,
     seed: int = 0,
     observability: Twin | None = None,
     cap: int = MAX_STEPS,
@@ -90,7 +89,6 @@ def contamination(
         shuffle: permute frames 2 to 10 in place of adding noise, once a trajectory; actions and start flags stay in
             their order, delays count from frame 10, ``sigmas`` becomes one NaN. On a POMDP another order may rightly
             change what the agent believes: draw conclusions on MDPs only.
-        identity: permute none of them, which must change nothing.
         seed: of episodes, start points and noise.
         progress: called with (start points done, starts).
 
@@ -118,7 +116,7 @@ def contamination(
                 continue
             clean = policy.features(w.frames)
             if shuffle:
-                order = np.arange(w.n + 1) if identity else shuffle_order(w.n + 1, FIRST, LAST, rng)
+                order = shuffle_order(w.n + 1, FIRST, LAST, rng)
                 versions, places, changed = clean[torch.as_tensor(order)][None], np.array([LAST]), FIRST
             else:
                 places = np.sort(rng.choice(w.n, min(per_window, starts - len(points), w.n), replace=False))

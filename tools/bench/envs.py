@@ -48,26 +48,20 @@ class Options(BenchOptions):
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
-    at_least(options, batches=1)
+    at_least(options, batches=1, repeats=1)
     for game, size in product(games, options.sizes):
         make(game, obs_size=size)  # refuse what does not exist before anything is measured
     for game, size, count in product(games, options.sizes, options.batches):
         log(f"{game}, {size} px, {count} envs")
-        for row in measure_game(game, size, count, options.seconds, options.repeats):
-            yield "envs", row
-
-
-def measure_game(game: str, size: int, count: int, seconds: float, repeats: int) -> Iterator[dict[str, Any]]:
-    """One row a measure; ``frames`` were made and consumed, ``gb_per_s`` is 0 where nothing is drawn."""
-    measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
-    found = interleaved(measures, seconds, repeats)
-    drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {"step": 0.0}
-    for name, result in found.items():
-        row: dict[str, Any] = {"game": game, "obs_size": size, "num_envs": count, "measure": name}
-        row |= {"frames": result.units, "frames_per_s": result.rate}
-        row |= {"frames_per_s_with_check": median(result.rates_with_check), "gb_per_s": drawn[name]}
-        row |= {f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}
-        yield row | {"checksum": result.checksum}
+        measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
+        found = interleaved(measures, options.seconds, options.repeats)
+        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {"step": 0.0}
+        for name, result in found.items():
+            row: dict[str, Any] = {"game": game, "obs_size": size, "num_envs": count, "measure": name}
+            row |= {"frames": result.units, "frames_per_s": result.rate}
+            row |= {"frames_per_s_with_check": median(result.rates_with_check), "gb_per_s": drawn[name]}
+            row |= {f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}
+            yield "envs", row | {"checksum": result.checksum}
 
 
 def read_all(frames: Any) -> int:

@@ -9,6 +9,9 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
+from torch.profiler import profile
+from torch.utils.benchmark import timer
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -45,8 +48,6 @@ def interleaved(
     measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 3
 ) -> dict[str, Measured]:
     """Time several things in turns, each so many seconds (or one ``work``) a turn, after warm-ups outside the clock."""
-    from torch.utils.benchmark import timer
-
     for measure in measures.values():
         for _ in range(warm_ups):
             measure.check(measure.work())
@@ -84,8 +85,6 @@ def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
 
     On a CPU the profiler's own memory makes copies look a little dearer than they are.
     """
-    from torch.profiler import profile
-
     work()
     with profile() as run:
         work()

@@ -88,7 +88,7 @@ class Options(BenchOptions):
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the tables ``models``, ``scans`` and ``saliency``."""
     batch, size = options.batch, options.size
-    at_least(options, steps=1, layers=1, size=1, batch=1, frames=1, threads=1)
+    at_least(options, steps=1, layers=1, size=1, batch=1, frames=1, threads=1, repeats=1)
     if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
         raise ValueError(f"device must be cpu, or cuda where torch finds a card, got {options.device!r}")
     device, how = torch.device(options.device), (options.seconds, options.repeats)

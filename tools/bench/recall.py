@@ -78,7 +78,7 @@ class Recall(NamedTuple):
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``recall``; those that the file holds already are not measured again."""
-    at_least(options, seconds=0.01, hidden_size=1, delays=1)
+    at_least(options, seconds=0.01, hidden_size=1, delays=1, seed=0)
     sizes, asked = (options.hidden_size, options.seed), []
 
     def measure(memory: str, delay: int, hidden_size: int, seed: int) -> Recall:

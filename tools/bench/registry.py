@@ -13,6 +13,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
+from arcade_torch.agents.runs.files import read_json
+from arcade_torch.tools.files import format_value, markdown_table
+
 FORMAT = 1
 
 BENCHES = {
@@ -75,15 +78,13 @@ TABLES: dict[str, Kind] = {
 }  # fmt: skip
 """What a file may hold; whoever adds a benchmark adds its tables here."""
 
-Log = Callable[[str], None]
-
 
 def module_of(name: str) -> Any:
     """The module of a benchmark: ``Options``, ``run``."""
     return import_module(f"arcade_torch.tools.bench.{name}")
 
 
-def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[str, Any]:
+def measure(benches: Mapping[str, BenchOptions], size: str, log: Callable[[str], None]) -> dict[str, Any]:
     """Run benchmarks one after another, those that keep freed memory last; the content of a file, four digits."""
     from arcade_torch.tools.machine import keep_freed_memory, machine
 
@@ -101,8 +102,6 @@ def measure(benches: Mapping[str, BenchOptions], size: str, log: Log) -> dict[st
 
 def read_results(path: Path) -> dict[str, Any]:
     """Read a file of ``arcade-torch bench all``; a ``ValueError`` if it is none, or a number in it is none."""
-    from arcade_torch.agents.runs.files import read_json
-
     values = read_json(path)
     if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
         raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
@@ -158,8 +157,6 @@ def compare(old: Mapping[str, Any], new: Mapping[str, Any], tolerance: float) ->
 
 def page(results: Mapping[str, Any]) -> str:
     """All tables as one Markdown page."""
-    from arcade_torch.tools.files import format_value, markdown_table
-
     machine = ", ".join(f"{name} {value}" for name, value in results["machine"].items() if value)
     lines = ["# Benchmarks", "", f"`make bench`, size {results['size']}. {machine}.", ""]
     for name, table in results["tables"].items():

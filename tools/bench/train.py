@@ -65,6 +65,10 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
         settings |= FORMS[name]
     settings |= {"algorithm": "pqn", "env": options.env, "memory": memory, "observability": "partial"}
     config = preset(network, device=options.device, **settings)
+    most = config.learner.grad_steps_per_update
+    require(
+        options.grad_steps <= most, "--grad-steps", options.grad_steps, f"at most {most} with the {network} network"
+    )
     return dataclasses.replace(config, pqn=dataclasses.replace(config.pqn, warmup_steps=0))
 
 
@@ -75,7 +79,6 @@ def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
         window[:] = [trainer.collector.collect()]  # overwrites the window before
 
     learner, every = trainer.learner, trainer.learner.minibatches
-    learner.config = dataclasses.replace(learner.config, epochs=1)
     learner.__dict__["minibatches"] = lambda rows: itertools.islice(every(rows), options.grad_steps)
 
     def learn() -> None:

@@ -34,7 +34,8 @@ class Bench(Command):
     def run(self) -> int:
         """Measure, print, save."""
         out, about = self.options.out, vars(self.options)
-        require(out is None or out.suffix in (".csv", ".json"), "--out", str(out), "a file that ends in .csv or .json")
+        endings = (".csv",) if self.options.resumable else (".csv", ".json")
+        require(out is None or out.suffix in endings, "--out", str(out), f"a file that ends in {' or '.join(endings)}")
         results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():

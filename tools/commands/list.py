@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from arcade_torch.envs_jax import make, registered_ids, resolve_id
+from arcade_torch.tools import players
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table, write_between
 from arcade_torch.tools.options import at_least
@@ -52,8 +53,6 @@ class List(Command):
         return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
 
     def _baselines(self) -> None:
-        from arcade_torch.tools import players
-
         at_least(self, episodes=1)
         ids = [resolve_id(name) for name in self.games] or registered_ids()
         rows, total = [], len(ids) * len(players.PLAYERS)

@@ -113,7 +113,9 @@ class Record(Shown):
         write = recording.writer_for(self.out)
         at_least(self, episodes=1, max_steps=1, scale=1)
         fastest = recording.FASTEST_FPS[self.out.suffix]
-        require(0 < self.fps <= fastest, "--fps", self.fps, f"above 0 and at most {fastest} for {self.out.suffix}")
+        require(
+            0.01 <= self.fps <= fastest, "--fps", self.fps, f"at least 0.01 and at most {fastest} for {self.out.suffix}"
+        )
         game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
         obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
         agent: Any = None

@@ -26,7 +26,7 @@ Measures = Mapping[str, Pooled]  # of one agent on one task: for each of `MEASUR
 
 def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
     """Figures ``contamination-KIND-GAME-TWIN``, one a task, and examples of each task's first agent."""
-    at_least(options, horizon=2)
+    at_least(options, horizon=2, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.contamination, vars(options), progress)
     made = Made([], notes, [_table(label, item) for label, item in measured])

@@ -118,7 +118,7 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
     chosen = [row for row in rows if name != "bias" or _has_bias(row)]
-    ends, places = np.array([getattr(row, name) for row in chosen]).T, range(len(chosen))
+    ends, places = np.reshape([getattr(row, name) for row in chosen], (-1, 3)).T, range(len(chosen))
     colours, errors = agent_colours([row.agent for row in rows]), {"error_kw": {"lw": 1}, "capsize": 3}
     axis.bar(places, ends[0], 0.72, color=[colours[row.agent] for row in chosen], yerr=whiskers(*ends), **errors)
     axis.set_xticks(places, [row.agent for row in chosen], rotation=35, ha="right", rotation_mode="anchor")

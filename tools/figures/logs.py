@@ -219,9 +219,10 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
     for (line, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("#d0d0d0")
         cell.set_text_props(weight="normal" if line else "bold")
-    base, _ = options.path("hyperparameters")
-    page = write_atomic(base.with_suffix(".md"), markdown_table(head, table) + "\n")
-    return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=[page])
+    base, endings = options.path("hyperparameters")
+    page, several = base.with_suffix(".md"), len(endings) > 1
+    files = [write_atomic(page, markdown_table(head, table) + "\n")] if several else []
+    return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=files)
 
 
 def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:

@@ -26,7 +26,7 @@ Masses = Mapping[tuple[str, str, str], Pooled]  # (agent, game, twin) -> mass in
 
 def densities(options: DensityOptions, progress: Progress | None) -> Made:
     """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
-    at_least(options, bins=1, episodes=1)
+    at_least(options, bins=1, episodes=1, seed=0)
     measured, notes = _measure(options, progress)
     made = Made([], notes)
     frames = np.concatenate([density.lengths for _, density in measured])

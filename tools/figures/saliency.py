@@ -47,14 +47,12 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
     return Made([picture], notes, [table])
 
 
-def saliency_figure(rows: Sequence[Row], *, show: int = 8, sigma_px: float | None = None, alpha: float = 0.5) -> Any:
+def saliency_figure(rows: Sequence[Row], *, show: int = 8) -> Any:
     """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose top it names.
 
     Args:
         rows: one ``(title, frames, maps)`` each, see `Row`.
         show: how many of the last frames are drawn.
-        sigma_px: smoothing in pixels; 6 at 128 px by default.
-        alpha: weight of the heat over the frame.
 
     Returns:
         A matplotlib figure.
@@ -63,7 +61,7 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, sigma_px: float | Non
     figure = need("matplotlib.pyplot").figure(figsize=(1.7 * columns, 2.2 * len(rows)), layout="constrained")
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
-        peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0], sigma_px, alpha)
+        peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0])
         part.suptitle(f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left")
     return figure
 
@@ -73,7 +71,6 @@ def plot(
     maps: NDArray[np.floating],
     axes: Sequence[Any],
     sigma_px: float | None = None,
-    alpha: float = 0.5,
     below: NDArray[np.float64] | None = None,
 ) -> float:
     """Draw the last frames of a trajectory, heat over each, on one scale; returns the value that is brightest.
@@ -90,7 +87,7 @@ def plot(
         axis.set_axis_off()
         if t >= 0:
             axis.imshow(frames[t], interpolation="nearest")
-            axis.imshow(heat[t], cmap="afmhot", vmin=0, vmax=1, alpha=alpha, interpolation="nearest")
+            axis.imshow(heat[t], cmap="afmhot", vmin=0, vmax=1, alpha=0.5, interpolation="nearest")
             name, share = "n" if t == n else f"n-{n - t}", "" if below is None else f": {below[t]:.1f} %"
             axis.set_title(f"$o_{{{name}}}${share}", fontsize="small")
     return peak

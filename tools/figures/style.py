@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import Array, seed_coverage
+from arcade_torch.tools.analysis.bootstrap import Array, measured_coverage
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
@@ -93,7 +93,7 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars", shar
     count = f"n = {low} seed{'s' * (low > 1)}" if low == high else f"n = {low} to {high} seeds"
     if high < 2:
         return f"{count}, no interval (needs two)"
-    share = seed_coverage(max(low, 2), confidence) if share is None else share
+    share = measured_coverage((max(low, 2),), (), confidence) if share is None else share
     return (
         f"{count}; {what}: {100 * confidence:g} % bootstrap interval over seeds, "
         f"measured coverage with {max(low, 2)} seeds {100 * share:.0f} %"
@@ -139,10 +139,6 @@ def save(options: Options, picture: Picture) -> list[Path]:
     return written
 
 
-_ID = re.compile(r'(\bid="|url\(#|href="#)')
-_NUMBER = re.compile(r"-?\d+\.\d{2,}")
-
-
 def svg(figure: Any, name: str) -> str:
     """A figure as an SVG element that can stand in a page beside others."""
     buffer = StringIO()
@@ -151,9 +147,9 @@ def svg(figure: Any, name: str) -> str:
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text)
-    text = _NUMBER.sub(lambda found: f"{float(found[0]):.4g}", text)
+    text = re.sub(r"-?\d+\.\d{2,}", lambda found: f"{float(found[0]):.4g}", text)
     prefix = re.sub(r"\W+", "-", name)
-    text = _ID.sub(lambda found: f"{found[1]}{prefix}-", re.sub(r">\s+<", "><", text))
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", re.sub(r">\s+<", "><", text))
     return text.replace("<svg", f'<svg role="img" aria-label="{escape(name)}"', 1)
 
 

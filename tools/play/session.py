@@ -144,12 +144,12 @@ class Session:
                     self.end = "terminated" if stepped.terminated[0] else "truncated"
                     self.finished += 1
                     self._report(self.end)
-        elif key == QUIT or (self.end is not None and self._all_played()):
+        elif key == QUIT or (key == NEXT and self.end is not None and self._all_played()):
             self._abandon()
             self.closed = True
-        elif self.end is not None:  # leave the last picture
+        elif key == NEXT and self.end is not None:  # leave the last picture
             self._begin((self.seed + 1) % 2**32)
-        elif key == RESTART:
+        elif key == RESTART and self.end is None:  # what has ended counts
             self._abandon()
             self._begin(self.seed)
 

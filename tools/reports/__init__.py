@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from arcade_torch.agents.config import flatten
+from arcade_torch.agents.config import flatten, require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
@@ -24,7 +24,6 @@ from arcade_torch.tools.runs import METRICS, Runs, check_comparable, open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
-TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
 MANY_PANELS = 8  # from here on pictures of learning are small
 TRUSTED_COVERAGE = 0.85  # below this measured coverage a difference is one of the seeds that were run
 
@@ -80,6 +79,7 @@ def report(
         ValueError: no run has finished yet, or there is no such part.
         MissingPackage: jinja2 is not installed.
     """
+    require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
     if unknown := sorted(set(skip) - set(get_args(Part))):
         raise ValueError(f"a report has no part {unknown[0]!r} to skip; parts: {', '.join(get_args(Part))}")
     jinja2 = need("jinja2")
@@ -110,7 +110,7 @@ def report(
             "colours": {agent: f"c{place}" for place, agent in enumerate(agents)},
             "palette": list(agent_colours(agents).values()),
         }
-    loader = jinja2.FileSystemLoader(TEMPLATES)
+    loader = jinja2.PackageLoader("arcade_torch.tools")
     strict = {"autoescape": True, "undefined": jinja2.StrictUndefined}
     environment = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, **strict)
     environment.filters["commas"] = "{:,}".format

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Protocol
 from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_json, write_atomic
 from arcade_torch.tools.errors import need, one_line, reason
-from arcade_torch.tools.machine import available_cores
+from arcade_torch.tools.machine import available_cores, keep_freed_memory
 from arcade_torch.tools.options import VARIABLE, load_extensions
 
 GRACE_S = 60.0
@@ -59,7 +59,6 @@ class Job(NamedTuple):
         """
         from arcade_torch.agents import TrainConfig, train
         from arcade_torch.agents.runs.folder import wait_until_free
-        from arcade_torch.tools.machine import keep_freed_memory
 
         load_extensions()  # of the process that made the job
         keep_freed_memory()

@@ -29,8 +29,7 @@ from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
-_SCORES = ("eval_mean", "eval_std", "eval_n", "train_max_ewm")
-RESULT_COLUMNS = ("run", *_CELL, "status", "frames", *_SCORES, "error")
+RESULT_COLUMNS = ("run", *_CELL, "status", "frames", "eval_mean", "eval_std", "eval_n", "train_max_ewm", "error")
 TIMING_COLUMNS = ("run", "frames", "seconds")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten, require
+from arcade_torch.agents.presets import preset
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
@@ -134,8 +135,6 @@ class Study:
 
     def config(self, run: RunSpec) -> TrainConfig:
         """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
-        from arcade_torch.agents.presets import preset
-
         others = set(self.algorithms) - {run.algorithm}
         changes = {"threads": 1} | {name: value for name, value in self.settings.items() if name not in others}
         changes |= {} if self.total_frames is None else {"total_frames": self.total_frames}

@@ -92,6 +92,11 @@ def test_the_papers_numbers_make_pictures_and_tables(
         assert (tmp_path / "returns-without.png").exists()
 
 
+def test_one_file_is_asked_for_and_one_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figure(capsys, "hyperparameters", "--paper", "--out", str(tmp_path / "numbers.csv"))
+    assert [path.name for path in tmp_path.iterdir()] == ["numbers.csv"]
+
+
 @pytest.mark.parametrize("name", ["returns", "gap-bias", "curves", "hyperparameters"])
 def test_run_folders_make_pictures_and_tables(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runs = fabricate(tmp_path / "runs", games=("CartPoleEasy-v0", "SkittlesEasy-v0"))
@@ -328,7 +333,10 @@ def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
     assert read_csv(tmp_path / "recall-density-16.csv") == rows
     monkeypatch.undo()
     file = next((trained / "gru-0" / "analysis").glob("recall_density-*.npz"))
-    for junk in (b"junk", file.read_bytes()[:200]):  # no zip file, and half of one
+    whole = file.read_bytes()
+    first = 30 + int.from_bytes(whole[26:28], "little") + int.from_bytes(whole[28:30], "little")  # byte of data
+    damaged = whole[:first] + bytes([whole[first] | 0b110]) + whole[first + 1 :]  # no such kind of compressed block
+    for junk in (b"junk", whole[:200], damaged):  # no zip file, half of one, a flipped bit
         file.write_bytes(junk)
         assert cli.main(words) == 0
         assert read_csv(tmp_path / "recall-density-16.csv") == rows  # made anew
