@@ -239,7 +239,7 @@ class ArcadeCollector(BaseCollector):
             self._finals.add(step, *raw.final)
         self._acted += 1
         reads = ROOT_KEYS if step == buffer.length - 1 else self._runner.reads
-        following = {"pixels": self._compressed(raw.pixels), **self.env.root_numbers(raw, reads)}
+        following = {"pixels": self._compressed(raw.pixels), **raw.root_numbers(reads)}
         if "last_action" in reads:
             following["last_action"] = action.to(torch.int64, copy=True)
         if "task" in reads and self.env.task_in_td:

@@ -1,8 +1,8 @@
 """``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -27,21 +27,13 @@ from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.process import check_process
 from arcade_torch.snapshot import Snapshots
-from arcade_torch.specs import make_specs
+from arcade_torch.specs import RawStep, make_specs
 
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
 Place = tuple[Canvas, int, torch.Tensor]
 Live = tuple[Batch, torch.Tensor]  # the batch, and bool [N, 2]: where its last step terminated or truncated
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
-
-
-class RawStep(NamedTuple):
-    """What one fused step gives."""
-
-    pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
-    numbers: torch.Tensor  # float32 [N, 5], see ``Step.numbers``
-    final: tuple[Any, jax.Array]  # the games' states before the resets, and who saw the partial view
 
 
 class ArcadeEnv(EnvBase):
@@ -152,6 +144,25 @@ class ArcadeEnv(EnvBase):
         """bool [N], true where the env shows its POMDP twin. A copy."""
         return to_torch(self._live.batch.partial, self.device).clone()
 
+    def __repr__(self) -> str:
+        """Game, number of envs, twin and device."""
+        partial = self.observability
+        twin = "full" if not partial.any() else "partial" if partial.all() else "mixed"
+        device = str(self.device)
+        return f"ArcadeEnv({self.game.id}, num_envs={self.num_envs}, observability={twin!r}, {device=})"
+
+    def to(self, device: torch.device | str) -> "ArcadeEnv":
+        """The env itself: it stays on the device it was made for, and refuses any other (ValueError)."""
+        wanted = pick_devices(device)[0]
+        if wanted != self.device:
+            raise ValueError(f"this env stays on {self.device}, where it was made: make one with device='{wanted}'")
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to its set_state()"
+        )
+
     def set_observability(self, observability: Observability) -> None:
         """Change which twin is shown, also in mid-episode; only the frames drawn from now on change.
 
@@ -244,18 +255,6 @@ class ArcadeEnv(EnvBase):
         self._go_on(step.root)  # on the CPU the step is done; argument lives until here
         return RawStep(frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial))
 
-    def root_numbers(self, raw: RawStep, keys: Collection[str]) -> dict[str, torch.Tensor]:
-        """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if asked for."""
-        numbers, out = raw.numbers, {}
-        done = numbers[:, TERMINATED:].any(-1, keepdim=True)
-        if "is_init" in keys:
-            out["is_init"] = done
-        if "step_count" in keys:
-            out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
-        if "episode_reward" in keys:
-            out["episode_reward"] = numbers[:, EPISODE_REWARD, None].masked_fill(done, 0)
-        return out
-
     def final_observations(self, max_steps: int) -> FinalObservations:
         """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
@@ -267,8 +266,7 @@ class ArcadeEnv(EnvBase):
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
-        if not isinstance(action, torch.Tensor) or action.layout is not torch.strided:
-            validation.check_tensor(action, "action")
+        validation.check_tensor(action, "action")
         num_actions, shape = self.game.num_actions, (self.num_envs,)
         if self.one_hot:
             if action.shape != (*shape, num_actions):
@@ -286,9 +284,7 @@ class ArcadeEnv(EnvBase):
         return action
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
-        plain = isinstance(tensordict, TensorDictBase) and tensordict.batch_size == self.batch_size
-        if not plain or "next" in tensordict or "_step" in tensordict:
-            validation.check_tensordict(tensordict, self.num_envs)
+        validation.check_tensordict(tensordict, self.num_envs)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
@@ -342,9 +338,7 @@ class ArcadeEnv(EnvBase):
         if self._state_in_td or "_step" in tensordict or self._post_step_mdp_hooks is not None:
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
             return stock
-        action = tensordict.get("action", None)
-        if not isinstance(action, torch.Tensor):
-            validation.tensor(tensordict, "action")
+        action = validation.tensor(tensordict, "action")
         raw = self.step_raw(action)
         last_action = action.to(torch.float32).argmax(-1) if self.one_hot else action
         following = self._next(raw.pixels, last_action, raw.numbers)
@@ -354,10 +348,13 @@ class ArcadeEnv(EnvBase):
             following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
         preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
         if preset is not None:
-            following.update(preset.exclude(*following.keys(True, True)))
+            unknown = preset.exclude(*following.keys(True, True))
+            following.update(unknown)
+            if keys := tuple(unknown.keys(True, True)):
+                validation.warn_state_is_dropped(*keys)  # by _step_mdp below
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
-        counts = self.root_numbers(raw, ("is_init", "step_count", "episode_reward"))
+        counts = raw.root_numbers(("is_init", "step_count", "episode_reward"))
         ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
         for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
             root._set_str(key, value, **_UNCHECKED)  # set() takes eight times as long

@@ -1,10 +1,12 @@
 """What ``ArcadeEnv`` refuses: arguments, tensordicts and entries that it could not use, in one clear line each."""
 
+import functools
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 
 from arcade_torch.envs_jax.validation import format_value
 
@@ -74,6 +76,17 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
         ):
             found = f"{type(kept).__name__} {list(kept.shape)}"
             raise ValueError(f"entry {key!r} is a {found}, expected shape {list(fresh.shape)} as the env gives it")
+
+
+@functools.cache
+def warn_state_is_dropped(*keys: NestedKey) -> None:
+    """Say once that what a policy wrote for the next step does not get there: TorchRL carries what specs name."""
+    names = ", ".join(".".join((key,) if isinstance(key, str) else key) for key in keys)
+    warnings.warn(
+        f"the policy wrote {names} for the next step, which does not get there, so a memory forgets: act in "
+        "TransformedEnv(env, get_primers_from_module(policy)), or with ArcadeCollector",
+        stacklevel=2,
+    )
 
 
 def mask(td: TensorDictBase, key: str, num_envs: int) -> torch.Tensor:

@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import jax
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
 State = TypeVar("State")
+Drawn = TypeVar("Drawn", contravariant=True)
 
 NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
@@ -102,6 +103,13 @@ class Game(abc.ABC, Generic[State]):
         return f"make({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
 
 
+class Screen(Protocol[Drawn]):
+    """What draws a game of this package."""
+
+    def draw(self, state: Drawn, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+
+
 class LevelGame(Game[State]):
     """A game of this package; ``levels`` are the numbers of each difficulty by the bare name of its id.
 
@@ -113,6 +121,11 @@ class LevelGame(Game[State]):
     """
 
     levels: ClassVar[Mapping[str, Any]]
+    screen: Screen[State]
 
     def __init__(self, level: Any, *, id: str, obs_size: int, rules: Rules) -> None:
         self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+
+    def render(self, state: State, partial: Array | bool) -> Array:
+        """See :meth:`Game.render`."""
+        return self.screen.draw(state, partial)

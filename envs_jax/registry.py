@@ -172,7 +172,8 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     unknown = sorted(set(options) - set(allowed))
     if unknown:
         has = f"its options are {', '.join(allowed)}" if allowed else "it has none of its own"
-        raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has}")
+        # TorchRL's GymEnv passes a frameskip, and does without it where it reads these words.
+        raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has} (unexpected keyword argument {unknown[0]!r})")
     from arcade_torch.envs_jax.checks import check_made
 
     game = _factory(full_id)(id=full_id, obs_size=obs_size, rules=rules, **options)

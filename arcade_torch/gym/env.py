@@ -39,7 +39,7 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
     """One game, one episode at a time. Made by ``gymnasium.make("arcade_torch/<id>", ...)``.
 
     Observations are the true frames, uint8 [S, S, 3]; the last one of an episode shows its end. ``info`` has
-    ``episode_reward`` (float, return so far) and ``step_count`` (int). A seed gives the bits that env 0 of
+    ``episode_reward`` (float64, return so far) and ``step_count`` (int64). A seed gives the bits that env 0 of
     ``arcade_torch.make(..., seed=seed)`` has; ``reset()`` without a seed goes on as that env does after an end.
 
     Args:
@@ -61,7 +61,7 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
         >>> env = gymnasium.make("arcade_torch/CartPoleEasy-v0", observability="partial")
         >>> frame, info = env.reset(seed=0)
         >>> frame, reward, terminated, truncated, info = env.step(2)
-        >>> frame.shape, info["step_count"]
+        >>> frame.shape, int(info["step_count"])
         ((128, 128, 3), 1)
     """
 
@@ -174,4 +174,4 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
 
     @staticmethod
     def _info(info: Info) -> Info:
-        return {key: value[0].item() for key, value in info.items()}
+        return {key: value[0] for key, value in info.items()}

@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, Stepped, seed_keys
+from arcade_torch.envs_jax.validation import check_choice
+from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
 from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
 from arcade_torch.observability import Observability, partial_flags
 
@@ -25,7 +26,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
     ``vectorization_mode="async"`` would start a process an env; it needs ``vector_kwargs={"context": "spawn"}``.
 
     Observations are uint8 [N, S, S, 3]. Infos, and what happens at an end, follow ``gymnasium.vector.SyncVectorEnv``
-    in all three auto-reset modes, to the bit; ``metadata["autoreset_mode"]`` says which one is in force:
+    in all three auto-reset modes, to the bit; ``autoreset_mode`` (in ``metadata`` too) says which one is in force:
 
     * ``NEXT_STEP`` (Gymnasium's default): an end shows its final frame; the following step ignores the env's action,
       pays 0 and shows the first frame of the new episode.
@@ -78,8 +79,10 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode of a vector environment is {render_mode!r}, allowed: None, 'rgb_array'")
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._mode, self._copy = _mode(autoreset_mode), copy
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self._mode}
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        check_choice("autoreset_mode", mode, tuple(each.value for each in AutoresetMode))
+        self.autoreset_mode, self._copy = AutoresetMode(mode), copy
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self.autoreset_mode}
         flags = partial_flags(observability, num_envs, partial_obs)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.single_action_space = action_space(self._batch.game.num_actions)
@@ -146,9 +149,9 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         if not self._started:
             raise ResetNeeded("call reset() before step()")
         argument = self._check_actions(actions)
-        if self._mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             return self._step_same(argument)
-        if self._mode is AutoresetMode.NEXT_STEP:
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             stepped = self._batch.reset_or_step(argument, self._ended)
         else:
             if self._ended.any():
@@ -156,7 +159,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
             stepped = self._batch.step(argument)
         self._ended = stepped.terminated | stepped.truncated
         frames = self._batch.draw(copy=self._copy)
-        return _result(frames, stepped, _masked(stepped.info, np.ones(self.num_envs, bool)))
+        return frames, *stepped[:3], _masked(stepped.info, np.ones(self.num_envs, bool))
 
     def _step_same(self, argument: npt.NDArray[np.int32]) -> StepResult:
         """Step, begin anew at once, and put the ends into the infos."""
@@ -169,7 +172,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
             infos = {"final_obs": final_obs, "_final_obs": ended.copy()}
             infos |= {"final_info": _masked(stepped.info, ended), "_final_info": ended.copy()}
         going_on = {key: np.where(ended, 0, value) for key, value in stepped.info.items()}
-        return _result(frames, stepped, infos | _masked(going_on, np.ones(self.num_envs, bool)))
+        return frames, *stepped[:3], infos | _masked(going_on, np.ones(self.num_envs, bool))
 
     def render(self) -> tuple[Frames, ...] | None:
         """The N frames with ``render_mode="rgb_array"``, otherwise None."""
@@ -187,21 +190,8 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
             raise ValueError(f"actions are {given.dtype} {given.shape}, expected integers ({self.num_envs},)")
         num_actions = self._batch.game.num_actions
         if given.min() < 0 or given.max() >= num_actions:
-            allowed = f"allowed: 0 to {num_actions - 1}"
-            raise ValueError(f"actions range from {given.min()} to {given.max()}, {allowed}")
+            raise ValueError(f"actions range from {given.min()} to {given.max()}, allowed: 0 to {num_actions - 1}")
         return given.astype(np.int32, copy=True)
-
-
-def _mode(mode: AutoresetMode | str) -> AutoresetMode:
-    try:
-        return AutoresetMode(mode)
-    except ValueError:
-        allowed = ", ".join(repr(each.value) for each in AutoresetMode)
-        raise ValueError(f"autoreset_mode is {mode!r}, allowed: {allowed}") from None
-
-
-def _result(frames: Frames, stepped: Stepped, infos: Info) -> StepResult:
-    return frames, stepped.reward, stepped.terminated, stepped.truncated, infos
 
 
 def _masked(info: Info, mask: Bools) -> Info:

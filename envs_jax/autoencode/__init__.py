@@ -51,7 +51,3 @@ class AutoEncode(LevelGame[AutoEncodeState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return rules.step(state, action, self.level, self.rules)
-
-    def render(self, state: AutoEncodeState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -42,7 +42,3 @@ class BattleShip(LevelGame[BattleShipState]):
     def step(self, key: Array, state: BattleShipState, action: Array) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
-
-    def render(self, state: BattleShipState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

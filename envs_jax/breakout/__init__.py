@@ -63,7 +63,3 @@ class Breakout(LevelGame[BreakoutState]):
     def step(self, key: Array, state: BreakoutState, action: Array) -> tuple[BreakoutState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
-
-    def render(self, state: BreakoutState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -48,7 +48,3 @@ class CartPole(LevelGame[CartPoleState]):
     def step(self, key: Array, state: CartPoleState, action: Array) -> tuple[CartPoleState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules)
-
-    def render(self, state: CartPoleState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -53,7 +53,3 @@ class CountRecall(LevelGame[CountRecallState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return rules.step(state, action, self.level, self.max_steps, self.rules)
-
-    def render(self, state: CountRecallState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -52,7 +52,3 @@ class MineSweeper(LevelGame[MineSweeperState]):
     def step(self, key: Array, state: MineSweeperState, action: Array) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules, self.mine_reward)
-
-    def render(self, state: MineSweeperState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

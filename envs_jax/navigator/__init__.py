@@ -44,7 +44,3 @@ class Navigator(LevelGame[NavigatorState]):
     def step(self, key: Array, state: NavigatorState, action: Array) -> tuple[NavigatorState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
-
-    def render(self, state: NavigatorState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

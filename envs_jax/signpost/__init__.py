@@ -39,7 +39,3 @@ class Signpost(LevelGame[SignpostState]):
     def step(self, key: Array, state: SignpostState, action: Array) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level)
-
-    def render(self, state: SignpostState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -48,7 +48,3 @@ class Skittles(LevelGame[SkittlesState]):
     def step(self, key: Array, state: SkittlesState, action: Array) -> tuple[SkittlesState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules, self.hit_reward)
-
-    def render(self, state: SkittlesState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)

@@ -44,7 +44,3 @@ class Tetris(LevelGame[TetrisState]):
     def step(self, key: Array, state: TetrisState, action: Array) -> tuple[TetrisState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules)
-
-    def render(self, state: TetrisState, partial: Array | bool) -> Array:
-        """See :meth:`Game.render`."""
-        return self.screen.draw(state, partial)
