@@ -26,12 +26,6 @@ class DQNLoss(PQNLoss):
     def _default_value_estimator(self) -> None:
         self.make_value_estimator(lmbda=0.0)
 
-    def prepare(self, batch: TensorDictBase) -> Any:
-        """See :meth:`PQNLoss.prepare`; keeps ``stored_target``."""
-        data = super().prepare(batch)
-        stored = batch.get("stored_target", None)
-        return data if stored is None else data.set("stored_target", stored[:, self.burn_in :])
-
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
         """Stored targets, if the batch brings them, else see :meth:`PQNLoss.targets`."""

@@ -1,4 +1,4 @@
-"""Policies: TensorDict modules that ``env.rollout``, TorchRL's ``Collector`` and ``ArcadeCollector`` take alike."""
+"""Policies: TensorDict modules for ``ArcadeCollector``; TorchRL's rollouts and collectors need a memory's primer."""
 
 from dataclasses import replace
 from os import PathLike
@@ -13,7 +13,7 @@ from torchrl.data import Categorical
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueModule
 
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.checkpoint import find_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
@@ -60,12 +60,12 @@ class Agent(TensorDictModuleBase):
         offers: what :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs", "value").
 
     Example:
-        >>> import arcade_torch
+        >>> from arcade_torch import ArcadeCollector, make
         >>> from arcade_torch.agents import preset
         >>> config = preset("small", memory="gru")
         >>> agent = Agent(config, build_network(config))
-        >>> env = arcade_torch.make("CartPoleEasy", num_envs=2)
-        >>> env.rollout(3, agent)["action"].shape
+        >>> collector = ArcadeCollector(make("CartPoleEasy", num_envs=2), agent, frames_per_batch=6)
+        >>> collector.collect()["action"].shape
         torch.Size([2, 3])
     """
 
@@ -113,8 +113,7 @@ class Agent(TensorDictModuleBase):
         ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``: of the state,
         [..., 1], the best of its Q-values where it has these.
         """
-        if what not in self.offers:
-            raise ValueError(f"this {self.config.algorithm} agent offers {', '.join(self.offers)}, not {what!r}")
+        require(what in self.offers, "what", what, f"one that this agent offers: {', '.join(self.offers)}")
         if isinstance(self.network, ActorCriticNetwork):
             return self.network.select(out, what)
         return out.amax(-1, keepdim=True) if what == "value" else out
@@ -151,7 +150,7 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
         device: where to put the network; default the device of the run if it is there, else the CPU.
 
     Returns:
-        The agent, in evaluation mode: a policy for ``env.rollout`` and every collector.
+        The agent, in evaluation mode: a policy for ``ArcadeCollector``, and for ``env.rollout`` if a memory is primed.
 
     Raises:
         CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was found.

@@ -18,6 +18,7 @@ from arcade_torch.agents.sequences import (
     NetworkInputs,
     as_steps,
     insert_final_observations,
+    is_stock,
     solve_backward,
     unroll,
     values_and_traces,
@@ -74,7 +75,7 @@ def gae(
 class SequenceGAE(nn.Module):
     """Advantages by one pass of the critic over each sequence, final observations read where they belong.
 
-    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value`` [N, L, 1] or [L, 1].
+    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value`` [..., L, 1].
 
     Args:
         critic: any TensorDict module that writes ``state_value`` [*, 1].
@@ -97,36 +98,33 @@ class SequenceGAE(nn.Module):
         self.inputs = NetworkInputs(critic)
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.gamma, self.lmbda, self.chunks = gamma, lmbda, chunks
-        self.reads: dict[str, Any] = {"reward": "reward", "terminated": "terminated"}
-        self.writes = {"advantage": "advantage", "value_target": "value_target", "value": "state_value"}
+        self.names: dict[str, Any] = {key: key for key in ("reward", "terminated", "advantage", "value_target")}
+        self.names["value"] = "state_value"
 
     def set_keys(self, **names: Any) -> None:
         """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``; the rest is unused."""
-        for table in (self.reads, self.writes):
-            table.update({name: names[name] for name in table.keys() & names.keys()})
+        self.names |= {name: key for name, key in names.items() if name in self.names}
 
     @torch.no_grad()
     def forward(self, batch: TensorDictBase, params: Any = None, target_params: Any = None) -> TensorDictBase:
         """Estimate advantages; gives the same object, with the three entries.
 
         Args:
-            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [N, L], [L] with next observations.
+            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [..., L] with next observations.
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
-        data = insert_final_observations(batch, self.inputs, self.time_limit, **self.reads)
-        value_key = self.writes["value"]
+        names = {name: self.names[name] for name in ("reward", "terminated")}
+        data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
         with nullcontext() if params is None else params.to_module(self.critic, preserve_module_state=False):
-            values = [unroll(self.critic, self.inputs, rows, value_key) for rows in data.chunk(self.chunks)]
+            values = [unroll(self.critic, self.inputs, rows, self.names["value"]) for rows in data.chunk(self.chunks)]
         value, position = torch.cat(values).squeeze(-1), data["position"]
         here, following = value.gather(1, position), value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
-        ends = data["terminated"]
-        advantage = gae(data["reward"], here, following, ends, data["cut"] & ~ends, gamma=self.gamma, lam=self.lmbda)
+        advantage = gae(data["reward"], here, following, data["terminated"], data["cut"], self.gamma, self.lmbda)
         entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
-        flags = batch.get("is_init")  # of sequences, the batch itself does not say how long they are
-        shape = flags.shape[:-1] if flags.ndim > batch.ndim else batch.shape
+        shape = batch.shape if is_stock(batch) else advantage.shape
         for key, entry in entries.items():
-            batch[self.writes[key]] = entry.reshape(shape).unsqueeze(-1)
+            batch[self.names[key]] = entry.reshape(shape).unsqueeze(-1)
         return batch
 
 
@@ -230,6 +228,8 @@ class Choice(Categorical):
     ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name the update.
     """
 
+    deterministic_sample = Categorical.mode  # the name that TorchRL asks for
+
     def sample(self, sample_shape: Any = ()) -> Tensor:
         """Draw by the largest of ``logits + Gumbel noise``, int64 [*sample_shape, *batch]."""
         logits = self.logits.expand(*sample_shape, *self.logits.shape)
@@ -246,14 +246,13 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
     Returns:
         TorchRL's ``ProbabilisticActor``; writes ``action`` int64 [*] and ``action_log_prob``.
     """
-    default = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     return ProbabilisticActor(
         network,
         in_keys=["logits"],
         distribution_class=Choice,
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
-        default_interaction_type=default,
+        default_interaction_type=ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM,
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
@@ -19,6 +20,7 @@ from arcade_torch.agents.sequences import (
     Key,
     NetworkInputs,
     insert_final_observations,
+    is_stock,
     solve_backward,
     unroll,
     values_and_traces,
@@ -107,8 +109,7 @@ class QLambdaEstimator(TDLambdaEstimator):
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
         names = (keys.reward, keys.done, keys.terminated)
         reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
-        truncated = done & ~terminated
-        return q_lambda_return(reward, next_value.squeeze(-1), terminated, truncated, *self._floats).unsqueeze(-1)
+        return q_lambda_return(reward, next_value.squeeze(-1), terminated, done, *self._floats).unsqueeze(-1)
 
 
 class PQNLoss(LossModule):
@@ -218,16 +219,16 @@ class PQNLoss(LossModule):
 
         See :func:`insert_final_observations`, whose result [N] it is.
         """
-        names = ("action", "is_init", "reward", "terminated", "truncated")
-        keys = {name: getattr(self.tensor_keys, name) for name in names}
+        keys = {x: getattr(self.tensor_keys, x) for x in ("action", "is_init", "reward", "terminated", "truncated")}
         return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in, **keys)
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Loss and metrics of a batch.
+        """Loss and metrics of a batch, and the priority of its steps, which is written into it.
 
         Args:
-            tensordict: sequences [N], a stock batch [B, T], or rows of what :meth:`prepare` gave.
+            tensordict: sequences [N], a stock batch [..., T], or rows of what :meth:`prepare` gave, which get no
+                priorities; with ``priority_weight``, [N] or one a step, if the loss is to be weighted.
 
         Returns:
             The out keys.
@@ -247,9 +248,19 @@ class PQNLoss(LossModule):
         chosen = q.flatten(1).gather(1, position * q.shape[-1] + action.reshape(position.shape))
         target = self.targets(data, q.detach(), steps)
         error = chosen - target
-        loss = self._reduce_loss(0.5 * error.square(), tensordict, weights=self._maybe_get_priority_weight(tensordict))
-        error, chosen = error.detach(), chosen.detach()
-        means = {"q_mean": chosen.mean(), "target_mean": target.mean(), "td_error": error.abs().mean()}
+        rows, trained = tensordict, slice(self.burn_in, self.burn_in + steps)
+        if data is not tensordict and is_stock(tensordict, self.tensor_keys.is_init):  # its masks are those of steps
+            rows = tensordict[..., trained]
+            error, chosen, target = (x.reshape(rows.shape) for x in (error, chosen, target))
+        weight = self._maybe_get_priority_weight(rows)
+        weight = None if weight is None else expand_as_right(weight, error)
+        loss = self._reduce_loss(0.5 * error.square(), rows, weights=weight)
+        each = {"q_mean": chosen.detach(), "target_mean": target, "td_error": error.detach().abs()}
+        if data is not tensordict and not tensordict.is_locked:
+            size, length = each["td_error"].unsqueeze(-1), self.burn_in + data["reward"].shape[1]
+            every = size.mean(-2, keepdim=True).repeat_interleave(length, -2)  # what is not trained has the mean
+            tensordict[self.tensor_keys.priority] = every.slice_scatter(size, -2, trained.start, trained.stop)
+        means = {key: self._reduce_loss(value, rows, reduction="mean") for key, value in each.items()}
         return TensorDict(loss=loss, **means, batch_size=[])
 
     @torch.no_grad()
@@ -260,7 +271,7 @@ class PQNLoss(LossModule):
         outcome = TensorDict(batch_size=next_value.shape)
         outcome["next", keys.reward] = data["reward"][:, :steps, None]
         outcome["next", keys.terminated] = data["terminated"][:, :steps, None]
-        outcome["next", keys.done] = (data["cut"] | data["terminated"])[:, :steps, None]
+        outcome["next", keys.done] = data["cut"][:, :steps, None]
         estimate: Callable[..., Tensor] = self.value_estimator.value_estimate
         return estimate(outcome, next_value=next_value.unsqueeze(-1)).squeeze(-1)
 

@@ -8,15 +8,13 @@ step, where the recurrent state that led to it reads it. For a causal memory the
 and because a batch has a fixed number of places ``K``, all shapes are static.
 """
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.agents.config import TimeLimit, require
+from arcade_torch.agents.config import TimeLimit, coerce, require
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 
@@ -35,16 +33,22 @@ class NetworkInputs:
         self.reads_first_state_only = self.stores == {"sequence"}
 
 
+def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
+    """Whether a batch has TorchRL's layout [..., L], not that of sequences [N] with entries [N, L, ...]."""
+    return batch.ndim != 1 or _get(batch, is_init).ndim == 2
+
+
 def insert_final_observations(
     batch: TensorDictBase, inputs: NetworkInputs, time_limit: str = "bootstrap", burn_in: int = 0, **names: Key
 ) -> TensorDict:
     """Lay out a batch for a pass that gives the values of all next observations.
 
     Args:
-        batch: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock TorchRL batch [N, L] or [L]
-            with dense ``("next", ...)`` observations. Entries: what the network reads, ``action``, ``is_init``,
-            ``("next", "reward" | "terminated" | "truncated")``; the recurrent state before step 0 as ``initial_state``
-            [N], or per step under the network's own keys (not needed where all rows begin with an episode).
+        batch: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock TorchRL batch [..., L] with
+            dense ``("next", ...)`` observations, read as [N, L]. Entries: what the network reads, ``action``,
+            ``is_init``, ``("next", "reward" | "terminated" | "truncated")``; the recurrent state before step 0 as
+            ``initial_state`` [N], or per step under the network's own keys (not needed where all rows begin with an
+            episode). TorchRL's masks of padded steps, ``mask`` and ``("collector", "mask")``, are looked at.
         inputs: of the network.
         time_limit: ``"bootstrap"``: a truncated step needs its true next observation; ``"terminal"``: it does not.
         burn_in: first steps that only bring the recurrent state up to date; they are kept apart.
@@ -59,45 +63,53 @@ def insert_final_observations(
 
     Raises:
         KeyError: an entry is missing; names it.
-        ValueError: a next observation that a target needs was not stored, or the recurrent state at step 0 is unknown.
+        ValueError: a needed next observation or the state at step 0 is missing, or steps do not follow each other.
     """
+    require("steps_to_next_obs" not in batch, "the batch", "steps_to_next_obs", "one without MultiStep: use lmbda")
     batch = batch.copy()
     for wanted, name in names.items():
         after = wanted in ("reward", "terminated", "truncated")
         batch[("next", wanted) if after else wanted] = _get(batch, unravel_key(("next", name)) if after else name)
-    if batch.ndim == 1 and _get(batch, "is_init").ndim == 2:  # one sequence [L] of a stock batch
-        batch = batch.unsqueeze(0)
+    if is_stock(batch):
+        _check_stored_states(batch, inputs)
+        slices = bool(burn_in) and batch.ndim == 1 and bool(batch["is_init"][1:].any())
+        require(not slices, "burn_in", burn_in, "0 for a flat batch of several slices: reshape it to [slices, length]")
+        batch = batch.reshape(-1, batch.shape[-1])
     is_init = _flat(batch, "is_init")
     batch["is_init"] = is_init.unsqueeze(-1)
     terminated, truncated = _flat(batch, ("next", "terminated")), _flat(batch, ("next", "truncated"))
     done = terminated | truncated
-    seam = torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
+    cut = done | torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
+    for key in ("mask", ("collector", "mask")):
+        if key in batch and (mask := _flat(batch, key)).shape == cut.shape:
+            cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]  # zeros follow, up to the length of the longest trajectory
     require(burn_in < is_init.shape[1], "burn_in", burn_in, f"less than the {is_init.shape[1]} steps of the batch")
     terminated = done if time_limit == "terminal" else terminated
-    needed = (done | seam) & ~terminated
-    index, mask, places = _final_places(batch, needed)
+    if "final_index" not in batch and "step_count" in batch and (counted := ("next", "step_count")) in batch:
+        follows = cut[:, :-1] | (_flat(batch, counted)[:, :-1] == _flat(batch, "step_count")[:, 1:])
+        require(bool(follows.all()), "step_count", "a jump within a row", "that of whole sequences, never shuffled")
+    needed = cut & ~terminated
+    index, used = _final_places(batch, needed)
 
-    used = mask & needed.gather(1, index) & (index >= burn_in)
     length = is_init.shape[1] - burn_in
     steps = torch.arange(length, device=is_init.device).expand(len(is_init), -1)
-    times = torch.cat((2 * steps, torch.where(used, 2 * (index - burn_in) + 1, 2 * length)), dim=1)
+    times = torch.cat((2 * steps, torch.where(used & (index >= burn_in), 2 * (index - burn_in) + 1, 2 * length)), dim=1)
     order = times.argsort(dim=1, stable=True)  # a place stands right behind its step, unused ones at the end
     position = order.argsort(dim=1)[:, :length]  # of each observation
 
-    out = TensorDict(
-        position=position,
-        action=_get(batch, "action")[:, burn_in:],
-        reward=_flat(batch, ("next", "reward"))[:, burn_in:],
-        terminated=terminated[:, burn_in:],
-        cut=(done | seam)[:, burn_in:],
-        batch_size=[len(is_init)],
-    )
+    whole = {"terminated": terminated, "cut": cut, "reward": _flat(batch, ("next", "reward"))}
+    whole |= {key: _get(batch, key) for key in ("action", "stored_target") if key == "action" or key in batch}
+    out = TensorDict({key: value[:, burn_in:] for key, value in whole.items()}, batch_size=[len(is_init)])
+    out["position"] = position
     roots = {key: _get(batch, key) for key in inputs.observation_keys}
-    both = {key: torch.cat((root[:, burn_in:], places(key)), dim=1) for key, root in roots.items()}
+    if not inputs.reads_first_state_only and "initial_state" not in batch:  # states of a stock batch
+        roots |= {key: batch[key] for key in inputs.state_keys if key in batch}
+    both = {key: torch.cat((root[:, burn_in:], _next(batch, key, index, inputs)), 1) for key, root in roots.items()}
     out["extended"] = TensorDict({key: _rows(value, order) for key, value in both.items()}, batch_size=order.shape)
     if burn_in:
         out["burn_in"] = TensorDict({key: root[:, :burn_in] for key, root in roots.items()}, [len(is_init), burn_in])
-    _add_state(out, batch, inputs, is_init, order, burn_in)
+    if inputs.state_keys:
+        _add_state(out, batch, inputs, burn_in)
     return out
 
 
@@ -113,8 +125,7 @@ def unroll(network: TensorDictModuleBase, inputs: NetworkInputs, sequences: Tens
     Returns:
         float [B, L + K, ...], the output along the extended sequence.
     """
-    state, extended = sequences.get("initial_state", None), sequences["extended"]
-    burn_in = sequences.get("burn_in", None)
+    state, burn_in, extended = (sequences.get(key, None) for key in ("initial_state", "burn_in", "extended"))
     if burn_in is not None and inputs.state_keys:  # no gradient: it only brings the state up to date (R2D2)
         with torch.no_grad(), set_recurrent_mode(False):
             for t in range(burn_in.shape[1]):
@@ -141,10 +152,11 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     Returns:
         TensorDict [N, L]; the recurrent state counts at index 0 and where an episode begins.
     """
-    if batch.ndim != 1 or _get(batch, "is_init").ndim == 2:
+    if is_stock(batch):
+        _check_stored_states(batch, inputs)
         return batch
-    shape = _flat(batch, "is_init").shape
-    out = TensorDict({key: _get(batch, key) for key in (*inputs.observation_keys, *keys)}, batch_size=shape)
+    entries = {key: _get(batch, key) for key in (*inputs.observation_keys, *keys)}
+    out = TensorDict(entries, batch_size=_flat(batch, "is_init").shape)
     if inputs.state_keys:
         _begin_with(out, batch["initial_state"], inputs)
     return out
@@ -164,14 +176,11 @@ def values_and_traces(
     and at the last step. Arguments that do not fit are refused, ``others`` for their shape alone.
     """
     shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
-    if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
-        raise ValueError(f"rewards, values, terminated, truncated must share one shape [B, T], T >= 1; got {shapes}")
-    if not reward.is_floating_point():  # gamma times lambda would be rounded to 0
-        raise ValueError(f"the dtype of rewards must be a floating one; got {reward.dtype}")
-    if not 0.0 <= gamma <= 1.0 or not 0.0 <= lam <= 1.0:
-        raise ValueError(f"gamma and lambda must lie in [0, 1]; got gamma={gamma}, lambda={lam}")
-    if time_limit not in ("bootstrap", "terminal"):
-        raise ValueError(f"time_limit must be 'bootstrap' or 'terminal'; got {time_limit!r}")
+    fits = len(shapes) == 1 and reward.ndim == 2 and reward.shape[1] > 0
+    require(fits, "rewards, values, terminated, truncated", shapes, "of one shape [B, T], T >= 1")
+    require(reward.is_floating_point(), "the dtype of rewards", reward.dtype, "a floating one")  # or traces were 0
+    require(0.0 <= gamma <= 1.0 and 0.0 <= lam <= 1.0, "gamma and lambda", (gamma, lam), "in [0, 1]")
+    coerce("time_limit", time_limit, TimeLimit)
     done = terminated | truncated
     trace = torch.full_like(reward, gamma * lam).masked_fill(done, 0.0)
     trace[:, -1] = 0.0
@@ -188,6 +197,14 @@ def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
             trace = trace[:, : trace.shape[1] - reach] * trace[:, reach:]
         reach *= 2
     return base
+
+
+def _check_stored_states(batch: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored there get lost."""
+    if inputs.reads_first_state_only and "step_count" in batch:
+        within = batch["is_init"].reshape(batch.shape) & (batch["step_count"].reshape(batch.shape) > 0)
+        lost = any(bool(batch[key][within].any()) for key in inputs.state_keys if key in batch)
+        require(not lost, "store", "sequence", "'step' (of the network) for slices that begin within episodes")
 
 
 def _with_state(step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs) -> TensorDictBase:
@@ -211,63 +228,43 @@ def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: Networ
         sequences[key] = every
 
 
-def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor, Any]:
-    """Steps [N, K] whose next observation is at hand, which places are in use, and the observations by key."""
-    index, mask = batch.get("final_index", None), batch.get("final_mask", None)
+def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps [N, K] whose next observation is at hand, and which of these places are needed."""
+    index = batch.get("final_index", None)
     if index is None:
         count = max(int(needed.sum(1).max()), 1)  # a stock batch has as many places as it needs
         index = (~needed).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
-        mask = needed.gather(1, index)
-    stored = torch.zeros_like(needed, dtype=torch.int8).scatter_add_(1, index, mask.to(torch.int8))
-    if missing := int((needed & (stored == 0)).sum()):
-        raise ValueError(
-            f"{missing} next observations are needed but were not stored: collect with final_frames='truncated' "
-            "or 'all', or use time_limit='terminal'"
-        )
-    frames = batch.get("final_pixels", None)
-
-    def places(key: Key) -> Tensor:
-        return frames if key == "pixels" and frames is not None else _rows(_next(batch, key), index)
-
-    return index, mask, places
+    used = needed.gather(1, index) & batch.get("final_mask", needed.new_ones(()))
+    missing = int(needed.sum() - used.sum())
+    allowed = "stored where needed: collect with final_frames='truncated' or 'all', or take time_limit='terminal'"
+    require(not missing, "next observations", f"{missing} missing", allowed)
+    return index, used
 
 
-def _next(batch: TensorDictBase, key: Key) -> Tensor:
-    """The entry of the next observations; nothing begins there."""
+def _next(batch: TensorDictBase, key: Key, index: Tensor, inputs: NetworkInputs) -> Tensor:
+    """The entry of the observations [N, K] behind the steps ``index``; nothing begins there, so no state is read."""
     if key == "is_init":
-        return torch.zeros_like(_flat(batch, key)).unsqueeze(-1)
-    value = batch.get(("next", *((key,) if isinstance(key, str) else key)), None)
-    if value is None and key == "last_action":
-        value = _get(batch, "action")
+        return torch.zeros_like(index, dtype=torch.bool).unsqueeze(-1)
+    if key == "pixels" and "final_pixels" in batch:
+        return batch["final_pixels"]  # type: ignore[no-any-return]
+    other = "action" if key == "last_action" else key if key in inputs.state_keys else None
+    value = batch.get(unravel_key(("next", key)), other and batch.get(other, None))
     if value is None:
         raise KeyError(f"no next observations: neither 'final_pixels' nor ('next', {key!r}); take collect() or 'all'")
-    return value  # type: ignore[no-any-return]
+    return _rows(value, index)
 
 
-def _add_state(
-    out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, is_init: Tensor, order: Tensor, burn_in: int
-) -> None:
-    """The recurrent state before the first step; where a stock batch has one a step, those as well."""
-    if not inputs.state_keys:
-        return
+def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> None:
+    """The recurrent state before the first step."""
     first = batch.get("initial_state", None)
     if first is not None:
         out["initial_state"] = first.select(*inputs.state_keys)
         if burn_in and not inputs.reads_first_state_only:
             _begin_with(out["burn_in"], first, inputs)
-        return
-    per_step = {key: batch.get(key, None) for key in inputs.state_keys}
-    if missing := [key for key, value in per_step.items() if value is None]:
-        if not bool(is_init[:, 0].all()):
-            raise ValueError(f"the batch begins in mid-episode but has neither 'initial_state' nor {missing[0]!r}")
-        return
-    out["initial_state"] = TensorDict({key: value[:, 0] for key, value in per_step.items()}, batch_size=out.batch_size)
-    if not inputs.reads_first_state_only:
-        for key, value in per_step.items():
-            nothing = value.new_zeros(len(value), order.shape[1] - value.shape[1] + burn_in, *value.shape[2:])
-            out["extended"][key] = _rows(torch.cat((value[:, burn_in:], nothing), 1), order)
-            if burn_in:
-                out["burn_in"][key] = value[:, :burn_in]
+    elif not (missing := [key for key in inputs.state_keys if key not in batch]):
+        out["initial_state"] = TensorDict({key: batch[key][:, 0] for key in inputs.state_keys}, out.batch_size)
+    elif not bool(batch["is_init"][:, 0].all()):
+        raise ValueError(f"the batch begins in mid-episode but has neither 'initial_state' nor {missing[0]!r}")
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ class ActorCriticNetwork(TensorDictModuleBase):
 
     Attributes:
         actor, critic: TensorDict modules for the terms of a loss; where one network serves both, the critic reads what
-            the actor has written.
+            the actor has written (TorchRL's ``A2CLoss`` has to be given :attr:`estimator`, or it trains no critic).
 
     Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent actor-critic.
     """

@@ -123,7 +123,9 @@ def test_a_burn_in_of_memories_that_store_in_two_ways_is_refused():
         DQNLoss(TensorDictSequential(*towers), burn_in=1)
 
 
-@pytest.mark.parametrize(("burn_in", "message"), [(-1, "a whole number >= 0"), (4, "less than the 4 steps of the batch")])
+@pytest.mark.parametrize(
+    ("burn_in", "message"), [(-1, "a whole number >= 0"), (4, "less than the 4 steps of the batch")]
+)
 def test_a_burn_in_that_leaves_nothing_to_learn_from_gets_one_line(burn_in, message):
     with pytest.raises(ValueError, match=f"^burn_in must be {message}; got {burn_in}$"):
         DQNLoss(toy_network(), burn_in=burn_in)(stream(2, 4, seed=1).sequences())

@@ -6,7 +6,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules.utils import get_primers_from_module
 
 import arcade_torch
 from arcade_torch.agents import Agent, build_network, evaluate, load, make_actor, make_policy, preset
@@ -112,11 +114,15 @@ def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
     config = preset("smoke", algorithm=algorithm, memory="gru")
     agent = Agent(config, build_network(config))
     env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=0)
+    env = TransformedEnv(env, get_primers_from_module(agent, warn=False))
     played, state = env.rollout(6, agent, break_when_any_done=False), agent.initial_state(2)
     for t in range(6):  # the other way to ask it
         roots = {key: played[key][:, t] for key in ("pixels", "last_action", "is_init")}
         action, extras, state = agent.act(TensorDict(roots, [2]), state)
         assert torch.equal(action, played["action"][:, t]) and extras
+        for key, value in extras.items():
+            written = played["action_value" if key == "q_value" else key][:, t]
+            torch.testing.assert_close(value, written.reshape(value.shape))
     frames = torch.randint(256, (1, 3, 32, 32, 3), dtype=torch.uint8)
     last, flags = torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.bool)
     out, _ = agent.network.remember(agent.network.encode(frames), last, flags, agent.initial_state(1))
@@ -128,7 +134,7 @@ def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
     else:
         assert torch.equal(agent.outputs(out, "q"), out)
         assert torch.equal(agent.outputs(out, "value"), out.amax(-1, keepdim=True))
-    with pytest.raises(ValueError, match=r"offers .*, not 'advantage'"):
+    with pytest.raises(ValueError, match=r"offers: .*; got 'advantage'"):
         agent.outputs(out, "advantage")
 
 

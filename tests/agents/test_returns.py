@@ -151,7 +151,7 @@ def test_numbers_worked_out_by_hand():
 @both
 @pytest.mark.parametrize(
     ("numbers", "words"),
-    [((1.5, 0.8), "gamma=1.5"), ((0.9, -0.1), "lambda=-0.1"), ((0.9, 0.8, "never"), "'never'")],
+    [((1.5, 0.8), r"gamma .*1.5"), ((0.9, -0.1), r"lambda .*-0.1"), ((0.9, 0.8, "never"), "'never'")],
 )
 def test_bad_arguments_are_named(estimate, numbers, words):
     with pytest.raises(ValueError, match=words):
