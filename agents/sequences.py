@@ -58,8 +58,8 @@ def insert_final_observations(
     Returns:
         TensorDict [N] with ``extended`` [N, L + K] (what the network reads), ``position`` int64 [N, L] (where each
         step's observation stands; its true successor stands right behind it), ``burn_in`` [N, burn_in],
-        ``initial_state`` [N], and ``reward``, ``terminated``, ``cut`` (the episode or its record ends here), ``action``
-        [N, L, ...]; L without burn-in.
+        ``initial_state`` [N], ``reward``, ``terminated``, ``cut`` (the episode or its record ends here), and
+        ``action``, ``stored_target`` (DQN's, if the batch has it) [N, L, ...]; L without burn-in.
 
     Raises:
         KeyError: an entry is missing; names it.
