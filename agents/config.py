@@ -205,6 +205,8 @@ class PPOConfig(LearnerConfig):
     """Weight of the entropy bonus at the start."""
     entropy_end: Fraction = 1.0
     """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
+    advantage_decay: Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)] = 0.0
+    """Kept at an update of the running deviation that advantages are divided by; 0: each minibatch by its own."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
     prediction_coeff: PositiveOrZero = 0.0
@@ -228,8 +230,7 @@ class DQNConfig(QConfig):
     lam: Fraction = 0.0
     """Lambda of the return, in [0, 1]; 0 is the one-step target."""
     replay_frames: int = 132_000
-    """Capacity in frames (of 43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows
-    of all environments."""
+    """Capacity in frames (43,200 bytes each, 3,072 with the small encoder), rounded down to whole windows of all."""
     batch_sequences: Count = 32
     """Sequences drawn in an update, without repetition; all epochs go over the same."""
     learning_starts: Count = 32
@@ -237,8 +238,7 @@ class DQNConfig(QConfig):
     burn_in: CountOrZero = 0
     """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
     targets: Literal["recompute", "stored"] = "recompute"
-    """``"recompute"``: from present Q-values, whenever a sequence is used; ``"stored"`` (the published form): once,
-    when it was collected."""
+    """``"recompute"``: from present Q-values, at every use; ``"stored"`` (the published form): once, when collected."""
     target_every: CountOrZero = 0
     """Updates between copies of the network to a target network, which then gives the next values; 0 for none."""
 
@@ -254,8 +254,7 @@ class DQNConfig(QConfig):
     @property
     def replay_sequences(self) -> int:
         """Capacity in sequences: whole windows of all environments."""
-        length = self.overlap + self.num_steps
-        return self.replay_frames // (self.num_envs * length) * self.num_envs
+        return self.replay_frames // (self.num_envs * (self.overlap + self.num_steps)) * self.num_envs
 
 
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}

@@ -63,6 +63,7 @@ class Learner:
         self.loss, self.config, self.training = loss, config, training
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = make_optimizer(self.parameters, config.learning_rate, optimizer)
+        self.norm: nn.Module = getattr(loss, "advantage_norm", None) or nn.Module()  # of PPO; in the checkpoint too
         self.frames_per_step = config.frames_per_update / config.grad_steps_per_update
         self.grad_steps = 0
         self.learning_rate = config.learning_rate
@@ -116,12 +117,13 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the trained weights and the generator that the coming updates depend on."""
-        return {"optimizer": self.optimizer.state_dict(), "grad_steps": self.grad_steps}
+        return {"optimizer": self.optimizer.state_dict(), "grad_steps": self.grad_steps, "norm": self.norm.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment; the weights are loaded elsewhere."""
         rate = self.optimizer.param_groups[0]["lr"]  # on CUDA a tensor, which a checkpoint would put on the CPU
         self.optimizer.load_state_dict(state["optimizer"])
+        self.norm.load_state_dict(state.get("norm", {}))  # older checkpoints have none
         self.optimizer.param_groups[0]["lr"] = rate  # its value is set before every step
         self.grad_steps = state["grad_steps"]
 

@@ -9,7 +9,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce
@@ -178,6 +178,8 @@ class PPOLoss(ClipPPOLoss):
         keys = self.tensor_keys
         if tensordict.get(keys.advantage, None) is None:
             tensordict = self.value_estimator(tensordict.copy())
+            if self.advantage_norm is not None and self.training:
+                self.advantage_norm.update(tensordict[keys.value_target])
         read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
         losses = super().forward(as_steps(tensordict, self.inputs, *read))
         if self.prediction_coeff:
@@ -203,7 +205,8 @@ class PPOLoss(ClipPPOLoss):
         self.make_value_estimator()
 
     def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
-        return normalise(advantage)
+        centred = advantage - advantage.mean()
+        return centred / (centred.square().mean().sqrt() + 1e-8)  # finite where all are equal
 
     def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
         log_weight, dist, _, correction = super()._log_weight(tensordict, adv_shape)
@@ -214,12 +217,6 @@ class PPOLoss(ClipPPOLoss):
 
     def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
         return dist.entropy().unsqueeze(-1)  # type: ignore[no-any-return]
-
-
-def normalise(advantage: Tensor) -> Tensor:
-    """Mean 0 and population standard deviation 1, over all entries; 1e-8 keeps a constant finite."""
-    centred = advantage - advantage.mean()
-    return centred / (centred.square().mean().sqrt() + 1e-8)
 
 
 class Choice(Categorical):
@@ -268,25 +265,27 @@ class PPO(Learner):
     def __init__(self, network: Any, config: PPOConfig, training: Training) -> None:
         names = ("time_limit", "entropy_coeff", "critic_coeff", "prediction_coeff")
         options: Any = {name: getattr(config, name) for name in names}
+        if config.advantage_decay:
+            options["advantage_norm"] = PopArtValueNorm(beta=config.advantage_decay, epsilon=1e-8).to(training.device)
         loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=config.clip, **options)
-        loss.make_value_estimator(
-            gamma=config.gamma, lmbda=config.lam, chunks=config.minibatches, critic=network.estimator
-        )
+        chunks = config.minibatches
+        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam, chunks=chunks, critic=network.estimator)
         super().__init__(loss, config, training, optimizer="adam")
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
         """Learn from one window, with ``action_log_prob``; see `PQN.update`."""
-        config = self.config
         data = self.loss.value_estimator(batch)
+        if self.loss.advantage_norm is not None:  # a running mean and deviation of whatever it is given
+            self.loss.advantage_norm.update(data["advantage"])
         for minibatch in self.minibatches(data):
-            left = config.entropy_end ** (frames / self.training.total_frames)
-            self.loss.entropy_coeff.fill_(config.entropy_coeff * left)
+            left = self.config.entropy_coeff * self.config.entropy_end ** (frames / self.training.total_frames)
+            self.loss.entropy_coeff.fill_(left)
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()
         return metrics | {
             "policy_loss": metrics["loss_objective"],
-            "value_loss": metrics["loss_critic"] / config.critic_coeff if config.critic_coeff else None,
+            "value_loss": metrics["loss_critic"] / self.config.critic_coeff if self.config.critic_coeff else None,
             "kl": metrics["kl_approx"],
             "q_mean": float(data["state_value"].mean()),
             "td_error": float(data["advantage"].abs().mean()),

@@ -80,8 +80,7 @@ class Trainer:
             compile_network(self.network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
-        on_gpus = torch.cuda.default_generators
-        self.random = on_gpus[device.index] if device.type == "cuda" else torch.default_generator  # draws the actions
+        self.random = torch.cuda.default_generators[device.index] if device.type == "cuda" else torch.default_generator
         training = Training(self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs)
         self.learner = LEARNERS[config.algorithm](self.network, numbers, training)
         self.policy = make_policy(self.network)

@@ -153,6 +153,7 @@ BAD = [
     ("ppo", "clip", 0.0),
     ("ppo", "entropy_coeff", -0.1),
     ("ppo", "entropy_end", 1.5),
+    ("ppo", "advantage_decay", 1.0),
     ("ppo", "critic_coeff", -0.1),
     ("ppo", "prediction_coeff", -0.1),
     ("dqn", "batch_sequences", 0),

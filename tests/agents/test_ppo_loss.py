@@ -8,12 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.modules import set_recurrent_mode
+from torchrl.modules import PopArtValueNorm, set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
 from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
-from arcade_torch.agents.ppo import PPO, normalise
+from arcade_torch.agents.ppo import PPO
 from arcade_torch.agents.sequences import as_steps
 from arcade_torch.models import ActorCriticNetwork
 from tests.agents.fakes import (
@@ -43,6 +43,10 @@ def acted(s, form="sequences", shift=0.0, **options):
     loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, **options)
     loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
     return network, batch, loss
+
+
+def normalise(advantage):
+    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
 
 
 def total(out):
@@ -260,17 +264,72 @@ def test_it_is_a_torchrl_loss_with_its_keys():
 
 
 def test_advantages_are_normalised_and_a_constant_stays_finite():
-    advantage = torch.randn(4, 5, 1)
-    found = normalise(advantage)
-    torch.testing.assert_close(found, (advantage - advantage.mean()) / advantage.std(correction=0))
-    assert torch.equal(normalise(torch.full((2, 3), 5.0)), torch.zeros(2, 3))
+    loss, advantage = acted(with_two_states(stream(2, 5, seed=8)))[2], torch.randn(4, 5, 1)
+    torch.testing.assert_close(loss._standardize_advantage(advantage, TensorDict()), normalise(advantage))
+    assert torch.equal(loss._standardize_advantage(torch.full((2, 3), 5.0), TensorDict()), torch.zeros(2, 3))
+
+
+def parts_of(loss, batch):
+    with torch.no_grad():
+        return {key: value.clone() for key, value in loss(batch).items()}
+
+
+@pytest.mark.parametrize("form", ["sequences", "stock"])
+def test_a_norm_of_torchrl_divides_the_advantages_in_the_place_of_each_minibatchs_own(form):
+    s = with_two_states(stream(3, 7, seed=12))
+    network, batch, plain = acted(s, form, shift=0.4)
+    norm = PopArtValueNorm(beta=0.5, epsilon=1e-8)
+    loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm)
+    loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    batch = loss.value_estimator(batch)
+    norm.update(batch["advantage"])
+    found, wanted = parts_of(loss, batch), parts_of(plain, batch)
+    assert norm.debiasing_term == 0.5  # one update: a loss of estimated advantages gives none
+    shifted = batch.copy().set("advantage", batch["advantage"] - batch["advantage"].mean())
+    torch.testing.assert_close(parts_of(loss, shifted)["loss_objective"], wanted["loss_objective"])
+    assert not torch.allclose(found["loss_objective"], wanted["loss_objective"])  # it is not centred
+    assert torch.equal(found["loss_critic"], wanted["loss_critic"])
+
+
+def test_a_norm_learns_from_value_targets_where_the_loss_estimates_by_itself_in_training():
+    network, batch, plain = acted(with_two_states(stream(3, 7, seed=12)))
+    norm = PopArtValueNorm(beta=0.5, epsilon=1e-8)
+    loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm)
+    loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    loss(batch)
+    torch.testing.assert_close(
+        norm.scale(), plain.value_estimator(batch.copy())["value_target"].std(correction=0)[None]
+    )
+    loss.eval()(batch)
+    assert norm.debiasing_term == 0.5
+
+
+def test_the_learner_follows_the_deviation_of_its_windows_and_a_quiet_one_stays_quiet():
+    config = PPOConfig(num_envs=3, num_steps=6, epochs=2, minibatches=3, learning_rate=1e-9, advantage_decay=0.9)
+    training = Training(total_frames=36, generator=torch.Generator(), device=torch.device("cpu"))
+    learner, seen = PPO(toy_actor_critic(3), config, training), []
+    window = with_two_states(stream(3, 6, seed=11)).sequences()
+    window["action_log_prob"] = torch.full((3, 6), -1.6)
+    advantage = torch.randn(3, 6, 1)
+    advantage -= advantage.mean()
+    estimates = {"value_target": torch.zeros(3, 6, 1), "state_value": torch.zeros(3, 6, 1)}
+    for size in (1.0, 0.01):
+        learner.loss._value_estimator.forward = lambda data, size=size: data.update(
+            {"advantage": size * advantage, **estimates}
+        )
+        learner.update(window.copy(), 0)
+        seen.append(learner.norm.scale().item())
+    squares = 0.9 * 1.0 + 0.01**2  # without bias: weights .9 and 1 of 1.9
+    deviation = advantage.std(correction=0).item()
+    assert seen == pytest.approx([deviation, deviation * math.sqrt(squares / 1.9)], rel=1e-4)
+    assert PPO(toy_actor_critic(3), replace(config, advantage_decay=0.0), training).loss.advantage_norm is None
 
 
 def test_the_defaults_are_the_papers():
     c = PPOConfig()
     assert (c.num_envs, c.num_steps, c.epochs, c.minibatches, c.gamma, c.lam) == (16, 128, 4, 16, 0.99, 0.95)
     assert (c.clip, c.entropy_coeff, c.critic_coeff, c.max_grad_norm) == (0.2, 0.01, 0.5, 0.5)
-    assert c.entropy_end == 1.0
+    assert (c.entropy_end, c.advantage_decay) == (1.0, 0.0)
     assert learning_rate_at(c, 0, 10**7) == 1e-4 and learning_rate_at(c, 10**7, 10**7) == 1e-10
     assert learning_rate_at(c, 5 * 10**6, 10**7) == pytest.approx((1e-4 + 1e-10) / 2)
     assert epsilon_at(c, 0, 10**7) is None and c.steps_before == 0
