@@ -132,9 +132,10 @@ class PPOLoss(ClipPPOLoss):
     """TorchRL's ``ClipPPOLoss`` over whole sequences of a recurrent actor and critic.
 
     Differences: advantages come from :class:`SequenceGAE` before the first gradient step and are normalised in each
-    minibatch by the population deviation plus 1e-8; the value loss is half the squared error, clipped like the ratio;
-    the entropy is not checked for NaN in every call, which would wait for the device. In keys and out keys are those of
-    ``ClipPPOLoss``, and ``loss_prediction`` where that has a weight.
+    minibatch by the population deviation plus 1e-8, unless an ``advantage_norm`` divides them (``update`` it once a
+    window with what it is to follow, advantages or value targets); the value loss is half the squared error, clipped
+    like the ratio; the entropy is not checked for NaN in every call, which would wait for the device. In keys and out
+    keys are those of ``ClipPPOLoss``, and ``loss_prediction`` where that has a weight.
 
     Args:
         actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
