@@ -206,7 +206,7 @@ class PPOConfig(LearnerConfig):
     entropy_end: Fraction = 1.0
     """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
     advantage_decay: Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)] = 0.0
-    """Kept at an update of the running deviation that advantages are divided by; 0: each minibatch by its own."""
+    """Share kept, at each update, of the running deviation that divides advantages; 0: each minibatch has its own."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
     prediction_coeff: PositiveOrZero = 0.0
@@ -230,7 +230,7 @@ class DQNConfig(QConfig):
     lam: Fraction = 0.0
     """Lambda of the return, in [0, 1]; 0 is the one-step target."""
     replay_frames: int = 132_000
-    """Capacity in frames (43,200 bytes each, 3,072 with the small encoder), rounded down to whole windows of all."""
+    """Capacity in frames (43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows."""
     batch_sequences: Count = 32
     """Sequences drawn in an update, without repetition; all epochs go over the same."""
     learning_starts: Count = 32

@@ -304,7 +304,7 @@ def test_a_norm_learns_from_value_targets_where_the_loss_estimates_by_itself_in_
     assert norm.debiasing_term == 0.5
 
 
-def test_the_learner_follows_the_deviation_of_its_windows_and_a_quiet_one_stays_quiet():
+def test_the_learner_follows_the_deviation_of_its_windows():
     config = PPOConfig(num_envs=3, num_steps=6, epochs=2, minibatches=3, learning_rate=1e-9, advantage_decay=0.9)
     training = Training(total_frames=36, generator=torch.Generator(), device=torch.device("cpu"))
     learner, seen = PPO(toy_actor_critic(3), config, training), []
