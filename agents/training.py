@@ -40,23 +40,14 @@ COMPILE_BACKEND = "inductor"
 
 @dataclass(frozen=True)
 class TrainResult:
-    """How a run ended.
+    """How a run ended."""
 
-    Attributes:
-        run_dir: its folder.
-        status: ``"finished"`` or ``"interrupted"``.
-        frames: training frames.
-        seconds: time spent collecting and learning.
-        evaluation: greedy evaluation at the end; None if interrupted.
-        train_max_ewm: the paper's score of the training curve; None where an env ended no episode.
-    """
-
-    run_dir: Path
-    status: str
-    frames: int
-    seconds: float
-    evaluation: EvalResult | None = None
-    train_max_ewm: float | None = None
+    run_dir: Path  # its folder
+    status: str  # "finished" or "interrupted"
+    frames: int  # of training
+    seconds: float  # spent collecting and learning
+    evaluation: EvalResult | None = None  # greedy, at the end; None if interrupted
+    train_max_ewm: float | None = None  # the paper's score of the training curve; None where an env ended no episode
 
 
 class Trainer:
@@ -75,17 +66,17 @@ class Trainer:
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
         self.config, numbers = config, config.learner
         device, _ = pick_devices(config.device)  # refused here if it is not there
-        self.network = build_network(config)
-        if config.compile:
-            compile_network(self.network, COMPILE_BACKEND)
+        self.network = build_network(config)  # learns
+        self.acting = build_network(config) if numbers.ema_decay else self.network  # is saved, too
+        for network in {self.network, self.acting} if config.compile else ():
+            compile_network(network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
         self.random = torch.cuda.default_generators[device.index] if device.type == "cuda" else torch.default_generator
         training = Training(self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs)
         self.learner = LEARNERS[config.algorithm](self.network, numbers, training)
-        self.policy = make_policy(self.network)
+        self.policy = make_policy(self.acting).to(device)
         self.explorers = [module for module in self.policy.modules() if isinstance(module, EGreedyModule)]
-        self.policy.to(device)
         self.env = make_env(config, numbers.num_envs, config.seed)
         self.collector = arcade_torch.ArcadeCollector(
             self.env,
@@ -100,8 +91,7 @@ class Trainer:
             store_states=False,
         )
         self.stats = EpisodeStats(np.full(numbers.num_envs, np.nan))
-        self.frames = self.updates = 0
-        self.seconds = 0.0
+        self.frames, self.updates, self.seconds = 0, 0, 0.0
 
     @property
     def done(self) -> bool:
@@ -118,8 +108,8 @@ class Trainer:
         for _ in range(windows):
             pixels = self.collector.collect(random=True).get("pixels")[:, numbers.steps_before :]
             seen.append(pixels.flatten(0, 1)[::stride].clone())
-        if seen:
-            self.network.calibrate(torch.cat(seen))
+        for network in {self.network, self.acting} if seen else ():
+            network.calibrate(torch.cat(seen))
 
     def update(self) -> dict[str, Any]:
         """Collect one window and learn from it; returns a row of ``metrics.csv``.
@@ -140,6 +130,9 @@ class Trainer:
             metrics = self.learner.update(batch, self.frames)
         except NonFiniteError as error:
             raise NonFiniteError(f"update {self.updates + 1} (after {self.frames} frames): {error}") from error
+        if numbers.ema_decay:
+            for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
+                mean.data.lerp_(new.data, 1 - numbers.ema_decay)
         self.frames += numbers.frames_per_update
         self.updates += 1
         took = time.perf_counter() - began
@@ -165,6 +158,7 @@ class Trainer:
         collector.pop("policy_state_dict", None)
         return {
             **self.learner.state_dict(),
+            "network": None if self.network is self.acting else self.network.state_dict(),
             "explore": self.random.get_state(),
             "shuffle": self.shuffle.get_state(),
             "collector": collector,
@@ -179,7 +173,8 @@ class Trainer:
         state = checkpoint.trainer or {}
         try:
             self.learner.load_state_dict(state)
-            self.network.load_state_dict(checkpoint.weights)
+            self.acting.load_state_dict(checkpoint.weights)
+            self.network.load_state_dict(state.get("network") or checkpoint.weights)
             self.random.set_state(state["explore"].cpu())
             self.shuffle.set_state(state["shuffle"])
             self.collector.load_state_dict(state["collector"], strict=False)
@@ -307,7 +302,7 @@ class _Run:
     def _evaluate(self) -> EvalResult:
         if self.eval_env is None:
             self.eval_env = make_eval_env(self.config, self.config.eval_episodes)
-        agent = Agent(self.config, self.trainer.network, self.trainer.frames)
+        agent = Agent(self.config, self.trainer.acting, self.trainer.frames)
         result = evaluate(agent, env=self.eval_env)
         row = {"frames": agent.frames, "mean": result.mean, "std": result.std, "n": len(result.returns)}
         self.evals.append(row)
@@ -321,7 +316,7 @@ class _Run:
         """Write a checkpoint, unless there is one of this moment."""
         trainer = self.trainer
         if self.saved_at != trainer.frames:
-            weights = trainer.network.state_dict()
+            weights = trainer.acting.state_dict()
             save_checkpoint(self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict())
             self.saved_at = trainer.frames
 

@@ -45,7 +45,7 @@ def config(algorithm, memory="gru", env="CartPoleEasy", **changes):
 def saved(trainer):
     """A checkpoint as it would stand in the file."""
     stream = io.BytesIO()
-    torch.save({"weights": trainer.network.state_dict(), "state": trainer.state_dict()}, stream)
+    torch.save({"weights": trainer.acting.state_dict(), "state": trainer.state_dict()}, stream)
     stream.seek(0)
     found = torch.load(stream, weights_only=True)
     return Checkpoint(trainer.config, trainer.frames, found["weights"], found["state"], Path())
@@ -66,17 +66,19 @@ def assert_replays(loss, batch):
         assert q.std() > 1e-4 and (q.amax(-1) - taken).max() < 1e-5
 
 
-@pytest.mark.parametrize("memory", ["attention", "gdn", "feedforward"])
+@pytest.mark.parametrize(
+    ("memory", "ema_decay"), [("attention", 0.0), ("gdn", 0.0), ("feedforward", 0.0), ("gru", 0.75)]
+)
 @algorithms
-def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(algorithm, memory, monkeypatch, tmp_path):
-    greedy = {} if algorithm == "ppo" else {algorithm: {"epsilon_start": 0.0, "epsilon_end": 0.0, "warmup_steps": 0}}
-    what = config(algorithm, memory, **greedy)
+def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(algorithm, memory, ema_decay, monkeypatch, tmp_path):
+    greedy = {} if algorithm == "ppo" else {"epsilon_start": 0.0, "epsilon_end": 0.0, "warmup_steps": 0}
+    what = config(algorithm, memory, **{algorithm: greedy | {"ema_decay": ema_decay}})
     trainer, ends = Trainer(what, tmp_path), []
     trainer.warm_up()
     update = trainer.learner.update
 
     def check_then_update(batch, frames):
-        if trainer.updates == 0 or algorithm == "ppo":
+        if trainer.updates == 0 or (algorithm == "ppo" and not ema_decay):
             with torch.no_grad():
                 assert_replays(trainer.learner.loss, batch)
         ends.append(bool(batch["next", "done"][:, :-1].any()))
@@ -92,9 +94,32 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(algorithm, mem
     again.load(moment)
     assert torch.equal(torch.get_rng_state(), draws)
     assert [without_times(again.update()) for _ in range(3)] == [without_times(row) for row in rows]
-    mine, theirs = again.network.state_dict(), trainer.network.state_dict()
-    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
-    assert any(not torch.equal(moment.weights[name], theirs[name]) for name in theirs)
+    for mine, theirs in ((again.network, trainer.network), (again.acting, trainer.acting)):
+        mine, theirs = mine.state_dict(), theirs.state_dict()
+        assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+        assert any(not torch.equal(moment.weights[name], theirs[name]) for name in theirs)
+
+
+@algorithms
+def test_what_acts_is_a_running_mean_of_what_is_trained(algorithm, tmp_path):
+    trainer = Trainer(config(algorithm, **{algorithm: {"ema_decay": 0.75}}), tmp_path)
+    trainer.warm_up()
+    wanted = {name: value.clone() for name, value in trainer.network.state_dict().items()}
+    assert all(torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items())
+    for _ in range(3):
+        trainer.update()
+        trained = trainer.network.state_dict()
+        for name, _ in trainer.network.named_parameters():
+            wanted[name] = 0.75 * wanted[name] + 0.25 * trained[name]
+        torch.testing.assert_close(dict(trainer.acting.state_dict()), wanted)
+    assert any(not torch.equal(value, trained[name]) for name, value in wanted.items())
+    acts = {id(p) for p in trainer.policy.parameters()}
+    assert acts == {id(p) for p in trainer.acting.parameters()}
+
+
+def test_without_a_mean_the_same_weights_act_and_learn():
+    trainer = Trainer(config("ppo"))
+    assert trainer.acting is trainer.network and trainer.state_dict()["network"] is None
 
 
 @pytest.mark.parametrize(

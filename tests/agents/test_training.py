@@ -29,7 +29,7 @@ from arcade_torch.agents import (
     training,
 )
 from arcade_torch.agents.metrics import paper_score
-from arcade_torch.agents.runs.checkpoint import list_checkpoints
+from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_checkpoint
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS
 
@@ -338,6 +338,16 @@ def test_an_agent_is_loaded_from_a_run_or_a_checkpoint(whole):
     assert load(newest).frames == 640 and load(previous).frames == 512 and load(folder / "checkpoints").frames == 640
     again = evaluate(agent, episodes=4)
     assert again.returns.tolist() == result.evaluation.returns.tolist()
+
+
+def test_the_weights_that_act_are_evaluated_saved_and_loaded(tmp_path):
+    numbers = dataclasses.asdict(CONFIG.learner) | {"ema_decay": 0.9}
+    config = dataclasses.replace(CONFIG, **{CONFIG.algorithm: type(CONFIG.learner)(**numbers)})
+    result = train(config, tmp_path)
+    agent, (newest, _) = load(tmp_path), list_checkpoints(tmp_path / "checkpoints")
+    trained = load_checkpoint(newest).trainer["network"]
+    assert any(not torch.equal(value, trained[name]) for name, value in agent.network.state_dict().items())
+    assert evaluate(agent, episodes=4).returns.tolist() == result.evaluation.returns.tolist()
 
 
 def test_loading_nothing_says_what_was_found(tmp_path):
