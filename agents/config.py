@@ -29,7 +29,6 @@ Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIM
 Positive = Annotated[float, Range("a number > 0", lambda x: x > 0.0)]
 PositiveOrZero = Annotated[float, Range("a number >= 0", lambda x: x >= 0.0)]
 Fraction = Annotated[float, Range("a number in [0, 1]", lambda x: 0.0 <= x <= 1.0)]
-Decay = Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)]
 Options = Mapping[str, Any]
 TimeLimit = Literal["bootstrap", "terminal"]
 Bootstrap = Literal["next", "last"]
@@ -124,9 +123,9 @@ class LearnerConfig(Checked):
     """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
     max_grad_norm: Positive = 0.5
     """Limit on the joint norm of the gradients."""
-    ema_decay: Decay = 0.0
-    """Share kept, at each update, of the weights that act and are saved, which then follow those in training as a
-    running mean; 0: the same weights do both."""
+    average_share: Fraction = 0.0
+    """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
+    (polynomial decay: Shamir & Zhang, arXiv 1212.1824); 0: the same weights do both."""
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
     time_limit: TimeLimit = "bootstrap"
@@ -209,7 +208,7 @@ class PPOConfig(LearnerConfig):
     """Weight of the entropy bonus at the start."""
     entropy_end: Fraction = 1.0
     """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
-    advantage_decay: Decay = 0.0
+    advantage_decay: Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)] = 0.0
     """Share kept, at each update, of the running deviation that divides advantages; 0: each minibatch has its own."""
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""

@@ -67,7 +67,7 @@ class Trainer:
         self.config, numbers = config, config.learner
         device, _ = pick_devices(config.device)  # refused here if it is not there
         self.network = build_network(config)  # learns
-        self.acting = build_network(config) if numbers.ema_decay else self.network  # is saved, too
+        self.acting = build_network(config) if numbers.average_share else self.network  # is saved, too
         for network in {self.network, self.acting} if config.compile else ():
             compile_network(network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
@@ -130,11 +130,11 @@ class Trainer:
             metrics = self.learner.update(batch, self.frames)
         except NonFiniteError as error:
             raise NonFiniteError(f"update {self.updates + 1} (after {self.frames} frames): {error}") from error
-        if numbers.ema_decay:
-            for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
-                mean.data.lerp_(new.data, 1 - numbers.ema_decay)
         self.frames += numbers.frames_per_update
         self.updates += 1
+        if self.acting is not self.network:
+            for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
+                mean.data.lerp_(new.data, 1 / (1 + numbers.average_share * self.updates))
         took = time.perf_counter() - began
         self.seconds += took
         row = {

@@ -67,18 +67,20 @@ def assert_replays(loss, batch):
 
 
 @pytest.mark.parametrize(
-    ("memory", "ema_decay"), [("attention", 0.0), ("gdn", 0.0), ("feedforward", 0.0), ("gru", 0.75)]
+    ("memory", "average_share"), [("attention", 0.0), ("gdn", 0.0), ("feedforward", 0.0), ("gru", 0.5)]
 )
 @algorithms
-def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(algorithm, memory, ema_decay, monkeypatch, tmp_path):
+def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
+    algorithm, memory, average_share, monkeypatch, tmp_path
+):
     greedy = {} if algorithm == "ppo" else {"epsilon_start": 0.0, "epsilon_end": 0.0, "warmup_steps": 0}
-    what = config(algorithm, memory, **{algorithm: greedy | {"ema_decay": ema_decay}})
+    what = config(algorithm, memory, **{algorithm: greedy | {"average_share": average_share}})
     trainer, ends = Trainer(what, tmp_path), []
     trainer.warm_up()
     update = trainer.learner.update
 
     def check_then_update(batch, frames):
-        if trainer.updates == 0 or (algorithm == "ppo" and not ema_decay):
+        if trainer.updates == 0 or (algorithm == "ppo" and not average_share):
             with torch.no_grad():
                 assert_replays(trainer.learner.loss, batch)
         ends.append(bool(batch["next", "done"][:, :-1].any()))
@@ -102,15 +104,15 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(algorithm, mem
 
 @algorithms
 def test_what_acts_is_a_running_mean_of_what_is_trained(algorithm, tmp_path):
-    trainer = Trainer(config(algorithm, **{algorithm: {"ema_decay": 0.75}}), tmp_path)
+    trainer = Trainer(config(algorithm, **{algorithm: {"average_share": 0.5}}), tmp_path)
     trainer.warm_up()
     wanted = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     assert all(torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items())
-    for _ in range(3):
+    for newest in (2 / 3, 1 / 2, 2 / 5):  # shares of the first three updates' weights
         trainer.update()
         trained = trainer.network.state_dict()
         for name, _ in trainer.network.named_parameters():
-            wanted[name] = 0.75 * wanted[name] + 0.25 * trained[name]
+            wanted[name] = (1 - newest) * wanted[name] + newest * trained[name]
         torch.testing.assert_close(dict(trainer.acting.state_dict()), wanted)
     assert any(not torch.equal(value, trained[name]) for name, value in wanted.items())
     acts = {id(p) for p in trainer.policy.parameters()}
@@ -118,7 +120,7 @@ def test_what_acts_is_a_running_mean_of_what_is_trained(algorithm, tmp_path):
 
 
 def test_without_a_mean_the_same_weights_act_and_learn():
-    trainer = Trainer(config("ppo"))
+    trainer = Trainer(config("ppo", ppo={"average_share": 0.0}))
     assert trainer.acting is trainer.network and trainer.state_dict()["network"] is None
 
 

@@ -141,7 +141,7 @@ BAD = [
         for v in (0, -1)
     ],
     *[(a, "warmup_steps", -1) for a in ("pqn", "ppo", "dqn")],
-    *[(a, "ema_decay", 1.0) for a in ("pqn", "ppo", "dqn")],
+    *[(a, "average_share", 1.5) for a in ("pqn", "ppo", "dqn")],
     *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("gamma", "lam", "lr_decay_fraction") for v in (-0.1, 1.1)],
     *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("learning_rate", "max_grad_norm") for v in (0.0, -1.0)],
     *[(a, "gamma", float("nan")) for a in ("pqn", "ppo", "dqn")],

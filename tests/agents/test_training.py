@@ -341,7 +341,7 @@ def test_an_agent_is_loaded_from_a_run_or_a_checkpoint(whole):
 
 
 def test_the_weights_that_act_are_evaluated_saved_and_loaded(tmp_path):
-    numbers = dataclasses.asdict(CONFIG.learner) | {"ema_decay": 0.9}
+    numbers = dataclasses.asdict(CONFIG.learner) | {"average_share": 0.5}
     config = dataclasses.replace(CONFIG, **{CONFIG.algorithm: type(CONFIG.learner)(**numbers)})
     result = train(config, tmp_path)
     agent, (newest, _) = load(tmp_path), list_checkpoints(tmp_path / "checkpoints")
