@@ -9,9 +9,8 @@ from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
 _SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
 _SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
 _SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
-_SMALL_PPO = {"epochs": 2, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
+_SMALL_PPO = {"epochs": 3, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
 _SMALL_PPO |= {"entropy_coeff": 0.05, "entropy_end": 0.002, "critic_coeff": 4.0, "prediction_coeff": 1.0}
-_SMALL_PPO |= {"advantage_decay": 0.99, "average_share": 0.03}
 _TINY = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
 _TINY_REPLAY = {"replay_frames": 192, "batch_sequences": 8, "learning_starts": 16, "burn_in": 2}
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -60,9 +59,9 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the last step of a
       window is trained in the next (PQN), targets are stored (DQN), no last action (PPO), no skip connection around the
       memory, the games' law of the published numbers.
-    * ``small``: a small network and PPO for the ten Easy games in ten minutes of one core (results/small.md); PQN and
-      DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it. Time limits end like terminations. With PPO a mean
-      of the weights over some updates acts, and the memory also learns to expect the next frame's features.
+    * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core (results/small.md;
+      results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
+      Time limits end like terminations; PPO's memory also learns to expect the next frame's features.
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:

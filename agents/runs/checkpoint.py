@@ -3,7 +3,7 @@
 ``checkpoints/`` of a run holds the last two, named by their frame count, and ``latest``, the name of the newest::
 
     checkpoints/latest                              text: frames-000000204800
-    checkpoints/frames-000000204800/weights.safetensors    network, buffers included
+    checkpoints/frames-000000204800/weights.safetensors    network that acts, with buffers
     checkpoints/frames-000000204800/trainer.pt             optimiser, counters, generators, environments, memory
     checkpoints/frames-000000204800/meta.json              format, config, frames, checksums; written last
 

@@ -2,8 +2,7 @@
 
     python results/small/easy.py [COMMIT STUDY_FOLDER ...]
 
-Finished runs of the study folders are added to easy.csv, where the run is not there yet; COMMIT trained them. For the
-tables of easy-before.csv, put that file in the place of easy.csv.
+Finished runs of the study folders are added to easy.csv, where the run is not there yet; COMMIT trained them.
 """
 
 import csv
@@ -23,8 +22,6 @@ TABLE = HERE / "easy.csv"
 TWINS = {"full": "MDP", "partial": "POMDP"}
 MEMORIES = {"lru": "LRU", "mlp": "none"}
 RETURNS = ("eval_mean", "train_max_ewm")
-COLUMNS = ("study", "game", "twin", "rules", "memory", "seed", "commit", "frames", "eval_mean", "eval_std")
-COLUMNS += ("train_max_ewm", "seconds", "curve")
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -49,7 +46,7 @@ def add(rows: list[dict[str, str]], commit: str, folder: Path) -> None:
         rules = "published" if config["rules"] == "reference" else "ours"
         values = [*key[:3], rules, *key[3:], commit, result["frames"], f"{result['mean']:.3f}", f"{result['std']:.3f}"]
         values += [f"{result['train_max_ewm']:.3f}", round(result["seconds"]), " ".join(f"{v:.2f}" for v in curve)]
-        rows.append(dict(zip(COLUMNS, map(str, values), strict=True)))
+        rows.append(dict(zip(rows[0], map(str, values), strict=True)))
 
 
 def paper() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
@@ -107,15 +104,11 @@ def gaps(rows: list[dict[str, str]]) -> None:
     rows, published = [row for row in rows if row["memory"] == "lru"], 0.0
     for game in sorted({row["game"] for row in rows}):
         twins = [[row for row in rows if (row["game"], row["twin"]) == (game, twin)] for twin in TWINS.values()]
-        if not all(twins):
-            continue
         columns = [game.removesuffix("Easy"), " and ".join(str(len(runs)) for runs in twins)]
         columns += [column for key in RETURNS for column in difference(*twins, key)]
         theirs = [paper()[game, twin]["LRU"][0] for twin in TWINS.values()]
         print("| " + " | ".join([*columns, number(theirs[0] - theirs[1], 2)]) + " |")
         published += normalise(game, theirs[0]) - normalise(game, theirs[1])
-    if len({(row["game"], row["twin"]) for row in rows}) < 20:
-        return
     ends, back = ["all ten, in [0, 1]", ""], {twin: name for name, twin in TWINS.items()}
     for key in RETURNS:
         scores = [Score("lru", row["game"], back[row["twin"]], int(row["seed"]), float(row[key])) for row in rows]
@@ -174,7 +167,7 @@ def main() -> None:
         add(rows, sys.argv[1], Path(folder))
     rows.sort(key=lambda row: (row["study"], row["game"], row["twin"], row["memory"], int(row["seed"])))
     with open(TABLE, "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     table(rows)
