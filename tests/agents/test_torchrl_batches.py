@@ -254,4 +254,4 @@ def test_priorities_are_written_where_torchrl_looks_for_them(burn_in, bootstrap)
     loss(s.stock().lock_())
     assert set(data.keys()) == before
     loss.set_keys(priority="surprise")
-    assert torch.equal(loss(batch := s.stock())["td_error"], batch["surprise"][:, steps].mean())
+    torch.testing.assert_close(loss(batch := s.stock())["td_error"], batch["surprise"][:, steps].mean())
