@@ -124,8 +124,8 @@ class LearnerConfig(Checked):
     max_grad_norm: Positive = 0.5
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
-    """The weights that act and are saved are a mean of those that learn, at the end over about this share of all
-    updates, after part p of the run over p cubed of that (results/recipe.md); 0: the same weights do both."""
+    """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
+    (polynomial decay: Shamir & Zhang, arXiv 1212.1824); 0: the same weights do both."""
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
     time_limit: TimeLimit = "bootstrap"

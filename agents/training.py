@@ -133,9 +133,8 @@ class Trainer:
         self.frames += numbers.frames_per_update
         self.updates += 1
         if self.acting is not self.network:
-            window = numbers.average_share * self.updates * (self.frames / self.total_frames) ** 2
             for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
-                mean.data.lerp_(new.data, 1 / (1 + window))
+                mean.data.lerp_(new.data, 1 / (1 + numbers.average_share * self.updates))
         took = time.perf_counter() - began
         self.seconds += took
         row = {
