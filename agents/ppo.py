@@ -279,8 +279,9 @@ class PPO(Learner):
         if self.loss.advantage_norm is not None:  # a running mean and deviation of whatever it is given
             self.loss.advantage_norm.update(data["advantage"])
         for minibatch in self.minibatches(data):
-            left = self.config.entropy_coeff * self.config.entropy_end ** (frames / self.training.total_frames)
-            self.loss.entropy_coeff.fill_(left)
+            progress = frames / self.training.total_frames
+            self.loss.entropy_coeff.fill_(self.config.entropy_coeff * self.config.entropy_end**progress)
+            self.loss.clip_epsilon.fill_(self.config.clip * self.config.clip_end**progress)
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()
