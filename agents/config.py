@@ -124,7 +124,8 @@ class LearnerConfig(Checked):
     max_grad_norm: Positive = 0.5
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
-    """A mean of weights over about this share of the updates so far acts and is saved (arXiv 1212.1824); 0: none."""
+    """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
+    (polynomial decay: Shamir & Zhang, arXiv 1212.1824); 0: the same weights do both."""
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
     time_limit: TimeLimit = "bootstrap"
@@ -203,8 +204,6 @@ class PPOConfig(LearnerConfig):
     """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
     clip: Positive = 0.2
     """How far the probability ratio, and the value, may move in an update before the gradient stops."""
-    clip_end: Fraction = 1.0
-    """Share of the ratio's limit which is left at the end of the run, reached by equal factors; 1 keeps it."""
     entropy_coeff: PositiveOrZero = 0.01
     """Weight of the entropy bonus at the start."""
     entropy_end: Fraction = 1.0

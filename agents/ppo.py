@@ -279,9 +279,8 @@ class PPO(Learner):
         if self.loss.advantage_norm is not None:  # a running mean and deviation of whatever it is given
             self.loss.advantage_norm.update(data["advantage"])
         for minibatch in self.minibatches(data):
-            progress = frames / self.training.total_frames
-            self.loss.entropy_coeff.fill_(self.config.entropy_coeff * self.config.entropy_end**progress)
-            self.loss.clip_epsilon.fill_(self.config.clip * self.config.clip_end**progress)
+            left = self.config.entropy_coeff * self.config.entropy_end ** (frames / self.training.total_frames)
+            self.loss.entropy_coeff.fill_(left)
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()

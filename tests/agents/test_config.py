@@ -152,7 +152,6 @@ BAD = [
     *[(a, "overlap", v) for a in ("pqn", "dqn") for v in (-1, 129)],
     ("pqn", "bootstrap", "first"),
     ("ppo", "clip", 0.0),
-    ("ppo", "clip_end", 1.5),
     ("ppo", "entropy_coeff", -0.1),
     ("ppo", "entropy_end", 1.5),
     ("ppo", "advantage_decay", 1.0),
