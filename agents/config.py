@@ -125,7 +125,7 @@ class LearnerConfig(Checked):
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
     """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
-    (polynomial decay: Shamir & Zhang, arXiv 1212.1824); 0: the same weights do both."""
+    (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of the return, in [0, 1]; 0: no mean."""
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
     time_limit: TimeLimit = "bootstrap"

@@ -133,8 +133,9 @@ class Trainer:
         self.frames += numbers.frames_per_update
         self.updates += 1
         if self.acting is not self.network:
+            reached = min(1.0, max(0.0, self.stats.smooth or 0.0)) ** 4
             for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
-                mean.data.lerp_(new.data, 1 / (1 + numbers.average_share * self.updates))
+                mean.data.lerp_(new.data, 1 / (1 + reached * numbers.average_share * self.updates))
         took = time.perf_counter() - began
         self.seconds += took
         row = {

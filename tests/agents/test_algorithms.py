@@ -103,12 +103,14 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
 
 
 @algorithms
-def test_what_acts_is_a_running_mean_of_what_is_trained(algorithm, tmp_path):
+def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(algorithm, monkeypatch, tmp_path):
     trainer = Trainer(config(algorithm, **{algorithm: {"average_share": 0.5}}), tmp_path)
     trainer.warm_up()
     wanted = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     assert all(torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items())
-    for newest in (2 / 3, 1 / 2, 2 / 5):  # shares of the first three updates' weights
+    monkeypatch.setattr(trainer.stats, "update", lambda *window: None)
+    for reached, newest in ((None, 1), (-1.0, 1), (0.5, 32 / 35), (1.0, 1 / 3), (7.0, 2 / 7)):  # shares of new weights
+        trainer.stats.smooth = reached
         trainer.update()
         trained = trainer.network.state_dict()
         for name, _ in trainer.network.named_parameters():
