@@ -170,7 +170,10 @@ def main() -> None:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+    mean = [row for row in rows if row["study"].startswith("easy-mean")]
+    rows = [row for row in rows if row not in mean]
     table(rows)
+    table(mean)
     compare(rows)
     gaps(rows)
     draw(rows)
