@@ -170,10 +170,10 @@ def main() -> None:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    mean = [row for row in rows if row["study"].startswith("easy-mean")]
-    rows = [row for row in rows if row not in mean]
-    table(rows)
-    table(mean)
+    others = {name: [row for row in rows if row["study"].startswith(name)] for name in ("easy-mean", "two-passes")}
+    rows = [row for row in rows if not any(row in other for other in others.values())]
+    for part in (rows, *others.values()):
+        table(part)
     compare(rows)
     gaps(rows)
     draw(rows)
