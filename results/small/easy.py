@@ -171,7 +171,7 @@ def main() -> None:
         writer.writeheader()
         writer.writerows(rows)
     others = {name: [row for row in rows if row["study"].startswith(name)] for name in ("easy-mean", "two-passes")}
-    rows = [row for row in rows if not any(row in other for other in others.values())]
+    rows = [row for row in rows if not row["study"].startswith(tuple(others))]
     for part in (rows, *others.values()):
         table(part)
     compare(rows)
