@@ -170,7 +170,8 @@ def main() -> None:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    others = {name: [row for row in rows if row["study"].startswith(name)] for name in ("easy-mean", "two-passes")}
+    apart = ("easy-mean", "eight-minibatches", "two-passes")  # studies of settings that are not the preset
+    others = {name: [row for row in rows if row["study"].startswith(name)] for name in apart}
     rows = [row for row in rows if not row["study"].startswith(tuple(others))]
     for part in (rows, *others.values()):
         table(part)
