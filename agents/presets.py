@@ -9,8 +9,10 @@ from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
 _SMALL = {"num_envs": 64, "num_steps": 32, "max_grad_norm": 1.0, "warmup_steps": 150, "time_limit": "terminal"}
 _SMALL_Q = {"overlap": 0, "minibatches": 16, "lam": 0.8, "lr_decay_fraction": 1.0, "exploration_fraction": 0.4}
 _SMALL_REPLAY = {"replay_frames": 100_000, "batch_sequences": 128, "learning_starts": 256, "burn_in": 4}
-_SMALL_PPO = {"epochs": 3, "minibatches": 4, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
-_SMALL_PPO |= {"entropy_coeff": 0.05, "entropy_end": 0.002, "critic_coeff": 4.0, "prediction_coeff": 1.0}
+_SMALL_PPO = {"epochs": 2, "minibatches": 8, "learning_rate": 1e-3, "learning_rate_end": 5e-5, "average_share": 0.1}
+_SMALL_PPO |= {"entropy_coeff": 0.1, "entropy_end": 0.001, "critic_coeff": 4.0, "advantage_decay": 0.99}
+_AT_ONCE = ("AutoEncode", "BattleShip", "CountRecall", "MineSweeper")  # an action is paid in the step it is taken
+_SURVIVAL = ("CartPole", "Noisy", "Skittles")  # every step survived is paid, and nothing else
 _TINY = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
 _TINY_REPLAY = {"replay_frames": 192, "batch_sequences": 8, "learning_starts": 16, "burn_in": 2}
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -25,26 +27,19 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "small": {
         "algorithm": "ppo",
         "network": "small",
-        "total_frames": 2_200_000,
+        "total_frames": 2_500_000,
         "threads": 1,
-        "eval_every": 200_000,
+        "eval_every": 250_000,
         "checkpoint_every": 50_000,
         "pqn": _SMALL | _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6},
-        "ppo": _SMALL | _SMALL_PPO,
+        "ppo": _SMALL | _SMALL_PPO | {"prediction_coeff": 1.0},
         "dqn": _SMALL | _SMALL_Q | {"epochs": 1, "learning_rate": 1e-3, "learning_rate_end": 5e-5} | _SMALL_REPLAY,
     },
 }
-_PRESETS["smoke"] = _PRESETS["small"] | {
-    "algorithm": "pqn",
-    "memory": "mingru",
-    "total_frames": 512,
-    "eval_every": 0,
-    "eval_episodes": 4,
-    "checkpoint_every": 128,
-    "pqn": _PRESETS["small"]["pqn"] | _TINY,
-    "ppo": _PRESETS["small"]["ppo"] | _TINY,
-    "dqn": _PRESETS["small"]["dqn"] | _TINY | _TINY_REPLAY,
-}
+_PRESETS["smoke"] = _PRESETS["small"] | {group: _PRESETS["small"][group] | _TINY for group in GROUPS}
+_PRESETS["smoke"]["dqn"] |= _TINY_REPLAY
+_PRESETS["smoke"] |= {"algorithm": "pqn", "memory": "mingru", "total_frames": 512, "checkpoint_every": 128}
+_PRESETS["smoke"] |= {"eval_every": 0, "eval_episodes": 4}
 
 
 def preset_names() -> list[str]:
@@ -61,7 +56,9 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       memory, the games' law of the published numbers.
     * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core (results/small.md;
       results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy, SkittlesEasy, MineSweeperEasy with it.
-      Time limits end like terminations; PPO's memory also learns to expect the next frame's features.
+      Time limits end like terminations; PPO's memory also learns to expect the next frame's features. PPO's gamma is
+      .98 in games that pay an action at once (AutoEncode, BattleShip, CountRecall, MineSweeper), .995 in those that pay
+      every step survived (the CartPoles, Skittles), .99 in the others.
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -89,6 +86,8 @@ def preset(name: str, **changes: Any) -> TrainConfig:
         values["network_options"] = {"skip": "none", "use_last_action": False}
     if name in ("paper", "reference"):
         values |= _paper_budget(values, env)
+    if name == "small" and env.startswith(_AT_ONCE + _SURVIVAL):
+        values["ppo"] = values["ppo"] | {"gamma": 0.98 if env.startswith(_AT_ONCE) else 0.995}
     for group, kind in GROUPS.items():
         if group in changes:
             given = changes[group]

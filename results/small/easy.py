@@ -2,13 +2,15 @@
 
     python results/small/easy.py [COMMIT STUDY_FOLDER ...]
 
-Finished runs of the study folders are added to easy.csv, where the run is not there yet; COMMIT trained them.
+Finished runs of the study folders, trained by COMMIT, are added to easy.csv where they are not there yet. Their greedy
+return is that of ``arcade-torch evaluate RUN --episodes 1024 --json RUN/greedy.json``.
 """
 
 import csv
 import json
 import sys
 from pathlib import Path
+from statistics import mean, pstdev
 
 import matplotlib.pyplot as plt
 from scipy.stats import ttest_ind
@@ -30,12 +32,13 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def add(rows: list[dict[str, str]], commit: str, folder: Path) -> None:
-    """Append the finished runs of a study that are not there yet."""
+    """Append the finished and evaluated runs of a study that are not there yet."""
     known = {(row["study"], row["game"], row["twin"], row["memory"], row["seed"]) for row in rows}
     for run in sorted((folder / "runs").iterdir()):
-        if not (run / "eval.json").exists():
+        if not (run / "greedy.json").exists():
             continue
         result = json.loads((run / "eval.json").read_text())
+        returns = json.loads((run / "greedy.json").read_text())["returns"]
         config = json.loads((run / "config.json").read_text())["config"]
         twin = TWINS[config["observability"]]
         key = (folder.name, config["env"].removesuffix("-v0"), twin, config["memory"], str(config["seed"]))
@@ -44,8 +47,9 @@ def add(rows: list[dict[str, str]], commit: str, folder: Path) -> None:
         with open(run / "eval.csv") as file:
             curve = [float(row["mean"]) for row in csv.DictReader(file)]
         rules = "published" if config["rules"] == "reference" else "ours"
-        values = [*key[:3], rules, *key[3:], commit, result["frames"], f"{result['mean']:.3f}", f"{result['std']:.3f}"]
-        values += [f"{result['train_max_ewm']:.3f}", round(result["seconds"]), " ".join(f"{v:.2f}" for v in curve)]
+        values = [*key[:3], rules, *key[3:], commit, result["frames"], f"{mean(returns):.3f}", f"{pstdev(returns):.3f}"]
+        values += [len(returns), f"{result['train_max_ewm']:.3f}", round(result["seconds"])]
+        values.append(" ".join(f"{value:.2f}" for value in curve))
         rows.append(dict(zip(rows[0], map(str, values), strict=True)))
 
 
@@ -72,9 +76,9 @@ def table(rows: list[dict[str, str]]) -> None:
     for (game, twin, rules, memory), runs in cells.items():
         models = paper()[game, twin]
         best = max(models, key=lambda model: models[model])
-        means = [sum(float(run[key]) for run in runs) / len(runs) for key in RETURNS]
-        enough = [round(mean, 2) >= models[best][0] for mean in means]
-        near = [mean >= models[best][0] - models[best][1] / 5**0.5 for mean in means]  # they have five seeds
+        means = [mean(float(run[key]) for run in runs) for key in RETURNS]
+        enough = [round(value, 2) >= models[best][0] for value in means]
+        near = [value >= models[best][0] - models[best][1] / 5**0.5 for value in means]  # they have five seeds
         reached = {(True, True): "yes", (True, False): "greedy only", (False, True): "training only"}
         verdict = reached.get((enough[0], enough[1]), "no")
         if verdict != "yes" and all(map(max, enough, near)):
@@ -89,7 +93,7 @@ def table(rows: list[dict[str, str]]) -> None:
 def difference(one: list[dict[str, str]], other: list[dict[str, str]], key: str) -> list[str]:
     """The means of two cells, and their difference with Welch's 95 % interval where both have several seeds."""
     values = [[float(run[key]) for run in runs] for runs in (one, other)]
-    means = [sum(cell) / len(cell) for cell in values]
+    means = [mean(cell) for cell in values]
     found = number(means[0] - means[1])
     if min(map(len, values)) > 1:
         interval = ttest_ind(*values, equal_var=False).confidence_interval()
@@ -146,7 +150,7 @@ def draw(rows: list[dict[str, str]]) -> None:
             for row in rows:
                 if (row["game"], row["twin"]) == (game, twin):
                     curve = [float(value) for value in row["curve"].split()]
-                    axis.plot([0.2 * (n + 1) for n in range(len(curve))], curve, color=colours[row["memory"]], lw=1.2)
+                    axis.plot([0.25 * (n + 1) for n in range(len(curve))], curve, color=colours[row["memory"]], lw=1.2)
             axis.set_title(f"{game.removesuffix('Easy')} {twin}", fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel("million frames")
@@ -170,7 +174,7 @@ def main() -> None:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    apart = ("easy-mean", "eight-minibatches", "two-passes")  # studies of settings that are not the preset
+    apart = ("before", "eight-minibatches", "two-passes")  # studies of settings that are not the preset
     others = {name: [row for row in rows if row["study"].startswith(name)] for name in apart}
     rows = [row for row in rows if not row["study"].startswith(tuple(others))]
     for part in (rows, *others.values()):

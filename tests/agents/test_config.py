@@ -10,6 +10,7 @@ import torch
 from arcade_torch.agents.config import GROUPS, OF_ENV, OF_NETWORK, DQNConfig, PQNConfig, TrainConfig, differing_fields
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
+from arcade_torch.envs_jax.registry import GAMES
 
 
 def test_the_defaults_are_the_papers_numbers():
@@ -49,7 +50,7 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
 
-@pytest.mark.parametrize(("algorithm", "steps"), [("pqn", 3104), ("ppo", 1164)])
+@pytest.mark.parametrize(("algorithm", "steps"), [("pqn", 3104), ("ppo", 1552)])
 def test_gradient_steps_of_the_small_preset_in_200k_frames(algorithm, steps):
     c = preset("small", algorithm=algorithm, total_frames=200_000)
     assert c.num_updates * c.learner.grad_steps_per_update == steps
@@ -60,6 +61,15 @@ def test_the_small_preset_is_the_recipe_and_every_learner_has_numbers_in_it():
     assert preset("small", algorithm="pqn", pqn={"lam": 0.5}).pqn.lam == 0.5
     with pytest.raises(ValueError, match="the algorithm is 'ppo'"):
         preset("small", pqn={"lam": 0.5})
+
+
+def test_the_small_presets_discount_goes_by_how_soon_an_action_is_paid():
+    at_once = dict.fromkeys(("AutoEncode", "BattleShip", "CountRecall", "MineSweeper"), 0.98)
+    gammas = at_once | dict.fromkeys(("CartPole", "NoisyCartPole", "Skittles"), 0.995)
+    for game in GAMES:
+        assert preset("small", env=f"{game}Easy").ppo.gamma == gammas.get(game, 0.99)
+        assert preset("small", env=f"{game}Easy", ppo={"gamma": 0.9}).ppo.gamma == 0.9
+        assert preset("small", env=f"{game}Easy", algorithm="pqn").pqn.gamma == 0.99
 
 
 @pytest.mark.parametrize("name", preset_names())
