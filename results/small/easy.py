@@ -15,7 +15,8 @@ from statistics import mean, pstdev
 import matplotlib.pyplot as plt
 from scipy.stats import ttest_ind
 
-from arcade_torch.tools.analysis.gap_bias import game_of, gap_and_bias, normalise
+from arcade_torch.tools.analysis.bootstrap import Interval
+from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, gap_and_bias, normalise
 from arcade_torch.tools.runs import Score
 
 HERE = Path(__file__).parent
@@ -96,45 +97,76 @@ def difference(one: list[dict[str, str]], other: list[dict[str, str]], key: str)
     means = [mean(cell) for cell in values]
     found = number(means[0] - means[1])
     if min(map(len, values)) > 1:
-        interval = ttest_ind(*values, equal_var=False).confidence_interval()
-        found += f" [{number(interval.low, 2)}, {number(interval.high, 2)}]"
+        welch = ttest_ind(*values, equal_var=False).confidence_interval()
+        found += f" [{number(welch.low, 2)}, {number(welch.high, 2)}]"
     return [", ".join(map(number, means)), found]
 
 
+def wholes(rows: list[dict[str, str]]) -> list[GapBias]:
+    """Gap and bias over all games that every agent has on both twins, greedily and in training."""
+    back = {twin: name for name, twin in TWINS.items()}
+    found = []
+    for key in RETURNS:
+        scores = [Score(r["memory"], r["game"], back[r["twin"]], int(r["seed"]), float(r[key])) for r in rows]
+        found.append(gap_and_bias(scores))
+    return found
+
+
+def interval(found: Interval) -> str:
+    """A number of the suite with its interval."""
+    return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
+
+
 def gaps(rows: list[dict[str, str]]) -> None:
-    """Print the observability gap of LRU, MDP minus POMDP, game by game and over all games."""
-    print("\n| game | seeds | greedy: MDP, POMDP | gap | training: MDP, POMDP | gap | paper: LRU's gap |")
+    """Print the observability gap, MDP minus POMDP: LRU's game by game, both agents' over all games."""
+    print("\n| game | seeds | greedy: MDP, POMDP | gap | training: MDP, POMDP | gap | paper: gap |")
     print("|" + "---|" * 7)
-    rows, published = [row for row in rows if row["memory"] == "lru"], 0.0
-    for game in sorted({row["game"] for row in rows}):
-        twins = [[row for row in rows if (row["game"], row["twin"]) == (game, twin)] for twin in TWINS.values()]
+    lru, models, suites = [row for row in rows if row["memory"] == "lru"], paper(), wholes(rows)
+    for game in sorted({row["game"] for row in lru}):
+        twins = [[row for row in lru if (row["game"], row["twin"]) == (game, twin)] for twin in TWINS.values()]
         columns = [game.removesuffix("Easy"), " and ".join(str(len(runs)) for runs in twins)]
         columns += [column for key in RETURNS for column in difference(*twins, key)]
-        theirs = [paper()[game, twin]["LRU"][0] for twin in TWINS.values()]
+        theirs = [models[game, twin]["LRU"][0] for twin in TWINS.values()]
         print("| " + " | ".join([*columns, number(theirs[0] - theirs[1], 2)]) + " |")
-        published += normalise(game, theirs[0]) - normalise(game, theirs[1])
-    ends, back = ["all ten, in [0, 1]", ""], {twin: name for name, twin in TWINS.items()}
-    for key in RETURNS:
-        scores = [Score("lru", row["game"], back[row["twin"]], int(row["seed"]), float(row[key])) for row in rows]
-        suite = gap_and_bias(scores, baseline="lru").row("lru")
-        gap = f"{number(suite.gap.value)} [{number(suite.gap.low)}, {number(suite.gap.high)}]"
-        ends += [f"{number(suite.mdp.value)}, {number(suite.pomdp.value)}", gap]
-    print("| " + " | ".join([*ends, number(published / 10, 2)]) + " |")
+    for memory, name in (("lru", "LRU"), ("mlp", "MLP")):  # the paper's MLP has the same zeros on both twins of Tetris
+        columns = [f"all, {MEMORIES[memory]}", f"{len(suites[0].tasks)} games"]
+        for suite in suites:
+            row = suite.row(memory)
+            columns += [f"{number(row.mdp.value)}, {number(row.pomdp.value)}", interval(row.gap)]
+        means = [
+            sum(normalise(g, m[name][0]) for (g, t), m in models.items() if t == twin and name in m)
+            for twin in TWINS.values()
+        ]
+        print("| " + " | ".join([*columns, number((means[0] - means[1]) / len(suites[0].tasks), 2)]) + " |")
 
 
-def compare(rows: list[dict[str, str]]) -> None:
-    """Print what LRU adds on the POMDPs, where both agents were trained: means over seeds, Welch's 95 % intervals."""
-    print("\n| POMDP | seeds | greedy: LRU, none | added | training: LRU, none | added | paper: LRU, none |")
+def compare(rows: list[dict[str, str]], twin: str) -> None:
+    """Print what LRU adds where both agents were trained: means over seeds, with Welch's 95 % intervals."""
+    print(f"\n| {twin} | seeds | greedy: LRU, none | added | training: LRU, none | added | paper: LRU, none |")
     print("|" + "---|" * 7)
-    for game in sorted({row["game"] for row in rows}):
-        runs = {m: [r for r in rows if (r["game"], r["twin"], r["memory"]) == (game, "POMDP", m)] for m in MEMORIES}
-        if not all(runs.values()):
-            continue
-        columns = [game.removesuffix("Easy"), " and ".join(str(len(runs[m])) for m in MEMORIES)]
-        columns += [column for key in RETURNS for column in difference(runs["lru"], runs["mlp"], key)]
-        models = paper()[game, "POMDP"]
+    cells = {m: [row for row in rows if (row["twin"], row["memory"]) == (twin, m)] for m in MEMORIES}
+    for game in sorted({row["game"] for row in cells["lru"]} & {row["game"] for row in cells["mlp"]}):
+        runs = [[row for row in cell if row["game"] == game] for cell in cells.values()]
+        columns = [game.removesuffix("Easy"), " and ".join(str(len(cell)) for cell in runs)]
+        columns += [column for key in RETURNS for column in difference(*runs, key)]
+        models = paper()[game, twin]
         columns.append(", ".join(number(models[name][0], 2) if name in models else "-" for name in ("LRU", "MLP")))
         print("| " + " | ".join(columns) + " |")
+
+
+def bias(rows: list[dict[str, str]]) -> None:
+    """Print the memory bias of LRU, the last lines of the table above, with and without Tetris."""
+    suites = wholes(rows)
+    for title, without in (("all, in [0, 1]", ""), ("all but Tetris", "Tetris")):
+        tasks, columns = [task for task in suites[0].tasks if game_of(task) != without], []
+        for suite in suites:
+            agents = {row.agent: row for row in (suite.without[without] if without else suite.rows)}
+            columns += [", ".join(number(agents[m].mdp.value) for m in MEMORIES), interval(agents["lru"].bias)]
+        ends = "-"  # the paper's Tetris without memory is not a return
+        if without:
+            theirs = [[normalise(task, paper()[task, "MDP"][name][0]) for task in tasks] for name in ("LRU", "MLP")]
+            ends = ", ".join(number(mean(values)) for values in theirs)
+        print("| " + " | ".join([title, f"{len(tasks)} games", *columns, ends]) + " |")
 
 
 def draw(rows: list[dict[str, str]]) -> None:
@@ -179,7 +211,9 @@ def main() -> None:
     rows = [row for row in rows if not row["study"].startswith(tuple(others))]
     for part in (rows, *others.values()):
         table(part)
-    compare(rows)
+    for twin in reversed(TWINS.values()):
+        compare(rows, twin)
+    bias(rows)
     gaps(rows)
     draw(rows)
 
