@@ -4,10 +4,13 @@ Public names are resolved on first use: importing the package costs little, ``ar
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-import arcade_torch.gym  # puts the games into Gymnasium's registry
-import arcade_torch.process  # noqa: F401  (notes forks)
+import arcade_torch.process
+
+if find_spec("gymnasium") is not None:  # the memory models do without it
+    import arcade_torch.gym  # noqa: F401  (puts the games into Gymnasium's registry)
 
 __version__ = "0.2.0"
 

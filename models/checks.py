@@ -14,6 +14,14 @@ __all__ = ["MemoryLawError", "check_memory"]
 
 GUARD = 1e-4  # what a small number in a denominator may cost the law of averages
 
+# Largest difference allowed between two ways to compute the same thing; see ``_difference``.
+TOLERANCES = {
+    torch.float64: 1e-7,
+    torch.float32: 1e-4,
+    torch.bfloat16: 0.1,
+    torch.float16: 0.01,
+}
+
 
 class MemoryLawError(AssertionError):
     """A memory model breaks one of the laws.
@@ -29,7 +37,13 @@ class MemoryLawError(AssertionError):
 
 
 def check_memory(
-    module: nn.Module, *, input_size: int | None = None, tolerance: float = 1e-7, seed: int = 0, gradients: bool = True
+    module: nn.Module,
+    *,
+    input_size: int | None = None,
+    dtype: torch.dtype = torch.float64,
+    tolerance: float | None = None,
+    seed: int = 0,
+    gradients: bool = True,
 ) -> dict[str, float]:
     """Check that a module is a lawful memory model.
 
@@ -41,16 +55,22 @@ def check_memory(
             ``averages_values = True`` says that its outputs depend on the past through a weighted mean only, as in
             attention, and has to keep one law more: the same input at every step gives the same output at every step.
         input_size: D; None reads ``module.input_size``.
-        tolerance: largest absolute difference allowed between two ways to compute the same outputs of order 1.
+        dtype: of parameters and inputs during the check. float64 finds the most; take float32, bfloat16
+            or float16 for kernels that know nothing else.
+        tolerance: largest difference allowed between two ways to compute the same outputs or states, as a
+            share of their largest entry where that is above 1; None for 1e-7 in float64, 1e-4 in float32,
+            0.01 in float16 and 0.1 in bfloat16.
         seed: of the random inputs.
-        gradients: also compare gradients with finite differences (the slowest law).
+        gradients: also compare gradients (the slowest law): in float64 with finite differences, which less
+            precise numbers cannot tell; in other types those of one call with those of a call a step.
 
     Returns:
         For each law the largest discrepancy that was found (all within tolerance).
 
     Raises:
         MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
-        ValueError, TypeError: the input size is not known; there is no ``initial_state``.
+        ValueError, TypeError: the input size is not known, or ``dtype`` is none of the four; there is no
+            ``initial_state``.
 
     Example:
         >>> from arcade_torch.models import check_memory, make_memory
@@ -62,9 +82,14 @@ def check_memory(
         raise ValueError("input size unknown: pass check_memory(module, input_size=...) or set module.input_size")
     if not hasattr(module, "initial_state"):
         raise TypeError(f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict")
+    if dtype not in TOLERANCES:
+        allowed = ", ".join(map(str, TOLERANCES))
+        raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
+    if tolerance is None:
+        tolerance = TOLERANCES[dtype]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        subject = _Subject(copy.deepcopy(module).double().eval(), size, tolerance)
+        subject = _Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
         laws: list[tuple[str, Callable[[_Subject, str], float]]] = [
             ("shapes are fixed", _shapes),
             ("scan equals step by step", _scan_equals_steps),
@@ -78,7 +103,8 @@ def check_memory(
         if getattr(module, "averages_values", False):
             laws.append(("an average of equal values is that value", _averages))
         if gradients:
-            laws.append(("gradients are right", _gradients))
+            exact = dtype == torch.float64
+            laws.append(("gradients are right", _gradients if exact else _gradients_of_steps))
         return {name: law(subject, name) for name, law in laws}
 
 
@@ -88,12 +114,13 @@ class _Subject:
 
     module: nn.Module
     input_size: int
+    dtype: torch.dtype
     tolerance: float
 
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
         like = next(self.module.parameters(), torch.zeros(0))
-        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(like.device)
+        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(like.device, self.dtype)
 
     def inputs(self, batch: int, steps: int, resets: float = 0.0) -> tuple[Tensor, TensorDict, Tensor]:
         """Random x, a state that some steps have led to, and start flags."""
@@ -109,10 +136,21 @@ class _Subject:
         self, law: str, found: str, cause: str, *pairs: tuple[Tensor, Tensor], tolerance: float | None = None
     ) -> float:
         """Largest difference of the pairs; raises if above the tolerance or not a number."""
-        worst = max((float((p - q).abs().max()) for p, q in pairs if p.numel()), default=0.0)
+        worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
         if not worst <= (self.tolerance if tolerance is None else tolerance):
             raise MemoryLawError(law, f"{found} (largest difference {worst:.2g})", cause, worst)
         return worst
+
+
+def _difference(p: Tensor, q: Tensor) -> float:
+    """Largest difference, as a share of the largest entry where that is above 1: sums over many steps
+    are large, and so is their rounding. Computed in float64.
+    """
+    wide = torch.complex128 if p.is_complex() else torch.float64
+    p = p.to(wide)
+    q = q.to(wide)
+    size = q.abs().max().clamp_min(1.0)
+    return float((p - q).abs().max() / size)
 
 
 def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
@@ -121,8 +159,8 @@ def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
 
 
 def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
-    """Tensors of two states side by side, as floats."""
-    return [(leaf.double(), q.get(key).double()) for key, leaf in _leaves(p).items()]
+    """Tensors of two states side by side."""
+    return [(leaf, q.get(key)) for key, leaf in _leaves(p).items()]
 
 
 def _shapes(s: _Subject, law: str) -> float:
@@ -142,8 +180,8 @@ def _shapes(s: _Subject, law: str) -> float:
             found = f"initial_state({batch}) has {expected} but forward returned {got}"
             cause = "the state grows, lacks the batch dimension, or does not take dtype and device from the parameters"
             raise MemoryLawError(law, found, cause)
-        if y.dtype != torch.float64:
-            raise MemoryLawError(law, f"float64 inputs gave {y.dtype}", "a constant or a cast in another dtype")
+        if y.dtype != s.dtype:
+            raise MemoryLawError(law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype")
     x, state, flags = s.inputs(2, 5, 0.3)
     before = state.clone()
     s.module(x, state, flags)
@@ -319,3 +357,20 @@ def _gradients(s: _Subject, law: str) -> float:
             "a hand-written backward pass, a detach, a .data or an in-place write",
         ) from error
     return 0.0
+
+
+def _gradients_of_steps(s: _Subject, law: str) -> float:
+    """The gradient of one call is that of a call a step, as far as rounding lets them agree."""
+    x, state, flags = s.inputs(2, 9)
+    flags[0, 4] = True
+    weight = s.random(2, 1)[..., :1]
+    parameters = [p for p in s.module.parameters() if p.requires_grad]
+    gradients = []
+    for read in (s.module, lambda *inputs: _steps(s, *inputs)):
+        given = x.clone().requires_grad_()
+        y, _ = read(given, state, flags)
+        arguments = [given, *parameters]
+        gradients.append(torch.autograd.grad((weight * y).sum(), arguments, materialize_grads=True))
+    pairs = zip(*gradients, strict=True)
+    found = "the gradients of one call and of a call a step differ"
+    return s.compare(law, found, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs)

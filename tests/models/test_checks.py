@@ -7,7 +7,7 @@ from torch import nn
 
 from arcade_torch.models.checks import MemoryLawError, check_memory
 from arcade_torch.models.mingru import MinGRU
-from arcade_torch.models.registry import make_memory
+from arcade_torch.models.registry import make_memory, memory_names
 
 
 class LeakyAverage(nn.Module):
@@ -235,3 +235,79 @@ def test_the_input_size_is_asked_for_when_it_cannot_be_known():
     with pytest.raises(ValueError, match="input_size"):
         check_memory(memory)
     check_memory(memory, input_size=3)
+
+
+# -- less precise numbers ----------------------------------------------------------------------
+
+
+class OnlyFloat32(LeakyAverage):
+    """Stands for a kernel that knows one type."""
+
+    def forward(self, x, state, is_init):
+        if x.dtype != torch.float32:
+            raise RuntimeError(f"expected float32, got {x.dtype}")
+        return super().forward(x, state, is_init)
+
+
+def test_a_kernel_that_knows_float32_alone_can_be_checked():
+    with pytest.raises(RuntimeError, match="expected float32"):
+        check_memory(OnlyFloat32())
+    report = check_memory(OnlyFloat32(), dtype=torch.float32)
+    assert len(report) == 7 and max(report.values()) < 1e-5
+
+
+@pytest.mark.parametrize("name", memory_names())
+def test_our_memories_pass_in_float32(name):
+    assert max(check_memory(make_memory(name, 5, 8), dtype=torch.float32).values()) < 1e-5
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.parametrize("name", ["mingru", "gru", "mlp", "linear_transformer", "attention"])
+def test_memories_of_real_numbers_pass_in_half_precision(name, dtype):
+    check_memory(make_memory(name, 5, 8), dtype=dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+@pytest.mark.parametrize(
+    ("flaw", "law"),
+    [
+        ("late flag", "scan equals step by step"),
+        ("ignores state", "scan equals step by step"),
+        ("only at index 0", "scan equals step by step"),
+        ("multiplies", "nothing leaks over a start"),
+        ("any row", "batch rows are independent"),
+        ("looks ahead", "scan equals step by step"),
+    ],
+)
+def test_a_broken_model_is_found_in_less_precise_numbers_too(flaw, law, dtype):
+    with pytest.raises(MemoryLawError, match=law):
+        check_memory(LeakyAverage(flaw), dtype=dtype)
+
+
+class WrongGradient(torch.autograd.Function):
+    """Passes its input on, and the gradient of the last step alone."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, gradient):
+        out = torch.zeros_like(gradient)
+        out[:, -1] = gradient[:, -1]
+        return out
+
+
+class Detaching(LeakyAverage):
+    def forward(self, x, state, is_init):
+        return super().forward(WrongGradient.apply(x), state, is_init)
+
+
+def test_a_wrong_gradient_is_found_in_float32():
+    with pytest.raises(MemoryLawError, match="gradients"):
+        check_memory(Detaching(), dtype=torch.float32)
+
+
+def test_a_type_that_is_no_floating_one_is_refused():
+    with pytest.raises(ValueError, match=r"dtype is torch\.int64, allowed: torch\.float64"):
+        check_memory(LeakyAverage(), dtype=torch.int64)
