@@ -18,10 +18,11 @@ _MODULES = {
     "learner": ("NonFiniteError",),
     "metrics": ("paper_score",),
     "policy": ("Agent", "build_network", "load", "make_policy"),
-    "ppo": ("PPO", "PPOLoss", "SequenceGAE", "gae", "make_actor"),
-    "pqn": ("PQN", "PQNLoss", "QLambdaEstimator", "q_lambda_return"),
+    "ppo": ("PPO", "PPOLoss", "make_actor"),
+    "pqn": ("PQN", "PQNLoss"),
     "presets": ("preset", "preset_names"),
     "replay": ("SequenceReplay",),
+    "returns": ("QLambdaEstimator", "SequenceGAE", "gae", "q_lambda_return"),
     "runs.files": ("CheckpointError",),
     "runs.folder": ("RunFolderError",),
     "training": ("TrainResult", "Trainer", "train"),
@@ -35,10 +36,11 @@ if TYPE_CHECKING:
     from arcade_torch.agents.learner import NonFiniteError
     from arcade_torch.agents.metrics import paper_score
     from arcade_torch.agents.policy import Agent, build_network, load, make_policy
-    from arcade_torch.agents.ppo import PPO, PPOLoss, SequenceGAE, gae, make_actor
-    from arcade_torch.agents.pqn import PQN, PQNLoss, QLambdaEstimator, q_lambda_return
+    from arcade_torch.agents.ppo import PPO, PPOLoss, make_actor
+    from arcade_torch.agents.pqn import PQN, PQNLoss
     from arcade_torch.agents.presets import preset, preset_names
     from arcade_torch.agents.replay import SequenceReplay
+    from arcade_torch.agents.returns import QLambdaEstimator, SequenceGAE, gae, q_lambda_return
     from arcade_torch.agents.runs.files import CheckpointError
     from arcade_torch.agents.runs.folder import RunFolderError
     from arcade_torch.agents.training import Trainer, TrainResult, train

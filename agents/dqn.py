@@ -9,10 +9,10 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate
 
 from arcade_torch.agents.config import DQNConfig
+from arcade_torch.agents.layout import unroll
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.replay import SequenceReplay
-from arcade_torch.agents.sequences import unroll
 
 
 class DQNLoss(PQNLoss):

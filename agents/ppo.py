@@ -1,152 +1,141 @@
 """PPO with a memory in actor and critic, or in neither."""
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
-from torch import Tensor, nn
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+    dispatch,
+)
+from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import PopArtValueNorm, ProbabilisticActor
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator
 
 from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce
+from arcade_torch.agents.layout import Key, NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.sequences import (
-    NetworkInputs,
-    as_steps,
-    insert_final_observations,
-    is_stock,
-    solve_backward,
-    unroll,
-    values_and_traces,
-)
+from arcade_torch.agents.returns import SequenceGAE
 
 
-def gae(
-    reward: Tensor,
+def ppo_objective(
+    log_prob: Tensor,
+    old_log_prob: Tensor,
+    advantage: Tensor,
     value: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    gamma: float,
-    lam: float,
-    time_limit: TimeLimit = "bootstrap",
-) -> Tensor:
-    r"""Generalised advantage estimate over a window.
-
-    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``, in which the value
-    ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a termination::
-
-        A[t] = delta[t]                                at an end and at the last step
-        A[t] = delta[t] + gamma * lam * A[t + 1]       elsewhere
-
-    ``A + v`` is the value target: the lambda-return, where ``v'[t]`` and ``v[t + 1]`` agree.
+    old_value: Tensor | None,
+    value_target: Tensor,
+    clip_epsilon: Tensor,
+) -> dict[str, Tensor]:
+    """The clipped losses of policy and value, one number a step; all arguments have one shape.
 
     Args:
-        reward: float [B, T], reward received on leaving observation ``t``.
-        value: float [B, T], value of observation ``t``.
-        next_value: float [B, T], value of the true next observation.
-        terminated: bool [B, T]; this and what follows as in :func:`q_lambda_return`.
-        truncated: bool [B, T].
-        gamma: discount per step, in [0, 1].
-        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the value.
-        time_limit: ``"bootstrap"`` or ``"terminal"``.
+        log_prob: of the action that was taken, by the policy that learns.
+        old_log_prob: the same by the policy that acted.
+        advantage: of the action, normalised.
+        value: of the observation, by the critic that learns.
+        old_value: the same before the first gradient step; None leaves the value unclipped.
+        value_target: what the value should have been.
+        clip_epsilon: how far the ratio may leave 1, and the value its old one, before the gradient ends.
 
     Returns:
-        float [B, T], in the dtype of ``reward``.
+        ``policy_loss`` and ``value_loss`` with gradient; without one ``kl``, an estimate that is never
+        negative (Schulman, "Approximating KL divergence", k3), and ``clipped`` and ``value_clipped``,
+        1 where a clip is at work.
 
-    Raises:
-        ValueError: as :func:`q_lambda_return`.
-
-    Source: Schulman et al., arXiv 1506.02438, equation 16.
-
-    Example:
-        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
-        >>> gae(ones, ones, ones, no, no, gamma=0.5, lam=1.0)
-        tensor([[0.8750, 0.7500, 0.5000]])
+    Source: Schulman et al., arXiv 1707.06347, equation 7; value clipping as in the published code.
     """
-    after, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit, value)
-    return solve_backward(reward + gamma * after - value, trace)
+    log_ratio = log_prob - old_log_prob
+    ratio = log_ratio.exp()
+    clipped_ratio = ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon)
+    policy_loss = -torch.minimum(ratio * advantage, clipped_ratio * advantage)
+
+    value_loss = 0.5 * (value - value_target).square()
+    value_clipped = torch.zeros_like(value)
+    if old_value is not None:
+        change = value - old_value
+        clipped_value = old_value + change.clamp(-clip_epsilon, clip_epsilon)
+        value_loss = torch.maximum(value_loss, 0.5 * (clipped_value - value_target).square())
+        value_clipped = (change.detach().abs() > clip_epsilon).to(value.dtype)
+
+    return {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "kl": (ratio - 1 - log_ratio).detach(),
+        "clipped": (ratio.detach() != clipped_ratio.detach()).to(ratio.dtype),
+        "value_clipped": value_clipped,
+    }
 
 
-class SequenceGAE(nn.Module):
-    """Advantages by one pass of the critic over each sequence, final observations read where they belong.
-
-    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value`` [..., L, 1].
-
-    Args:
-        critic: any TensorDict module that writes ``state_value`` [*, 1].
-        gamma: discount per step, in [0, 1].
-        lmbda: lambda of the estimate, in [0, 1].
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
-        chunks: parts that the rows are read in, which bounds memory.
-    """
-
-    def __init__(
-        self,
-        critic: TensorDictModuleBase,
-        gamma: float = 0.99,
-        lmbda: float = 0.95,
-        time_limit: TimeLimit = "bootstrap",
-        chunks: int = 1,
-    ) -> None:
-        super().__init__()
-        self.__dict__["critic"] = critic  # its parameters belong to the loss
-        self.inputs = NetworkInputs(critic)
-        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
-        self.gamma, self.lmbda, self.chunks = gamma, lmbda, chunks
-        self.names: dict[str, Any] = {key: key for key in ("reward", "terminated", "advantage", "value_target")}
-        self.names["value"] = "state_value"
-
-    def set_keys(self, **names: Any) -> None:
-        """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``; the rest is unused."""
-        self.names |= {name: key for name, key in names.items() if name in self.names}
-
-    @torch.no_grad()
-    def forward(self, batch: TensorDictBase, params: Any = None, target_params: Any = None) -> TensorDictBase:
-        """Estimate advantages; gives the same object, with the three entries.
-
-        Args:
-            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [..., L] with next observations.
-            params: parameters of the critic; default those it has.
-            target_params: not looked at.
-        """
-        names = {name: self.names[name] for name in ("reward", "terminated")}
-        data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
-        with nullcontext() if params is None else params.to_module(self.critic, preserve_module_state=False):
-            values = [unroll(self.critic, self.inputs, rows, self.names["value"]) for rows in data.chunk(self.chunks)]
-        value, position = torch.cat(values).squeeze(-1), data["position"]
-        here, following = value.gather(1, position), value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
-        advantage = gae(data["reward"], here, following, data["terminated"], data["cut"], self.gamma, self.lmbda)
-        entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
-        shape = batch.shape if is_stock(batch) else advantage.shape
-        for key, entry in entries.items():
-            batch[self.names[key]] = entry.reshape(shape).unsqueeze(-1)
-        return batch
+def normalize(advantage: Tensor) -> Tensor:
+    """Deviations from the mean, divided by the population deviation; finite where all are equal."""
+    centred = advantage - advantage.mean()
+    return centred / (centred.square().mean().sqrt() + 1e-8)
 
 
-class PPOLoss(ClipPPOLoss):
-    """TorchRL's ``ClipPPOLoss`` over whole sequences of a recurrent actor and critic.
+class PPOLoss(LossModule):
+    """:func:`ppo_objective` and an entropy bonus over whole sequences of a recurrent actor and critic.
 
-    Differences: advantages come from :class:`SequenceGAE` before the first gradient step and are normalised in each
-    minibatch by the population deviation plus 1e-8, unless an ``advantage_norm`` divides them (``update`` it once a
-    window with what it is to follow, advantages or value targets); the value loss is half the squared error, clipped
-    like the ratio; the entropy is not checked for NaN in every call, which would wait for the device. In keys and out
-    keys are those of ``ClipPPOLoss``, and ``loss_prediction`` where that has a weight.
+    In keys: what the networks read, ``action``, ``action_log_prob``, ``is_init``, and what
+    :class:`SequenceGAE` reads or writes. Advantages are made before the first gradient step and are
+    normalised in each minibatch, unless an ``advantage_norm`` divides them (``update`` it once a window
+    with what it is to follow, advantages or value targets).
+
+    Out keys, those of TorchRL's ``ClipPPOLoss``: ``loss_objective``, ``loss_critic``, ``loss_entropy``
+    (with gradient, weighted; their sum is to be minimised), ``entropy``, ``kl_approx``,
+    ``clip_fraction``, ``value_clip_fraction``; and ``loss_prediction`` where that has a weight.
 
     Args:
         actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
         critic_network: any TensorDict module that writes ``state_value`` [*, 1].
         time_limit: see :class:`SequenceGAE`.
-        critic_coeff: weight of the value loss.
-        prediction_coeff: weight of ``prediction_error``, which the actor has to write then (``predicts=True``).
-        **kwargs: ``clip_epsilon`` (0.2), ``entropy_coeff`` (0.01) and the others of ``ClipPPOLoss``.
+        clip_epsilon: see :func:`ppo_objective`; a buffer, ``loss.clip_epsilon.fill_(...)`` moves it.
+        clip_value: whether the value is clipped as well.
+        entropy_coeff: weight of the entropy bonus; a buffer.
+        critic_coeff: weight of the value loss, which is half the squared error.
+        prediction_coeff: weight of ``prediction_error``, which the actor has to write then
+            (``predicts=True``).
+        normalize_advantage: whether advantages are normalised in each minibatch.
+        advantage_norm: of TorchRL, such as ``PopArtValueNorm``; divides advantages instead.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        functional: hold the parameters apart from the networks, as TorchRL's losses do; False saves
+            that time.
 
-    Source: Schulman et al., arXiv 1707.06347, equations 7 and 9; value clipping as in the published implementation.
+    Source: Schulman et al., arXiv 1707.06347, equation 9. Equal to ``ClipPPOLoss`` with
+    ``loss_critic_type="l2"``, ``clip_value=True`` and half its ``critic_coeff``, on the same batch.
     """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Names of the entries, see ``LossModule.set_keys``."""
+
+        advantage: Key = "advantage"
+        value_target: Key = "value_target"
+        value: Key = "state_value"
+        sample_log_prob: Key = "action_log_prob"
+        action: Key = "action"
+        reward: Key = "reward"
+        done: Key = "done"
+        terminated: Key = "terminated"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.GAE
+    functional = True  # see the argument
+
+    actor_network: ProbabilisticTensorDictSequential
+    critic_network: TensorDictModuleBase
+    actor_network_params: Any
+    critic_network_params: Any
+    target_actor_network_params: Any
+    target_critic_network_params: Any
 
     def __init__(
         self,
@@ -154,38 +143,52 @@ class PPOLoss(ClipPPOLoss):
         critic_network: TensorDictModuleBase,
         *,
         time_limit: TimeLimit = "bootstrap",
+        clip_epsilon: float = 0.2,
+        clip_value: bool = True,
+        entropy_coeff: float = 0.01,
         critic_coeff: float = 0.5,
         prediction_coeff: float = 0.0,
-        **kwargs: Any,
+        normalize_advantage: bool = True,
+        advantage_norm: Any = None,
+        reduction: str = "mean",
+        functional: bool = True,
     ) -> None:
-        options = {"loss_critic_type": "l2", "clip_value": True, "log_explained_variance": False} | kwargs
-        super().__init__(actor_network, critic_network, critic_coeff=0.5 * critic_coeff, **options)
-        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
-        self.prediction_coeff = prediction_coeff
-        self.normalize_advantage = True
+        super().__init__()
+        self.functional = functional
+        if functional:
+            self.convert_to_functional(actor_network, "actor_network")
+            self.convert_to_functional(critic_network, "critic_network")
+        else:
+            self.actor_network = actor_network
+            self.critic_network = critic_network
         self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
-        self.out_keys = [*self.out_keys, *["loss_prediction"] * bool(prediction_coeff)]  # type: ignore[has-type]
+        self.time_limit = coerce("time_limit", time_limit, TimeLimit)
+        self.clip_value = clip_value
+        self.critic_coeff = critic_coeff
+        self.prediction_coeff = prediction_coeff
+        self.normalize_advantage = normalize_advantage
+        self.advantage_norm = advantage_norm
+        self.reduction = reduction
+        device = next((p.device for p in self.parameters()), torch.device("cpu"))
+        for name, number in (("clip_epsilon", clip_epsilon), ("entropy_coeff", entropy_coeff)):
+            value = torch.tensor(number, dtype=torch.float32, device=device)
+            self.register_buffer(name, value)
+        self.clip_epsilon: Tensor
+        self.entropy_coeff: Tensor
+        self.out_keys = ["loss_objective", "loss_critic", "loss_entropy"]
+        self.out_keys += ["entropy", "kl_approx", "clip_fraction", "value_clip_fraction"]
+        if prediction_coeff:
+            self.out_keys.append("loss_prediction")
+        self._default_value_estimator()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The parts of the loss.
-
-        Args:
-            tensordict: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock batch [B, T]; with
-                ``advantage``, ``value_target``, ``state_value`` (else they are estimated with the present critic).
-
-        Returns:
-            The out keys of ``ClipPPOLoss``.
-        """
+    def _set_in_keys(self) -> None:
+        """Entries that every batch holds; when names are set, assign others for plain tensors."""
         keys = self.tensor_keys
-        if tensordict.get(keys.advantage, None) is None:
-            tensordict = self.value_estimator(tensordict.copy())
-            if self.advantage_norm is not None and self.training:
-                self.advantage_norm.update(tensordict[keys.value_target])
-        read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
-        losses = super().forward(as_steps(tensordict, self.inputs, *read))
-        if self.prediction_coeff:
-            losses["loss_prediction"] = self.prediction_coeff * self._reduce_loss(self.__dict__.pop("_error"))
-        return losses
+        roots = [*self.inputs.observation_keys, *self.inputs.state_keys]
+        more = [keys.action, keys.sample_log_prob]
+        outcome = [("next", name) for name in (keys.reward, keys.done, keys.terminated)]
+        nexts = [("next", key) for key in self.inputs.observation_keys if key != "is_init"]
+        self.in_keys = list(dict.fromkeys([*roots, *more, *outcome, *nexts]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Choose how advantages are made.
@@ -198,26 +201,87 @@ class PPOLoss(ClipPPOLoss):
         if value_type is None:
             hyperparams = {"critic": self.critic_network, "time_limit": self.time_limit} | hyperparams
             self._value_estimator = SequenceGAE(**hyperparams)
-            self._forward_value_estimator_keys()
         else:
-            super().make_value_estimator(value_type, **hyperparams)
+            of_torchrl = [kind for kind in ValueEstimators if kind is not ValueEstimators.VTrace]
+            dispatch_value_estimator(self, value_type, supported=of_torchrl, **hyperparams)
+        self._forward_value_estimator_keys()
 
     def _default_value_estimator(self) -> None:
         self.make_value_estimator()
 
-    def _standardize_advantage(self, advantage: Tensor, tensordict: TensorDictBase) -> Tensor:
-        centred = advantage - advantage.mean()
-        return centred / (centred.square().mean().sqrt() + 1e-8)  # finite where all are equal
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        """Let the estimator know the names of the entries."""
+        names = ("advantage", "value_target", "value", "reward", "done", "terminated", "sample_log_prob")
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**{name: getattr(self.tensor_keys, name) for name in names})
+        self._set_in_keys()
 
-    def _log_weight(self, tensordict: TensorDictBase, adv_shape: torch.Size) -> tuple[Any, ...]:
-        log_weight, dist, _, correction = super()._log_weight(tensordict, adv_shape)
-        if self.prediction_coeff:  # the actor has just written it
-            self.__dict__["_error"] = tensordict["prediction_error"]
-        kl = log_weight.exp() - 1 - log_weight  # never negative, unlike the plain difference
-        return log_weight, dist, kl, correction
+    @dispatch  # type: ignore[untyped-decorator]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The parts of the loss.
 
-    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
-        return dist.entropy().unsqueeze(-1)  # type: ignore[no-any-return]
+        Args:
+            tensordict: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock batch [B, T]; with
+                ``advantage``, ``value_target``, ``state_value`` (else they are estimated with the present critic).
+
+        Returns:
+            The out keys.
+        """
+        keys = self.tensor_keys
+        if tensordict.get(keys.advantage, None) is None:
+            tensordict = self.value_estimator(tensordict.copy())
+            if self.advantage_norm is not None and self.training:
+                self.advantage_norm.update(tensordict[keys.value_target])
+        read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
+        steps = as_steps(tensordict, self.inputs, *read).copy()
+        old_value = steps[keys.value] if self.clip_value else None
+
+        with self._parameters_in(self.actor_network, "actor_network_params"):
+            policy = self.actor_network.get_dist(steps)
+        with self._parameters_in(self.critic_network, "critic_network_params"):
+            value = self.critic_network(steps)[keys.value]
+        terms = ppo_objective(
+            log_prob=policy.log_prob(steps[keys.action]).unsqueeze(-1),
+            old_log_prob=steps[keys.sample_log_prob].unsqueeze(-1),
+            advantage=self._scaled(steps[keys.advantage]),
+            value=value,
+            old_value=old_value,
+            value_target=steps[keys.value_target],
+            clip_epsilon=self.clip_epsilon,
+        )
+        entropy = policy.entropy().unsqueeze(-1)
+
+        losses = {
+            "loss_objective": terms["policy_loss"],
+            "loss_critic": self.critic_coeff * terms["value_loss"],
+            "loss_entropy": -self.entropy_coeff * entropy,
+        }
+        if self.prediction_coeff:
+            losses["loss_prediction"] = self.prediction_coeff * steps["prediction_error"]
+        diagnostics = {
+            "entropy": entropy.detach(),
+            "kl_approx": terms["kl"],
+            "clip_fraction": terms["clipped"],
+            "value_clip_fraction": terms["value_clipped"],
+        }
+        out = TensorDict(batch_size=[])
+        for name, each_step in losses.items():
+            out[name] = self._reduce_loss(each_step, tensordict)
+        for name, each_step in diagnostics.items():
+            out[name] = self._reduce_loss(each_step, tensordict, reduction="mean")
+        return out
+
+    def _parameters_in(self, network: Any, name: str) -> AbstractContextManager[Any]:
+        """While open, the network has the loss's parameters."""
+        if not self.functional:
+            return nullcontext()
+        parameters = getattr(self, name)
+        return parameters.to_module(network, preserve_module_state=False)  # type: ignore[no-any-return]
+
+    def _scaled(self, advantage: Tensor) -> Tensor:
+        if self.advantage_norm is not None:
+            return advantage / self.advantage_norm.scale()  # type: ignore[no-any-return]
+        return normalize(advantage) if self.normalize_advantage else advantage
 
 
 class Choice(Categorical):

@@ -12,104 +12,12 @@ from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
-from torchrl.objectives.value import TDLambdaEstimator, ValueEstimatorBase
+from torchrl.objectives.value import ValueEstimatorBase
 
 from arcade_torch.agents.config import Bootstrap, CountOrZero, PQNConfig, TimeLimit, coerce, require
+from arcade_torch.agents.layout import Key, NetworkInputs, insert_final_observations, is_stock, unroll
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.sequences import (
-    Key,
-    NetworkInputs,
-    insert_final_observations,
-    is_stock,
-    solve_backward,
-    unroll,
-    values_and_traces,
-)
-
-
-def q_lambda_return(
-    reward: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    gamma: float,
-    lam: float,
-    time_limit: TimeLimit = "bootstrap",
-) -> Tensor:
-    r"""Backward Q(lambda) return over a window.
-
-    With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done = terminated | truncated``::
-
-        G[t] = r[t] + gamma * m[t]                                          at a truncation and at the last step
-        G[t] = r[t]                                                         at a termination
-        G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
-
-    Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by doubling, in
-    ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over time.
-
-    Args:
-        reward: float [B, T], reward received on leaving observation ``t``.
-        next_value: float [B, T], ``max_a Q`` of the true next observation: the final frame where an episode was cut.
-            Values at terminated steps are ignored, whatever they are.
-        terminated: bool [B, T], the task's own end; removes the bootstrap and cuts the recursion.
-        truncated: bool [B, T], cut by a limit; keeps the bootstrap, cuts the recursion.
-        gamma: discount per step, in [0, 1].
-        lam: trace decay in [0, 1]; 0 gives the one-step target, 1 the Monte-Carlo return.
-        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a termination, as the published
-            implementation does.
-
-    Returns:
-        float [B, T], in the dtype of ``reward``.
-
-    Raises:
-        ValueError: shapes differ or are not [B, T]; integer rewards; ``gamma``, ``lam`` or ``time_limit`` not as above.
-
-    Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade (ICML 2026), PQN.
-
-    Example:
-        >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
-        >>> q_lambda_return(ones, ones, no, no, gamma=0.5, lam=1.0)
-        tensor([[1.8750, 1.7500, 1.5000]])
-    """
-    value, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit)
-    return solve_backward(reward + (gamma - trace) * value, trace)
-
-
-class QLambdaEstimator(TDLambdaEstimator):
-    """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its shapes are static.
-
-    TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which waits for the device.
-
-    Args:
-        gamma: discount per step, in [0, 1].
-        lmbda: trace decay, in [0, 1].
-        value_network: see ``TDLambdaEstimator``; not needed where ``next_value`` is given, as our losses do.
-        **kwargs: see ``TDLambdaEstimator``.
-    """
-
-    def __init__(self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any) -> None:
-        super().__init__(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
-        self._floats = float(gamma), float(lmbda)
-
-    def value_estimate(
-        self,
-        tensordict: TensorDictBase,
-        target_params: TensorDictBase | None = None,
-        next_value: Tensor | None = None,
-        time_dim: int | None = None,
-        **kwargs: Any,
-    ) -> Tensor:
-        """Lambda-returns, float [B, T, 1], of a batch with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
-
-        The values of the true next observations are ``next_value`` [B, T, 1], or what the value network makes of the
-        batch, with ``target_params`` and ``kwargs``. Time is the second dimension, whatever ``time_dim``.
-        """
-        keys = self.tensor_keys
-        if next_value is None:
-            next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
-        names = (keys.reward, keys.done, keys.terminated)
-        reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
-        return q_lambda_return(reward, next_value.squeeze(-1), terminated, done, *self._floats).unsqueeze(-1)
+from arcade_torch.agents.returns import QLambdaEstimator
 
 
 class PQNLoss(LossModule):

@@ -177,6 +177,7 @@ class MemoryNetwork(TensorDictModuleBase):
         self.in_keys = ["pixels", *["last_action"] * bool(num_actions), module.is_init_key, *module.state_keys]
         self.out_keys = module.out_keys
         self.out_key, self.state_keys, self.store = module.out_key, module.state_keys, module.store
+        self.state_key = state_key
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
         """The transform that puts initial states into an env's resets; see :class:`MemoryModule`."""
@@ -255,11 +256,14 @@ class MemoryNetwork(TensorDictModuleBase):
         Returns:
             float [B, T, A].
         """
-        features, recurrent, rows = self.encode(sequences["pixels"]), self._recurrent[0], sequences.shape[:1]
-        is_init = recurrent.start_flags(sequences)
+        features = self.encode(sequences["pixels"])
+        is_init = sequences["is_init"].squeeze(-1)
         last_action = sequences["last_action"] if self.num_actions else is_init
-        first = recurrent.stored_state(TensorDict({}, rows) if state is None else state, rows)
-        return self.remember(features, last_action, is_init, first)[0]
+        first = self.initial_state(len(sequences))
+        if state is not None and self.state_keys:
+            first.update(state[self.state_key])
+        y, _ = self.remember(features, last_action, is_init, first)
+        return y
 
     def prediction_error(self, x: Tensor, y: Tensor, is_init: Tensor) -> Tensor:
         """How far each next frame's features, as deviations from the batch's, are from those expected before it.

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.agents.sequences import unroll
+from arcade_torch.agents.layout import unroll
 from arcade_torch.models import ActorCriticNetwork, MemoryNetwork
 
 ACTIONS, WIDTH = 5, 6

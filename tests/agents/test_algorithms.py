@@ -309,15 +309,14 @@ def test_the_target_network_is_renewed_every_so_many_updates():
 
 
 @pytest.mark.parametrize("memory", ["lru", "mingru", "gru"])
-def test_an_update_opens_at_most_eight_files_which_the_architecture_page_names(memory):
+def test_an_update_opens_at_most_nine_files_which_the_architecture_page_names(memory):
     root, opened = Path(__file__).resolve().parents[2], {}
     trainer = Trainer(config("pqn", memory))
     batch = trainer.collector.collect()
 
     def look(frame, event, argument):
         file = Path(frame.f_code.co_filename).resolve()
-        check = frame.f_code.co_name in ("require", "coerce")  # of config.py: one line that is read where it stands
-        if event == "call" and not check and file.parent in (root / "agents", root / "models"):
+        if event == "call" and file.parent in (root / "agents", root / "models"):
             opened[str(file.relative_to(root))] = None
 
     sys.setprofile(look)
@@ -328,4 +327,4 @@ def test_an_update_opens_at_most_eight_files_which_the_architecture_page_names(m
     page = (root / "docs" / "architecture.md").read_text().partition("What an update of PQN reads")[2]
     table = page.partition("\n\n|")[2].partition("\n\n")[0].replace("models/lru.py", f"models/{memory}.py")
     named = re.findall(r"^\| `(\w+/\w+\.py)`", table, flags=re.MULTILINE)
-    assert list(opened) == [file for file in named if file in opened] and 5 < len(opened) <= 8
+    assert list(opened) == [file for file in named if file in opened] and 5 < len(opened) <= 9

@@ -9,12 +9,12 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, LossModule
 
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
+from arcade_torch.agents.layout import as_steps
 from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
-from arcade_torch.agents.ppo import PPO
-from arcade_torch.agents.sequences import as_steps
+from arcade_torch.agents.ppo import PPO, normalize, ppo_objective
 from arcade_torch.models import ActorCriticNetwork
 from tests.agents.fakes import (
     ACTIONS,
@@ -169,7 +169,7 @@ def test_objective_and_entropy_are_those_of_torchrls_own_loss(form):
     theirs = ClipPPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, normalize_advantage=False)
     from torchrl.modules import set_recurrent_mode
 
-    from arcade_torch.agents.sequences import as_steps
+    from arcade_torch.agents.layout import as_steps
 
     steps = as_steps(batch, ours.inputs, "action", "action_log_prob", *ESTIMATES).copy()
     steps["advantage"] = normalise(steps["advantage"])
@@ -253,7 +253,7 @@ def test_it_is_a_torchrl_loss_with_its_keys():
     network, batch, loss = acted(with_two_states(stream(2, 5, seed=8)))
     batch = loss.value_estimator(batch)
     out = loss(batch)
-    assert isinstance(loss, ClipPPOLoss)
+    assert isinstance(loss, LossModule) and set(out.keys()) == set(loss.out_keys)
     assert sorted(key for key, v in out.items() if v.requires_grad) == ["loss_critic", "loss_entropy", "loss_objective"]
     assert {id(p) for p in loss.parameters()} == {id(p) for p in network.parameters()}
     loss.set_keys(sample_log_prob="before", advantage="edge", reward="pay")
@@ -264,9 +264,9 @@ def test_it_is_a_torchrl_loss_with_its_keys():
 
 
 def test_advantages_are_normalised_and_a_constant_stays_finite():
-    loss, advantage = acted(with_two_states(stream(2, 5, seed=8)))[2], torch.randn(4, 5, 1)
-    torch.testing.assert_close(loss._standardize_advantage(advantage, TensorDict()), normalise(advantage))
-    assert torch.equal(loss._standardize_advantage(torch.full((2, 3), 5.0), TensorDict()), torch.zeros(2, 3))
+    advantage = torch.randn(4, 5, 1)
+    torch.testing.assert_close(normalize(advantage), normalise(advantage))
+    assert torch.equal(normalize(torch.full((2, 3), 5.0)), torch.zeros(2, 3))
 
 
 def parts_of(loss, batch):
@@ -333,3 +333,27 @@ def test_the_defaults_are_the_papers():
     assert learning_rate_at(c, 0, 10**7) == 1e-4 and learning_rate_at(c, 10**7, 10**7) == 1e-10
     assert learning_rate_at(c, 5 * 10**6, 10**7) == pytest.approx((1e-4 + 1e-10) / 2)
     assert epsilon_at(c, 0, 10**7) is None and c.steps_before == 0
+
+
+def test_the_objective_is_a_function_of_tensors_with_the_clips_of_the_paper():
+    old = torch.zeros(4)
+    ratio = torch.tensor([1.5, 1.5, 0.5, 1.1])
+    advantage = torch.tensor([1.0, -1.0, 1.0, 2.0])
+    value = torch.tensor([1.0, 0.1, 0.0, -1.0])
+    terms = ppo_objective(ratio.log(), old, advantage, value, torch.zeros(4), torch.ones(4), torch.tensor(0.2))
+    torch.testing.assert_close(terms["policy_loss"], -torch.tensor([1.2, -1.5, 0.5, 2.2]))
+    torch.testing.assert_close(terms["value_loss"], 0.5 * torch.tensor([0.64, 0.81, 1.0, 4.0]))
+    assert terms["clipped"].tolist() == [1, 1, 1, 0] and terms["value_clipped"].tolist() == [1, 0, 0, 1]
+    torch.testing.assert_close(terms["kl"], ratio - 1 - ratio.log())
+    unclipped = ppo_objective(ratio.log(), old, advantage, value, None, torch.ones(4), torch.tensor(0.2))
+    torch.testing.assert_close(unclipped["value_loss"], 0.5 * (value - 1).square())
+
+
+def test_a_gradient_step_of_ppo_never_waits_for_the_device():
+    """TorchRL's ``ClipPPOLoss`` tests its clip, a buffer, with ``if``: a wait on a GPU in every call."""
+    _, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
+    batch = loss.value_estimator(batch)
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profiler:
+        total(loss(batch)).backward()
+    names = {event.key for event in profiler.key_averages()}
+    assert "aten::exp" in names and "aten::_local_scalar_dense" not in names

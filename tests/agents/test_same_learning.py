@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, SequenceGAE, make_actor
-from arcade_torch.agents.sequences import unroll
+from arcade_torch.agents.layout import unroll
 from arcade_torch.models import make_actor_critic, make_network
 from tests.agents.data.tiny import NETWORK
 

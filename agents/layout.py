@@ -1,5 +1,4 @@
-"""Final observations put where they belong, so that one pass over a window gives the value of every next observation;
-and what returns and advantages share: the sum backward over a window.
+"""Final observations put where they belong, so that one pass over a window gives the value of every next observation.
 
 A memory model reads a window of ``L`` observations once. The value of the observation *after* a step is then the value
 at the following position, but for two cases: where an episode ended, the next position holds the first observation of
@@ -14,7 +13,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.agents.config import TimeLimit, coerce, require
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 
@@ -65,7 +63,8 @@ def insert_final_observations(
         KeyError: an entry is missing; names it.
         ValueError: a needed next observation or the state at step 0 is missing, or steps do not follow each other.
     """
-    require("steps_to_next_obs" not in batch, "the batch", "steps_to_next_obs", "one without MultiStep: use lmbda")
+    if "steps_to_next_obs" in batch:
+        raise ValueError("the batch must be one without MultiStep: use lmbda; got 'steps_to_next_obs'")
     batch = batch.copy()
     for wanted, name in names.items():
         after = wanted in ("reward", "terminated", "truncated")
@@ -73,7 +72,10 @@ def insert_final_observations(
     if is_stock(batch):
         _check_stored_states(batch, inputs)
         slices = bool(burn_in) and batch.ndim == 1 and bool(batch["is_init"][1:].any())
-        require(not slices, "burn_in", burn_in, "0 for a flat batch of several slices: reshape it to [slices, length]")
+        if slices:
+            raise ValueError(
+                f"burn_in must be 0 for a flat batch of several slices: reshape it to [slices, length]; got {burn_in}"
+            )
         batch = batch.reshape(-1, batch.shape[-1])
     is_init = _flat(batch, "is_init")
     batch["is_init"] = is_init.unsqueeze(-1)
@@ -83,11 +85,13 @@ def insert_final_observations(
     for key in ("mask", ("collector", "mask")):
         if key in batch and (mask := _flat(batch, key)).shape == cut.shape:
             cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]  # zeros follow, up to the length of the longest trajectory
-    require(burn_in < is_init.shape[1], "burn_in", burn_in, f"less than the {is_init.shape[1]} steps of the batch")
+    if burn_in >= is_init.shape[1]:
+        raise ValueError(f"burn_in must be less than the {is_init.shape[1]} steps of the batch; got {burn_in}")
     terminated = done if time_limit == "terminal" else terminated
     if "final_index" not in batch and "step_count" in batch and (counted := ("next", "step_count")) in batch:
         follows = cut[:, :-1] | (_flat(batch, counted)[:, :-1] == _flat(batch, "step_count")[:, 1:])
-        require(bool(follows.all()), "step_count", "a jump within a row", "that of whole sequences, never shuffled")
+        if not bool(follows.all()):
+            raise ValueError("step_count must be that of whole sequences, never shuffled; got a jump within a row")
     needed = cut & ~terminated
     index, used = _final_places(batch, needed)
 
@@ -162,49 +166,15 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     return out
 
 
-def values_and_traces(
-    reward: Tensor,
-    next_value: Tensor,
-    terminated: Tensor,
-    truncated: Tensor,
-    gamma: float,
-    lam: float,
-    time_limit: TimeLimit,
-    *others: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """What a step may count on, both [B, T]: the next value, 0 behind a termination; gamma times lambda, 0 at every end
-    and at the last step. Arguments that do not fit are refused, ``others`` for their shape alone.
-    """
-    shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
-    fits = len(shapes) == 1 and reward.ndim == 2 and reward.shape[1] > 0
-    require(fits, "rewards, values, terminated, truncated", shapes, "of one shape [B, T], T >= 1")
-    require(reward.is_floating_point(), "the dtype of rewards", reward.dtype, "a floating one")  # or traces were 0
-    require(0.0 <= gamma <= 1.0 and 0.0 <= lam <= 1.0, "gamma and lambda", (gamma, lam), "in [0, 1]")
-    coerce("time_limit", time_limit, TimeLimit)
-    done = terminated | truncated
-    trace = torch.full_like(reward, gamma * lam).masked_fill(done, 0.0)
-    trace[:, -1] = 0.0
-    return next_value.masked_fill(done if time_limit == "terminal" else terminated, 0.0), trace
-
-
-def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
-    """Solve ``G[t] = base[t] + trace[t] * G[t + 1]`` with ``G[T] = 0`` by doubling."""
-    steps, reach = base.shape[1], 1
-    while reach < steps:
-        head = torch.addcmul(base[:, :-reach], trace[:, : steps - reach], base[:, reach:])
-        base = torch.cat((head, base[:, -reach:]), dim=1)
-        if 2 * reach < steps:
-            trace = trace[:, : trace.shape[1] - reach] * trace[:, reach:]
-        reach *= 2
-    return base
-
-
 def _check_stored_states(batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored there get lost."""
     if inputs.reads_first_state_only and "step_count" in batch:
         within = batch["is_init"].reshape(batch.shape) & (batch["step_count"].reshape(batch.shape) > 0)
         lost = any(bool(batch[key][within].any()) for key in inputs.state_keys if key in batch)
-        require(not lost, "store", "sequence", "'step' (of the network) for slices that begin within episodes")
+        if lost:
+            raise ValueError(
+                "store must be 'step' (of the network) for slices that begin within episodes; got 'sequence'"
+            )
 
 
 def _with_state(step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs) -> TensorDictBase:
@@ -236,8 +206,11 @@ def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor
         index = (~needed).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
     used = needed.gather(1, index) & batch.get("final_mask", needed.new_ones(()))
     missing = int(needed.sum() - used.sum())
-    allowed = "stored where needed: collect with final_frames='truncated' or 'all', or take time_limit='terminal'"
-    require(not missing, "next observations", f"{missing} missing", allowed)
+    if missing:
+        raise ValueError(
+            "next observations must be stored where needed: collect with final_frames='truncated' or 'all', "
+            f"or take time_limit='terminal'; got {missing} missing"
+        )
     return index, used
 
 
