@@ -101,25 +101,34 @@ class ArcadeCollector(BaseCollector):
         self._weight_sync_schemes: dict[str, Any] | None = None
         self._num_envs, self._steps, self._overlap = env.num_envs, frames_per_batch // env.num_envs, overlap
         self._compress, self._final_frames = compress, final_frames
+        self._draws_in_place = compress is None and env.draws_safely()
         self._generator = torch.Generator(env.device)
-        self._generator.manual_seed(int(torch.randint(2**31, ())))
+        self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")))
         self._finals = env.final_observations(self._overlap + self._steps)
         self._runner = PolicyRunner(policy, env.num_envs, env.device, store, store_states)
         self._buffer: RolloutBuffer | None = None
-        self._frames, self._iter = 0, -1
+        self._frames = 0
+        self._iter = -1
+        self._next_traj_id = 0
         self.reset()
         if seed is not None:
             self.set_seed(seed)
 
     def reset(self) -> None:
-        """Start over: the next window begins with new episodes."""
+        """Start over: the next window begins with new episodes, which get new numbers."""
         self._obs: dict[str, torch.Tensor] | None = None
         self._seen = (-1, -1)  # the env's generation that the observation is of
         self._acted = 0  # steps since the first reset
         self._state = TensorDict({}, batch_size=[self._num_envs])
         self._window_starts: deque[TensorDict] = deque()  # recurrent states before the coming windows
-        self._traj_ids = torch.arange(self._num_envs, device=self.env.device)
-        self._next_traj_id = self._num_envs
+        self._begin_trajectories()
+
+    def _begin_trajectories(self) -> None:
+        """Give the episodes of all envs new numbers."""
+        first = self._next_traj_id
+        self._next_traj_id = first + self._num_envs
+        self._traj_ids = torch.arange(first, self._next_traj_id, dtype=torch.int64, device=self.env.device)
+        self._numbered = self._iter  # the last window whose episodes were numbered
 
     @property
     def frames(self) -> int:
@@ -172,22 +181,28 @@ class ArcadeCollector(BaseCollector):
             self.pre_collect_hook()
         buffer, obs = self._look()
         first_window = self._acted == 0
+        # Taken away until the window is whole: whatever ends it early, the next one begins with new storage.
+        self._buffer = None
+        self._obs = {}  # nothing holds the first frames
+        self._seen = (-1, -1)
         first = buffer.begin(carry=not first_window, reuse=self.return_same_td, dense=dense)
         began_with = {key: value for key, value in obs.items() if key != "pixels"}
-        self._obs, self._seen = {}, (-1, -1)  # nothing holds the first frames, and a window that fails is noticed
         random = random or self.policy is None or self._frames < self.init_random_frames
         as_wanted = exploration_type() is self.exploration_type  # of the whole process: threads must not take turns
         with nullcontext() if as_wanted else set_exploration_type(self.exploration_type):
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
-        self._obs, self._seen = obs, self.env.generation
         wanted = buffer.finish(began_with, obs["pixels"])
         for rows, steps, drawn in self._finals.draw(wanted):
             frames = to_torch(drawn, self.env.device)[: len(rows)]
             buffer.write_final(rows, steps, self._compressed(frames))
+        initial_state = self._window_starts.popleft()
         self._frames += self._num_envs * self._steps
         self._iter += 1
-        return buffer, self._window_starts.popleft()
+        self._buffer = buffer
+        self._obs = obs
+        self._seen = self.env.generation
+        return buffer, initial_state
 
     def _look(self) -> tuple[RolloutBuffer, dict[str, torch.Tensor]]:
         """Have a current observation and a place to store it, whatever happened to the env since the last window."""
@@ -195,8 +210,7 @@ class ArcadeCollector(BaseCollector):
             self._observe(self.env.reset())
         elif self.env.generation[0] != self._seen[0]:  # somebody else moved the env: what was seen before leads nowhere
             self._acted = 0
-            self._traj_ids = self._next_traj_id + torch.arange(self._num_envs, device=self.env.device)
-            self._next_traj_id += self._num_envs
+            self._begin_trajectories()
             self._observe(self.env.maybe_reset(self.env.observe()))
         elif self.env.generation != self._seen:
             self._observe(self.env.observe())
@@ -204,7 +218,7 @@ class ArcadeCollector(BaseCollector):
             self._state = self._runner.initial_state()
             self._window_starts.clear()
         assert self._obs is not None
-        if self._buffer is None:
+        if self._buffer is None:  # there is none yet, or what it held was a window that was lost
             sizes = self._num_envs, self._overlap, self._steps, self._obs["pixels"].shape[1:]
             shortest = min(game.max_steps for game in self.env.games)
             task = self.env.task if self.env.task_in_td else None
@@ -231,7 +245,7 @@ class ArcadeCollector(BaseCollector):
             num_actions, device = self.env.game.num_actions, self.env.device
             action = torch.randint(num_actions, (self._num_envs,), generator=self._generator, device=device)
         store_action = functools.partial(buffer.write_action, step, obs["pixels"], action)
-        into = buffer.place(step + 1) if self._compress is None else None
+        into = buffer.place(step + 1) if self._draws_in_place else None
         raw = self.env.step_raw(action, while_computing=store_action, into=into)
         buffer.write_outcome(step, raw.numbers)
         buffer.write_extras(step, extras)
@@ -252,7 +266,13 @@ class ArcadeCollector(BaseCollector):
         return not is_host(numbers.device) or bool(numbers.numpy()[:, first:].any())
 
     def _trajectories(self, buffer: RolloutBuffer) -> torch.Tensor:
-        """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them."""
+        """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them.
+
+        After windows that were not numbered (``collect``), all envs go on with new numbers.
+        """
+        if self._iter != self._numbered + 1:
+            self._begin_trajectories()
+        self._numbered = self._iter
         done = buffer.done[:, self._overlap :].T  # [T, N]: numbered in order of time
         new = torch.cumsum(done.reshape(-1), 0).reshape(done.shape) - 1 + self._next_traj_id
         ids = torch.cat([self._traj_ids.unsqueeze(0), new * done]).cummax(0).values
@@ -297,12 +317,14 @@ class ArcadeCollector(BaseCollector):
         if isinstance(self.policy, nn.Module):
             out["policy_state_dict"] = self.policy.state_dict()
         out["env_state_dict"] = self.env.get_extra_state()
+        out["traj_ids"] = self._traj_ids.clone()
+        out["next_traj_id"] = self._next_traj_id
+        out["numbered"] = self._numbered
         if self._obs is None or self._buffer is None:
             return out
         out["recurrent_state"] = self._state.clone().to_dict()
         out["window_starts"] = [state.clone().to_dict() for state in self._window_starts]
         out["overlap"] = self._buffer.overlap_state()
-        out["traj_ids"], out["next_traj_id"] = self._traj_ids.clone(), self._next_traj_id
         return out
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True, **kwargs: Any) -> None:
@@ -325,14 +347,16 @@ class ArcadeCollector(BaseCollector):
         self._generator.set_state(state_dict["generator"].cpu())
         self.reset()
         self._frames, self._iter = int(state_dict["frames"]), int(state_dict["iter"])
-        self._acted = int(state_dict["acted"])
+        if "traj_ids" in state_dict:
+            self._traj_ids = state_dict["traj_ids"].to(self.env.device)
+            self._next_traj_id = int(state_dict["next_traj_id"])
+        self._numbered = int(state_dict.get("numbered", self._iter))
         if "recurrent_state" not in state_dict:
             return
+        self._acted = int(state_dict["acted"])
         self._runner.initial_state()
         self._state = self._as_state(state_dict["recurrent_state"])
         self._window_starts.extend(self._as_state(state) for state in state_dict["window_starts"])
-        self._traj_ids = state_dict["traj_ids"].to(self.env.device)
-        self._next_traj_id = int(state_dict["next_traj_id"])
         self._obs, self._buffer = {}, None  # somebody may still hold batches of the old storage
         if not state_dict.get("moved", self._acted == 0):  # where others had moved the env, _look begins anew
             self._observe(self.env.observe())

@@ -1,8 +1,9 @@
 """The compiled functions of a game or a mixture of games, shared by all envs that play it. Loads no torch."""
 
 import weakref
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -31,8 +32,10 @@ class Step(NamedTuple):
 
     root: Batch  # after the resets: the live state, so copy what is exported of it
     final_state: Any  # the games' state before the resets
-    pixels: jax.Array  # uint8 [N, S, S, 3] of the root
-    numbers: jax.Array  # float32 [N, 5]: the outcome and the counts before the resets in one array, for one export
+    pixels: jax.Array | None  # uint8 [N, S, S, 3] of the root; None where they were drawn into a canvas
+    # int32 [N, 5]: the outcome and the counts before the resets, in one array for one export. Of the reward and of the
+    # episode's reward these are the bits of a float32, for a float32 counts no steps beyond 2 ** 24.
+    numbers: jax.Array
 
 
 class CompiledGame:
@@ -44,18 +47,58 @@ class CompiledGame:
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
         self.step = jax.jit(self._step, donate_argnums=2, keep_unused=True)
+        self._step_into: Any = jax.jit(self._flat_step_into, donate_argnums=0)
+        self._structure: Any = None  # of a step, whose leaves ``_step_into`` gives
+        self._calls_back: bool | None = None  # not known yet
+        self._known: dict[tuple[int, ...], int] = {}  # canvases by shape: compiled functions when it was last used
         self.reset_or_step = jax.jit(self._reset_or_step)
         self.step_only = jax.jit(self._step_only, donate_argnums=2, keep_unused=True)
         self.draw = jax.jit(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
         draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
         self.draw_rows = tuple(jax.jit(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
 
-    def _step(self, batch: Batch, action: jax.Array, spare: Spare = None, at: Any = None) -> Step:
-        """Step, begin anew where an episode ended, draw once (into ``spare[:, at]``, if given), and pack."""
+    def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
+        """Step, begin anew where an episode ended, draw once, and pack."""
         root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
-        if at is not None:
-            pixels = jax.lax.dynamic_update_index_in_dim(spare, pixels, at, 1)
         return Step(root, stepped.state, pixels, _pack(stepped, outcome))
+
+    def step_into(self, canvas: "Canvas", at: int, batch: Batch, action: Any) -> Step:
+        """Step as ``step`` does and draw into ``canvas[:, at]``; whatever interrupts, the canvas keeps its memory.
+
+        Args:
+            canvas: Of shape [N, L, S, S, 3].
+            at: Index on its second axis.
+            batch: The live batch.
+            action: int32 [N].
+
+        Returns:
+            The step without ``pixels``, which are in the canvas.
+        """
+        shape = canvas.memory.shape
+        if self._known.get(shape) == self._step_into._cache_size():
+            leaves = canvas.draw(self._step_into, at, batch, action)
+        else:
+            # Python traces and compiles: in a thread of its own, for Python's signals interrupt the main thread alone.
+            with ThreadPoolExecutor(1) as thread:
+                leaves = thread.submit(canvas.draw, self._step_into, at, batch, action).result()
+            self._known[shape] = self._step_into._cache_size()
+        step: Step = jax.tree.unflatten(self._structure, leaves)
+        return step
+
+    def _flat_step_into(self, memory: jax.Array, at: Any, batch: Batch, action: jax.Array) -> tuple[jax.Array, ...]:
+        """The memory, drawn into, and the other leaves of the step; flat, so that no Python runs to build the tuple."""
+        step = self._step(batch, action)
+        memory = jax.lax.dynamic_update_index_in_dim(memory, step.pixels, at, 1)
+        leaves, self._structure = jax.tree.flatten(step._replace(pixels=None))
+        return (memory, *leaves)
+
+    def calls_back(self, batch: Batch) -> bool:
+        """Whether a step of this batch runs Python code of a game, or what else may fail while it runs."""
+        if self._calls_back is None:
+            action = np.zeros(len(batch.step_count), np.int32)
+            text = str(jax.make_jaxpr(self._step)(batch, action))
+            self._calls_back = "callback" in text or "ffi_call" in text
+        return self._calls_back
 
     def _step_only(self, batch: Batch, action: jax.Array, spare: Spare = None) -> tuple[Batch, jax.Array, jax.Array]:
         """Step and draw, without any reset; returns the batch, the frames and the numbers."""
@@ -71,8 +114,10 @@ class CompiledGame:
 
 
 def _pack(stepped: Batch, outcome: Outcome) -> jax.Array:
-    columns = (outcome.reward, stepped.episode_reward, stepped.step_count, outcome.terminated, outcome.truncated)
-    return jnp.stack([jnp.asarray(column, jnp.float32) for column in columns], axis=-1)
+    floats = (outcome.reward, stepped.episode_reward)
+    bits = [jax.lax.bitcast_convert_type(jnp.asarray(column, jnp.float32), jnp.int32) for column in floats]
+    counts = (stepped.step_count, outcome.terminated, outcome.truncated)
+    return jnp.stack([*bits, *(jnp.asarray(column, jnp.int32) for column in counts)], axis=-1)
 
 
 def _draw_rows(
@@ -135,12 +180,36 @@ class Canvas:
 
     JAX would not draw where it knows that somebody looks, so they are laid over the bare address. They keep the canvas
     alive, and the canvas the memory. Who draws answers for the parts that were shown.
+
+    A function that draws is donated the memory and gives it back: between these two, nobody holds it. A signal that
+    raises there (Ctrl-C) would let go of it, and whoever looks would read freed memory. Python handles signals between
+    its own instructions only, so ``draw`` calls and keeps in one of them.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.memory = jnp.empty(shape, jnp.uint8, device=jax.devices("cpu")[0]).block_until_ready()
-        self.address = self.memory.unsafe_buffer_pointer()
+        memory = jnp.empty(shape, jnp.uint8, device=jax.devices("cpu")[0]).block_until_ready()
+        self._results: deque[tuple[jax.Array, ...]] = deque([(memory,)], maxlen=1)
+        self.address = memory.unsafe_buffer_pointer()
         self.__array_interface__ = {"shape": shape, "typestr": "|u1", "data": (self.address, False), "version": 3}
+
+    @property
+    def memory(self) -> jax.Array:
+        """Where is drawn, as the last function gave it back."""
+        return self._results[0][0]
+
+    def draw(self, function: Callable[..., tuple[jax.Array, ...]], *args: Any) -> tuple[jax.Array, ...]:
+        """Call a compiled function that draws.
+
+        Args:
+            function: Takes the memory, which it is donated, and ``args``; gives a flat tuple, the memory first.
+            *args: What else it takes.
+
+        Returns:
+            What it gave but for the memory.
+        """
+        arguments = [(argument,) for argument in (self.memory, *args)]
+        self._results.extend(map(function, *arguments))
+        return self._results[0][1:]
 
     def wait(self) -> None:
         """Wait until ``memory``, which a function gave back that it was donated to, has been drawn."""

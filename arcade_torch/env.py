@@ -24,6 +24,7 @@ from arcade_torch.compiled import (
 from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, wait_for_torch
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
+from arcade_torch.envs_jax.validation import check_fits, check_num_envs
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.process import check_process
 from arcade_torch.snapshot import Snapshots
@@ -89,13 +90,14 @@ class ArcadeEnv(EnvBase):
         debug: bool = False,
     ) -> None:
         check_process()
-        validation.check_num_envs(num_envs)
+        num_envs = check_num_envs(num_envs)
         flags_given = (categorical_actions, state_in_td, task_in_td, debug)
         validation.check_flags("categorical_actions state_in_td task_in_td debug", flags_given)
         flags = partial_flags(observability, num_envs)
         torch_device, jax_device = pick_devices(device)
         super().__init__(device=torch_device, batch_size=[num_envs])
         self._compiled = game if isinstance(game, CompiledGame) else CompiledGame(game)
+        check_fits(num_envs, self._compiled.batched.game.obs_size)
         self._batched = self._compiled.batched
         self._jax_device = jax_device
         self._check_actions = debug or is_host(torch_device)
@@ -243,26 +245,35 @@ class ArcadeEnv(EnvBase):
             ValueError: Actions of a wrong shape or out of range.
         """
         argument = int32_argument(self._check_action(action), self._jax_device)
-        memory, at = (into[0].memory, into[1]) if into else (self._memory.spare(), None)
-        step = self._compiled.step(self._live.batch, argument, memory, at)
-        if into:
-            into[0].memory = step.pixels  # at once: were the step interrupted, what lies over it would hang in the air
+        if into is None:
+            step = self._compiled.step(self._live.batch, argument, self._memory.spare())
+        else:
+            canvas, index, frames = into
+            step = self._compiled.step_into(canvas, index, self._live.batch, argument)
         if while_computing is not None:
             while_computing()
-        if into:
-            into[0].wait()
-        frames = into[2] if into else to_torch(self._memory.show(step.pixels), self.device)
+        if into is None:
+            frames = to_torch(self._memory.show(step.pixels), self.device)
+        else:
+            canvas.wait()
         self._go_on(step.root)  # on the CPU the step is done; argument lives until here
         return RawStep(frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial))
+
+    def draws_safely(self) -> bool:
+        """Whether steps may draw into memory that tensors lie over: a step that fails would take it along."""
+        return not self._compiled.calls_back(self._live.batch)
 
     def final_observations(self, max_steps: int) -> FinalObservations:
         """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
     def _go_on(self, batch: Batch, ends: torch.Tensor | None = None) -> None:
-        """Put another state in place. ``ends`` bool [N, 2] says where a step terminated or truncated it."""
-        self._live.batch, self._live.ends = batch, self._no_ends if ends is None else ends
-        self._live.generation += 1
+        """Put another state in place. ``ends`` bool [N, 2] says where a step terminated or truncated it.
+
+        All at once, so that an interrupt leaves the old state or the new one.
+        """
+        ends = self._no_ends if ends is None else ends
+        vars(self._live).update(batch=batch, ends=ends, generation=self._live.generation + 1)
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
@@ -271,6 +282,8 @@ class ArcadeEnv(EnvBase):
         if self.one_hot:
             if action.shape != (*shape, num_actions):
                 raise ValueError(f"action has shape {tuple(action.shape)}, expected one-hot {(*shape, num_actions)}")
+            if self._check_actions:
+                validation.check_one_hot(action)
             return action.to(torch.float32).argmax(-1)
         unsigned = _INTEGERS.get(action.dtype)
         if unsigned is None:
@@ -382,10 +395,11 @@ class ArcadeEnv(EnvBase):
     def _next(self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor) -> TensorDict:
         """The ``"next"`` tensordict. Frames and numbers are zero copy, since JAX never reads them again."""
         is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        step_count, episode_reward = numbers[:, STEP_COUNT, None].to(torch.int64), numbers[:, EPISODE_REWARD, None]
+        step_count = numbers[:, STEP_COUNT, None].to(torch.int64)
+        episode_reward = numbers[:, EPISODE_REWARD, None].view(torch.float32)
         counts = {"is_init": is_init, "step_count": step_count, "episode_reward": episode_reward}
         following = self._entries(frames, action, counts, numbers[:, TERMINATED:] > 0)
-        following["reward"] = numbers[:, REWARD, None]
+        following["reward"] = numbers[:, REWARD, None].view(torch.float32)
         return TensorDict._new_unsafe(following, batch_size=self.batch_size, device=self.device)
 
     def _entries(

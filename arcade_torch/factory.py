@@ -7,8 +7,8 @@ import torch
 
 from arcade_torch.compiled import compiled_game
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.envs_jax.validation import check_num_envs
 from arcade_torch.observability import Observability, partial_flags
-from arcade_torch.validation import check_num_envs
 
 
 def make(
@@ -64,7 +64,7 @@ def make(
         >>> make(["CartPoleEasy", "MineSweeperEasy"], num_envs=5).reset()["task"]
         tensor([0, 0, 0, 1, 1])
     """
-    check_num_envs(num_envs)
+    num_envs = check_num_envs(num_envs)
     flags = partial_flags(observability, num_envs, partial_obs)
     return ArcadeEnv(
         compiled_game(id, obs_size, rules, options),

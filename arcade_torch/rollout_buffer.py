@@ -77,7 +77,7 @@ class RolloutBuffer:
         size, device = (self.num_envs, self.length), self.device
         self.pixels = self._new_pixels.take()
         self._action = torch.zeros(size, dtype=torch.int64, device=device)
-        self._numbers = torch.zeros((*size, NUM_NUMBERS), device=device)
+        self._numbers = torch.zeros((*size, NUM_NUMBERS), dtype=torch.int32, device=device)
         self._root = {key: torch.zeros(size, dtype=dtype, device=device) for key, dtype in _ROOT_COLUMNS.items()}
         self._extras = {
             key: torch.zeros((*size, *shape), dtype=dtype, device=device)
@@ -180,7 +180,7 @@ class RolloutBuffer:
         self._root["last_action"][:, after] = self._action[:, before]
         self._root["is_init"][:, after] = done
         self._root["step_count"][:, after] = numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
-        self._root["episode_reward"][:, after] = numbers[..., EPISODE_REWARD].masked_fill(done, 0)
+        self._root["episode_reward"][:, after] = numbers[..., EPISODE_REWARD].view(torch.float32).masked_fill(done, 0)
         self._final[:, -1] = last
         if self._dense is not None and self._fills_dense:
             self._dense[:, -1] = last
@@ -252,8 +252,8 @@ class RolloutBuffer:
             "is_init": self._root["is_init"][:, first:, None],
             "step_count": self._root["step_count"][:, first:, None],
             "episode_reward": self._root["episode_reward"][:, first:, None],
-            ("next", "reward"): numbers[..., REWARD, None],
-            ("next", "episode_reward"): numbers[..., EPISODE_REWARD, None],
+            ("next", "reward"): numbers[..., REWARD, None].view(torch.float32),
+            ("next", "episode_reward"): numbers[..., EPISODE_REWARD, None].view(torch.float32),
             ("next", "step_count"): numbers[..., STEP_COUNT, None].to(torch.int64),
             ("next", "terminated"): numbers[..., TERMINATED, None] > 0,
             ("next", "truncated"): numbers[..., TRUNCATED, None] > 0,
@@ -269,7 +269,7 @@ class RolloutBuffer:
     def _buffers(self) -> dict[NestedKey, torch.Tensor]:
         """All buffers with axes [N, L, ...]."""
         dense = {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
-        fixed = {"pixels": self.pixels, "action": self._action, "numbers": self._numbers, **self._root, **dense}
+        fixed = {"pixels": self.pixels, "action": self._action, "outcomes": self._numbers, **self._root, **dense}
         return {**fixed, **{("extras", *path_of(key)): buffer for key, buffer in self._extras.items()}}
 
     def overlap_state(self) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Snapshots:
         self._num_envs = int(batch.step_count.shape[0])
         self._batched, self._game_id = batched, batched.game.id
         numbers = [fingerprint(group.game.id) for group in batched.groups]
-        self._games = torch.tensor(numbers)[torch.from_numpy(batched.task(self._num_envs))]
+        self._games = torch.tensor(numbers, device="cpu")[torch.from_numpy(batched.task(self._num_envs))]
         self._device = device
         self._jax_device = jax_device
 

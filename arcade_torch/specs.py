@@ -14,7 +14,7 @@ class RawStep(NamedTuple):
     """What one fused step gives."""
 
     pixels: torch.Tensor  # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
-    numbers: torch.Tensor  # float32 [N, 5], see ``Step.numbers``
+    numbers: torch.Tensor  # int32 [N, 5], see ``Step.numbers``
     final: tuple[Any, jax.Array]  # the games' states before the resets, and who saw the partial view
 
     def root_numbers(self, keys: Collection[str]) -> dict[str, torch.Tensor]:
@@ -26,7 +26,7 @@ class RawStep(NamedTuple):
         if "step_count" in keys:
             out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
         if "episode_reward" in keys:
-            out["episode_reward"] = numbers[:, EPISODE_REWARD, None].masked_fill(done, 0)
+            out["episode_reward"] = numbers[:, EPISODE_REWARD, None].view(torch.float32).masked_fill(done, 0)
         return out
 
 

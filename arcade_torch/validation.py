@@ -5,29 +5,17 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 
 from arcade_torch.envs_jax.validation import format_value
 
-MOST_ENVS = 2**20
-"""The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed allocation."""
 
-
-def check_num_envs(num_envs: int) -> None:
-    """Raise unless ``num_envs`` is an int from 1 to ``MOST_ENVS``."""
-    if isinstance(num_envs, bool) or not isinstance(num_envs, int):
-        raise TypeError(f"num_envs is {format_value(num_envs)}, expected an int of 1 or more")
-    if num_envs < 1:
-        raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
-    if num_envs > MOST_ENVS:
-        raise ValueError(f"num_envs is above {MOST_ENVS}, the most that a batch may hold")
-
-
-def check_flags(names: str, values: Sequence[bool | None]) -> None:
+def check_flags(names: str, values: Sequence[Any]) -> None:
     """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also be None."""
     for name, value in zip(names.split(), values, strict=True):
-        if not isinstance(value, bool) and not (value is None and name == "task_in_td"):
+        if not isinstance(value, bool | np.bool_) and not (value is None and name == "task_in_td"):
             raise TypeError(f"{name} is {format_value(value)}, allowed: True, False")
 
 
@@ -62,6 +50,16 @@ def check_tensor(value: Any, what: str) -> None:
         raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
     if value.layout is not torch.strided:
         raise TypeError(f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()")
+
+
+def check_one_hot(action: torch.Tensor) -> None:
+    """Raise ValueError unless every row holds a single one among zeros."""
+    ones = (action == 1).sum(-1)
+    others = ((action != 0) & (action != 1)).any(-1)
+    wrong = (ones != 1) | others
+    if bool(wrong.any()):
+        row = int(wrong.nonzero()[0, 0])
+        raise ValueError(f"action of env {row} is {action[row].tolist()}, expected one-hot: a single 1 among zeros")
 
 
 def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:

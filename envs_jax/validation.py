@@ -1,6 +1,9 @@
 """What a refusal says: the value that arrived, on one line, and what is allowed."""
 
+import os
 from typing import Any
+
+import numpy as np
 
 _LONGEST = 200
 
@@ -39,3 +42,30 @@ def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     kinds = tuple({type(one) for one in allowed})
     if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
         raise ValueError(f"{what} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}")
+
+
+MOST_ENVS = 2**20
+"""The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed allocation."""
+
+
+def check_num_envs(num_envs: Any) -> int:
+    """The number of envs as an int; raises unless it is a whole number from 1 to ``MOST_ENVS``."""
+    if isinstance(num_envs, bool | np.bool_) or not isinstance(num_envs, int | np.integer):
+        raise TypeError(f"num_envs is {format_value(num_envs)}, expected an int of 1 or more")
+    if num_envs < 1:
+        raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
+    if num_envs > MOST_ENVS:
+        raise ValueError(f"num_envs is above {MOST_ENVS}, the most that a batch may hold")
+    return int(num_envs)
+
+
+def check_fits(num_envs: int, obs_size: int) -> None:
+    """Raise ValueError if the frames of one step need more memory than the machine has."""
+    pages = os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else -1
+    frames = num_envs * obs_size * obs_size * 3
+    memory = pages * os.sysconf("SC_PAGE_SIZE") if pages > 0 else frames
+    if frames > memory:
+        raise ValueError(
+            f"num_envs is {num_envs}: the frames of one step take {frames / 1e9:.0f} GB, "
+            f"this machine has {memory / 1e9:.0f}: take at most {memory * num_envs // frames // 4}"
+        )

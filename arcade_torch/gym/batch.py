@@ -145,9 +145,13 @@ class NumpyBatch:
         self._batch = step.root
         frames = np.array(self._memory.show(step.pixels), copy=copy or None)
         numbers = np.asarray(step.numbers)
-        _, episode_reward, step_count, terminated, truncated = numbers.T
-        info = {"episode_reward": episode_reward.astype(np.float64), "step_count": step_count.astype(np.int64)}
-        stepped = Stepped(numbers[:, 0].astype(np.float64), terminated > 0, truncated > 0, info)
+        reward, episode_reward, step_count, terminated, truncated = numbers.T
+        info = {
+            "episode_reward": episode_reward.view(np.float32).astype(np.float64),
+            "step_count": step_count.astype(np.int64),
+        }
+        paid = reward.view(np.float32).astype(np.float64)
+        stepped = Stepped(paid, terminated > 0, truncated > 0, info)
         ended = stepped.terminated | stepped.truncated
         self._finals.add(0, step.final_state, step.root.partial)
         drawn = [np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])]

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.envs_jax.validation import check_choice
+from arcade_torch.envs_jax.validation import check_choice, check_fits, check_num_envs
 from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
 from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
 from arcade_torch.observability import Observability, partial_flags
@@ -74,8 +74,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs is {num_envs!r}, expected an int of 1 or more")
+        num_envs = check_num_envs(num_envs)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode of a vector environment is {render_mode!r}, allowed: None, 'rgb_array'")
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -85,6 +84,7 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self.autoreset_mode}
         flags = partial_flags(observability, num_envs, partial_obs)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
+        check_fits(num_envs, obs_size)
         self.single_action_space = action_space(self._batch.game.num_actions)
         self.single_observation_space = observation_space(obs_size)
         self.action_space = batch_space(self.single_action_space, num_envs)
