@@ -125,7 +125,8 @@ class LearnerConfig(Checked):
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
     """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
-    (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of the return, in [0, 1]; 0: no mean."""
+    (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of the training return, which counts
+    from 0 at the lowest that the game can pay to 1 at the highest; 0: no mean."""
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
     time_limit: TimeLimit = "bootstrap"
@@ -206,8 +207,9 @@ class PPOConfig(LearnerConfig):
     """How far the probability ratio, and the value, may move in an update before the gradient stops."""
     entropy_coeff: PositiveOrZero = 0.01
     """Weight of the entropy bonus at the start."""
-    entropy_end: Fraction = 1.0
-    """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it."""
+    entropy_end: Annotated[float, Range("a number in (0, 1]", lambda x: 0.0 < x <= 1.0)] = 1.0
+    """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it, and no factor
+    leads to 0 (for no bonus: ``entropy_coeff`` 0)."""
     advantage_decay: Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)] = 0.0
     """Share kept, at each update, of the running deviation that divides advantages; 0: each minibatch has its own."""
     critic_coeff: PositiveOrZero = 0.5

@@ -6,7 +6,7 @@ room. The oldest leaves when the capacity is reached, and its file when no kept 
 TorchRL's ``TensorDictReplayBuffer`` stores the same batches, but writes everything again for every checkpoint.
 """
 
-import os
+import re
 import tempfile
 from collections import deque
 from collections.abc import Mapping
@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from tensordict import TensorDict, TensorDictBase
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.runs.files import CheckpointError, checksum
+from arcade_torch.agents.runs.files import CheckpointError, checksum, write_atomic
 
+_WINDOW = re.compile(r"window-\d{9,12}\.safetensors")  # the only names that are read or removed
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
 
 
@@ -70,11 +71,8 @@ class SequenceReplay:
         size = tensors["pixels"].shape[2:]
         if self._segments and (held := self._segments[-1].data["pixels"].shape[2:]) != size:
             raise CheckpointError(f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}")
-        self._folder.mkdir(parents=True, exist_ok=True)
         file = self._folder / f"window-{self._added:09d}.safetensors"
-        draft = file.with_name(f".{file.name}.{os.getpid()}")
-        save_file(tensors, draft)
-        os.replace(draft, file)
+        write_atomic(file, save(tensors))
         self._open(file)
         self._added += 1
         while len(self) > self.capacity and len(self._segments) > 1:
@@ -115,18 +113,21 @@ class SequenceReplay:
         names = {segment.file.name: segment.checksum for segment in self._segments}
         needed = set(names).union(*self._lists)
         for file in self._folder.glob("window-*"):
-            if file.name not in needed:
+            if _WINDOW.fullmatch(file.name) and file.name not in needed:
                 file.unlink()
         self._lists.append(set(names))
         return {"files": names, "added": self._added}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to a saved moment; a ``CheckpointError`` if a file is missing or damaged."""
+        require(type(state["added"]) is int and 0 <= state["added"] < 10**12, "added", state["added"], "a count")
         self._added = state["added"]
         self._segments.clear()
         for name, digest in state["files"].items():
+            if not isinstance(name, str) or not _WINDOW.fullmatch(name):
+                raise CheckpointError(f"the checkpoint names {name!r}, which is no window of a replay")
             file = self._folder / name
-            if not file.is_file():
+            if file.is_symlink() or not file.is_file():
                 raise CheckpointError(f"{file} is missing: the replay of this checkpoint is not whole")
             if checksum(file) != digest:
                 raise CheckpointError(f"{file} is damaged: it does not have the checksum in the checkpoint")

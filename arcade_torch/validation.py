@@ -53,9 +53,10 @@ def check_tensor(value: Any, what: str) -> None:
 
 
 def check_one_hot(action: torch.Tensor) -> None:
-    """Raise ValueError unless every row holds a single one among zeros."""
-    ones = (action == 1).sum(-1)
-    others = ((action != 0) & (action != 1)).any(-1)
+    """Raise ValueError unless every row, rounded (a softmax may miss the 1), holds a single one among zeros."""
+    rounded = action.to(torch.float32).round()
+    ones = (rounded == 1).sum(-1)
+    others = ((rounded != 0) & (rounded != 1)).any(-1)
     wrong = (ones != 1) | others
     if bool(wrong.any()):
         row = int(wrong.nonzero()[0, 0])

@@ -4,21 +4,26 @@ import csv
 import hashlib
 import io
 import json
+import math
 import os
 import sys
+import zipfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from arcade_torch.agents.runs.files import open_regular, read_text, write_atomic
 from arcade_torch.agents.runs.files import read_csv as read_csv
-from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.errors import need
 
 NARROWEST = 80
 """Columns of a terminal in which every table can be read."""
+MOST_ARRAYS = 2 * 2**30
+"""Bytes of the largest arrays that are read from a file, unpacked."""
 Row = TypeVar("Row", bound=NamedTuple)
 
 
@@ -72,7 +77,7 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: 
 def write_between(page: Path, begin: str, end: str, text: str) -> Path:
     """Put text between two marks of a page, in the place of what stood there."""
     try:
-        old = page.read_text(encoding="utf-8")
+        old = read_text(page)
     except UnicodeDecodeError as error:
         raise ValueError(f"{page} is not text in UTF-8: {error}") from error
     if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
@@ -127,8 +132,45 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
     return write_atomic(path, buffer.getvalue())
 
 
+def read_npz(path: Path) -> dict[str, Any]:
+    """Arrays from a file, after a look at what they claim to be: a small file may unpack to more than memory holds.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no regular file, no archive of plain arrays, or larger than ``MOST_ARRAYS``.
+    """
+    with open_regular(path, MOST_ARRAYS) as stream:
+        try:
+            with zipfile.ZipFile(stream) as archive:
+                total = sum(entry.file_size for entry in archive.infolist())
+                if total > MOST_ARRAYS:
+                    raise ValueError(f"its arrays take {total:,} bytes, at most {MOST_ARRAYS:,} are read")
+                for entry in archive.infolist():
+                    with archive.open(entry) as member:
+                        _check_header(member, entry.file_size)
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as arrays:
+                return {key: arrays[key] for key in arrays.files}
+        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, KeyError) as error:
+            raise ValueError(f"{path} is no archive of arrays: {error}") from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def _check_header(member: IO[bytes], size: int) -> None:
+    """Refuse an array that claims to be larger than what is stored of it, or that holds objects."""
+    version = np.lib.format.read_magic(member)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(member)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > size:
+        raise ValueError(f"an array claims to be {dtype} {list(shape)}, which is not what is stored")
+
+
 def cached_arrays(
-    run: Path, name: str, options: Mapping[str, Any], compute: Callable[[], dict[str, Any]]
+    run: Path,
+    name: str,
+    options: Mapping[str, Any],
+    compute: Callable[[], dict[str, Any]],
 ) -> dict[str, Any]:
     """Arrays from ``run/analysis``, computed and written there if they are missing, made for others, or damaged.
 
@@ -137,14 +179,27 @@ def cached_arrays(
     """
     text = json.dumps(dict(options), sort_keys=True)
     file = run / "analysis" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.npz"
-    try:
-        with np.load(file, allow_pickle=False) as kept:
-            arrays = {key: kept[key] for key in kept.files}
-        if str(arrays["options"]) == text:
-            return arrays
-    except Exception:
-        pass  # there is none, or it is damaged: it is made anew
+    kept = _kept_arrays(file, text)
+    if kept is not None:
+        return kept
     arrays = {**compute(), "options": np.array(text)}
     if (run / "config.json").is_file() and os.access(run, os.W_OK):
-        write_npz(file, arrays)
+        write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
     return arrays
+
+
+def _kept_arrays(file: Path, options: str) -> dict[str, Any] | None:
+    """The arrays of a file, if they were made with these options and have the layout that was written."""
+    try:
+        arrays = read_npz(file)
+    except (OSError, ValueError):  # there is none, or it is damaged
+        return None
+    layout = str(arrays.pop("layout", ""))
+    fits = str(arrays.get("options", "")) == options and layout == _layout(arrays)
+    return arrays if fits else None
+
+
+def _layout(arrays: Mapping[str, Any]) -> str:
+    """Names, types and shapes of arrays as text."""
+    described = {name: [str(np.asarray(value).dtype), np.shape(value)] for name, value in arrays.items()}
+    return json.dumps(described, sort_keys=True)

@@ -11,28 +11,41 @@ A learner with a replay keeps it beside, in ``replay/`` of the run: the trainer'
 Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights_only=True``.
 """
 
+import io
 import os
 import pickle
+import re
 import shutil
 import warnings
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import Tensor
 
 from arcade_torch.agents.config import TrainConfig, differing_fields, require
-from arcade_torch.agents.runs.files import CheckpointError, checksum, read_json, write_atomic, write_json
+from arcade_torch.agents.runs.files import (
+    MOST_TENSORS,
+    CheckpointError,
+    checksum,
+    open_regular,
+    read_bytes,
+    read_json,
+    read_text,
+    write_atomic,
+    write_json,
+)
 
 FORMAT = 2
 """Format of checkpoints and run folders; 1 is that of arcade-torch 0.1, which is refused."""
 KEEP = 2
 _WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.json", "latest"
-_load_tensors: Callable[[Path], dict[str, Any]] = partial(torch.load, map_location="cpu", weights_only=True)
+_NAME = re.compile(r"frames-\d{12}")
+_DRAFT = re.compile(r"\.frames-\d{12}\.\d+")
 
 
 class _OtherRunError(CheckpointError):
@@ -64,24 +77,38 @@ def save_checkpoint(
     draft = folder / f".{final.name}.{os.getpid()}"
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
-    save_file({key: value.detach().cpu().contiguous().clone() for key, value in weights.items()}, draft / _WEIGHTS)
-    torch.save(trainer, draft / _TRAINER)
+    tensors = {key: value.detach().cpu().contiguous().clone() for key, value in weights.items()}
+    write_atomic(draft / _WEIGHTS, save(tensors))
+    state = io.BytesIO()
+    torch.save(trainer, state)
+    write_atomic(draft / _TRAINER, state.getvalue())
     sums = {part: checksum(draft / part) for part in (_WEIGHTS, _TRAINER)}
     write_json(draft / _META, {"format": FORMAT, "frames": frames, "config": config.to_dict(), "sha256": sums})
     shutil.rmtree(final, ignore_errors=True)
     os.replace(draft, final)
     write_atomic(folder / _LATEST, final.name + "\n")
-    for old in (*list_checkpoints(folder)[KEEP:], *folder.glob(".frames-*")):
+    for old in list_checkpoints(folder)[KEEP:]:
         shutil.rmtree(old, ignore_errors=True)
+    remove_draft_checkpoints(folder)
     return final
+
+
+def remove_draft_checkpoints(folder: Path) -> None:
+    """Remove what a killed process left of a checkpoint, and nothing else."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _DRAFT.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
     """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames) first."""
-    found = sorted((path for path in folder.glob("frames-*") if path.is_dir()), reverse=True)
-    pointer = folder / _LATEST
-    latest = pointer.read_text(encoding="utf-8", errors="replace").strip() if pointer.is_file() else ""
-    return sorted(found, key=lambda path: path.name != latest)
+    checkpoints = [path for path in folder.glob("frames-*") if _NAME.fullmatch(path.name) and path.is_dir()]
+    try:
+        latest = read_text(folder / _LATEST).strip()
+    except (OSError, ValueError):
+        latest = ""
+    checkpoints.sort(reverse=True)
+    return sorted(checkpoints, key=lambda path: path.name != latest)
 
 
 def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only: bool = False) -> Checkpoint:
@@ -96,7 +123,7 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
         require(type(frames) is int, "frames", frames, "a whole number")
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error
-    weights = _read_part(path / _WEIGHTS, sums, load_file)
+    weights = _read_part(path / _WEIGHTS, sums, _load_weights)
     if expect is not None and (fields := differing_fields(config, expect)):
         raise _OtherRunError(f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}")
     trainer = None if weights_only else _read_part(path / _TRAINER, sums, _load_tensors)
@@ -163,6 +190,22 @@ def find_checkpoint(path: Path) -> Checkpoint:
     raise CheckpointError(f"{path} holds no checkpoint; {hint}")
 
 
+def _load_weights(file: Path) -> dict[str, Tensor]:
+    return load(read_bytes(file, MOST_TENSORS))
+
+
+def _load_tensors(file: Path) -> dict[str, Any]:
+    """What ``torch.save`` wrote, unless it is packed: a small file could hold more than memory does."""
+    with open_regular(file, MOST_TENSORS) as stream:
+        with zipfile.ZipFile(stream) as archive:
+            packed = [entry.filename for entry in archive.infolist() if entry.compress_type != zipfile.ZIP_STORED]
+        if packed:
+            raise ValueError(f"{packed[0]} is compressed, which torch.save does not do")
+        stream.seek(0)
+        state: dict[str, Any] = torch.load(stream, map_location="cpu", weights_only=True)
+        return state
+
+
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
         meta: Any = read_json(path / _META)
@@ -187,6 +230,8 @@ def _read_part(file: Path, sums: dict[str, str], read: Callable[[Path], dict[str
         damage = f"does not have the checksum in {_META}"
     except FileNotFoundError:
         damage = "is missing"
+    except PermissionError as error:
+        raise CheckpointError(f"{file} may not be read: {error.strerror}") from error
     except pickle.UnpicklingError:
         damage = "holds more than tensors, numbers and text; not loaded"
     except Exception as error:  # torch, zipfile and safetensors name damage in many ways

@@ -1,4 +1,4 @@
-"""Small files of a run: replaced atomically, or tables that grow by whole rows."""
+"""Small files of a run: read with a bound, replaced atomically, or tables that grow by whole rows."""
 
 import csv
 import hashlib
@@ -7,9 +7,16 @@ import json
 import os
 import re
 import secrets
+import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
+
+MOST_TEXT = 256 * 2**20
+"""Bytes of the largest text that is read: JSON, TOML, CSV."""
+MOST_TENSORS = 16 * 2**30
+"""Bytes of the largest file of tensors that is read."""
+_DRAFT = re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL)
 
 
 class CheckpointError(RuntimeError):
@@ -19,18 +26,69 @@ class CheckpointError(RuntimeError):
         super().__init__(" ".join(message.splitlines()))  # names of files may have line breaks
 
 
-def write_atomic(path: Path, data: str | bytes) -> Path:
-    """Replace a file in one step: readers see the old content or the new, never a part; missing folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Others may write the same file on another machine; names may be as long as the system allows.
-    temporary = path.with_name(f".{path.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}")
+def open_regular(path: Path, most_bytes: int = MOST_TEXT) -> BinaryIO:
+    """Open a file for reading, if it is a regular one of a size that can be meant.
+
+    What is opened is looked at, so that nothing can take its place in between; nothing is waited for.
+
+    Args:
+        path: the file, or a link to it.
+        most_bytes: the largest size.
+
+    Raises:
+        FileNotFoundError, PermissionError: as ``open`` raises them.
+        ValueError: it is a folder, a pipe, a socket or a device, or too large.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-        os.replace(temporary, path)
-    except BaseException:  # a full disk, for one
-        temporary.unlink(missing_ok=True)
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError(f"{path} is not a regular file")
+        if status.st_size > most_bytes:
+            raise ValueError(f"{path} has {status.st_size:,} bytes, at most {most_bytes:,} are read")
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_bytes(path: Path, most_bytes: int = MOST_TEXT) -> bytes:
+    """What a regular file holds; raises as :func:`open_regular`."""
+    with open_regular(path, most_bytes) as stream:
+        return stream.read(most_bytes)
+
+
+def read_text(path: Path) -> str:
+    """What a regular file of text in UTF-8 holds, without a byte order mark; a ``ValueError`` if it is no such file."""
+    return read_bytes(path).decode("utf-8-sig")
+
+
+def write_atomic(path: Path, data: str | bytes) -> Path:
+    """Replace a file in one step: readers see the old content or the new, never a part; missing folders are made.
+
+    Raises:
+        OSError: it cannot be written; ``filename`` is ``path``, and the old content is still there.
+    """
+    # Others may write the same file on another machine; names may be as long as the system allows.
+    draft = path.with_name(f".{path.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}.draft")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft.write_bytes(data.encode() if isinstance(data, str) else data)
+        os.replace(draft, path)
+    except OSError as error:  # a full disk, for one
+        draft.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    except BaseException:
+        draft.unlink(missing_ok=True)
         raise
     return path
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what :func:`write_atomic` of a killed process left in a folder, and nothing else."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _DRAFT.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            path.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> Path:
@@ -41,15 +99,18 @@ def write_json(path: Path, value: Any) -> Path:
 def read_json(path: Path) -> Any:
     """Read a JSON file; a ``ValueError`` if it does not hold JSON."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:  # no text, no JSON, too many digits, nested too deeply
         raise ValueError(f"{path} does not hold JSON: {error}") from error
 
 
 def checksum(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    with open_regular(path, MOST_TENSORS) as stream:
+        while block := stream.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
@@ -98,8 +159,7 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
         ValueError: it is no text, has no header or a name twice in it, or has such a line.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            text = file.read()
+        text = read_text(path)
         text = text if strict else text[: text.rfind("\n") + 1]
         header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
     except (UnicodeDecodeError, csv.Error) as error:

@@ -4,7 +4,6 @@ import contextlib
 import importlib.metadata
 import os
 import platform
-import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -15,8 +14,8 @@ from filelock import FileLock, Timeout
 
 import arcade_torch
 from arcade_torch.agents.config import TrainConfig, differing_fields
-from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format
-from arcade_torch.agents.runs.files import is_final, read_json, write_json
+from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format, remove_draft_checkpoints
+from arcade_torch.agents.runs.files import is_final, read_json, remove_drafts, write_json
 
 METRIC_COLUMNS = (
     "frames", "updates", "grad_steps", "seconds", "fps",
@@ -53,7 +52,7 @@ class RunFolder:
         """Refuse, by a ``RunFolderError``, a folder that holds something (with ``resume``: another run) or that cannot be
         written; change nothing.
         """
-        if self._config.is_file() and resume:
+        if self._config.exists() and resume:
             self._check_same(config)
         elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
             hint = "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
@@ -81,11 +80,13 @@ class RunFolder:
             yield
 
     def _prepare(self, config: TrainConfig) -> None:
-        for draft in (*self.path.glob(".*.[0-9]*"), *self.replay.glob(".window-*")):
-            draft.unlink(missing_ok=True)
-        for draft in self.checkpoints.glob(".frames-*"):
-            shutil.rmtree(draft, ignore_errors=True)
-        if self._config.is_file():
+        for folder in (self.checkpoints, self.replay):
+            if folder.is_symlink():
+                raise RunFolderError(f"{folder} is a link: a run removes files there, so make it a folder")
+        for folder in (self.path, self.replay):
+            remove_drafts(folder)
+        remove_draft_checkpoints(self.checkpoints)
+        if self._config.exists():
             self._check_same(config)  # another process may have come first
         else:
             record = {"format": FORMAT, "config": config.to_dict(), "versions": versions(), "command": sys.argv}
@@ -97,10 +98,17 @@ class RunFolder:
             if reason := refuse_format(f"the run in {self.path}", record.get("format", 1)):
                 raise RunFolderError(reason)
             saved = TrainConfig.from_dict(record["config"])
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except PermissionError as error:
+            raise RunFolderError(f"{self._config} may not be read: {error.strerror}") from error
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(f"{self._config} does not describe a run: {error}") from error
         if fields := differing_fields(saved, config):
             raise RunFolderError(f"{self.path} holds another run; differing fields: {', '.join(fields)}")
+
+    def check_there(self) -> None:
+        """Raise ``RunFolderError`` if somebody removed or moved the folder while its run trains."""
+        if not self._config.is_file():
+            raise RunFolderError(f"{self.path} is not there any more, or its config.json: the run ends here")
 
     def finished(self) -> dict[str, Any] | None:
         """The final ``eval.json`` if the run is finished; a damaged one is made again from the last checkpoint."""

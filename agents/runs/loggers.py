@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.agents.runs.files import read_text, write_atomic
 
 
 class LoggerError(RuntimeError):
@@ -85,7 +85,7 @@ def _wandb(config: TrainConfig, folder: Path, frames: int) -> Any:
         write_atomic(file, uuid.uuid4().hex + "\n")
     logger = WandbLogger(
         exp_name=folder.name,
-        id=file.read_text().strip(),
+        id=read_text(file).strip(),
         project=os.environ.get("WANDB_PROJECT", "arcade-torch"),
         log_dir=str(folder),
         log_env_packages=False,

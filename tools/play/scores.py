@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.agents.runs.files import read_csv, read_text
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.tools.analysis.gap_bias import game_of
@@ -47,7 +47,7 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
     if not path.exists():
         return []
     rows = read_csv(path)
-    if path.read_text(encoding="utf-8").partition("\n")[0].strip() != ",".join(COLUMNS):
+    if read_text(path).partition("\n")[0].strip() != ",".join(COLUMNS):
         raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
     for row in rows:
         require(_WHOLE.fullmatch(row["seed"]) is not None, f"{path}: the seed", row["seed"], "a whole number")

@@ -98,7 +98,7 @@ def test_a_checkpoint_of_version_0_1_is_refused_in_one_line_that_says_so(tmp_pat
 
 def test_a_process_that_dies_while_saving_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
     save(tmp_path, 64, 1.0)
-    for name in ("save_file", "checksum"):
+    for name in ("save", "checksum"):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):

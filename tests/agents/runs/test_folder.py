@@ -61,15 +61,19 @@ def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written
         assert process.stdout is not None and process.stdout.readline() == "claimed\n"
         with pytest.raises(RunFolderError, match="another process trains in"):
             folder.claim(CONFIG).__enter__()
-        (folder.path / ".progress.json.123").write_text("{")
+        draft = ".progress.json.123-0123abcd.draft"
+        (folder.path / draft).write_text("{")
+        (folder.path / ".mine.123").write_text("the user's own")
+        (folder.path / ".mine.124-0123abcd.draft").mkdir()
         (folder.checkpoints / ".frames-000000000064.123").mkdir(parents=True)
         folder.replay.mkdir()
-        for name in ("window-000000000.safetensors", ".window-000000001.safetensors.123"):
+        for name in ("window-000000000.safetensors", ".window-000000001.safetensors.7-0123abcd.draft"):
             (folder.replay / name).write_text("frames")
         process.kill()
     with folder.claim(CONFIG):
         left = sorted(path.name for path in folder.path.rglob("*"))
-        assert left == ["checkpoints", "config.json", LOCK, "replay", "window-000000000.safetensors"]
+        kept = [".mine.123", ".mine.124-0123abcd.draft"]
+        assert left == [*kept, "checkpoints", "config.json", LOCK, "replay", "window-000000000.safetensors"]
 
 
 def test_a_lock_alone_does_not_make_a_folder_taken(tmp_path: Path) -> None:
