@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
@@ -365,15 +366,48 @@ class TrainConfig(Checked):
         return cls(**values | groups)
 
 
-def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
-    """Names of the fields that make two configs different runs, as ``name (this != that)``.
+def differing_fields(
+    one: TrainConfig | Mapping[str, Any],
+    other: TrainConfig | Mapping[str, Any],
+    free: Iterable[str] = RESUME_MAY_CHANGE,
+) -> list[str]:
+    """Names of the fields that make two configs different runs, as ``name (this != that)``; see `differing_values`."""
+    pairs = differing_values(one, other, free).items()
+    return [f"{name} ({this!r} != {that!r})" for name, (this, that) in pairs]
+
+
+def differing_values(
+    one: TrainConfig | Mapping[str, Any],
+    other: TrainConfig | Mapping[str, Any],
+    free: Iterable[str] = RESUME_MAY_CHANGE,
+) -> dict[str, tuple[Any, Any]]:
+    """The fields in which two configs differ, by dotted name, with both values.
+
+    Args:
+        one: a config, or plain settings as a ``config.json`` holds them. A field that they lack has its default: they
+            may be from before there was that field. Of a field that this version does not know the default is None.
+        other: the same of the other run.
+        free: fields that may differ, of whole groups too.
 
     Numbers of learners that neither of them uses make no difference.
     """
-    mine, theirs = flatten(one.to_dict()), flatten(other.to_dict())
-    unused = tuple(f"{name}." for name in GROUPS if name not in (one.algorithm, other.algorithm))
-    names = [n for n in mine.keys() | theirs.keys() if n not in RESUME_MAY_CHANGE and not n.startswith(unused)]
-    return [f"{n} ({mine.get(n)!r} != {theirs.get(n)!r})" for n in sorted(names) if mine.get(n) != theirs.get(n)]
+    mine, theirs = _settings(one), _settings(other)
+    unused = set(GROUPS) - {mine["algorithm"], theirs["algorithm"]}
+    skipped = {*free, *unused}
+    names = [name for name in sorted(mine.keys() | theirs.keys()) if not {name, name.partition(".")[0]} & skipped]
+    pairs = {name: (mine.get(name), theirs.get(name)) for name in names}
+    return {name: (this, that) for name, (this, that) in pairs.items() if this != that}
+
+
+def _settings(config: TrainConfig | Mapping[str, Any]) -> dict[str, Any]:
+    """All settings of a run by dotted name; those that it does not state have their defaults."""
+    plain = config.to_dict() if isinstance(config, TrainConfig) else config
+    return _defaults() | flatten({name: value for name, value in plain.items() if value is not None})
+
+
+@lru_cache(maxsize=1)
+def _defaults() -> dict[str, Any]:
+    return flatten(TrainConfig().to_dict())
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:

@@ -11,12 +11,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import flatten, require
+from arcade_torch.agents.config import TrainConfig, differing_values, flatten, require
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
+from arcade_torch.envs_jax import resolve_id
+from arcade_torch.tools.run_folders import RunFolders
 
 METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
 _SIZE = ("layers", "hidden_size")
+_BOM = "\ufeff"  # what some programs write in front of a table
 _VERSION = re.compile(r"-v\d+$")
 FREE = {"device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"}
 """Settings that may differ among runs that are compared."""
@@ -39,13 +42,26 @@ class AgentKey:
         options = config.get("network_options") or {}
         if not isinstance(options, Mapping) or not isinstance(config.get("memory"), str):
             raise ValueError("its memory or its network_options are of no use")
-        flat, network, size = flatten(options), str(config.get("network", "paper")), ""
+        network, size = str(config.get("network", "paper")), ""
+        flat = {name: str(plain_number(value)) for name, value in flatten(options).items()}
         if any(name in flat for name in _SIZE):
             default = preset_size(network)
-            chosen = "x".join(str(flat.get(name, base)) for name, base in zip(_SIZE, default.split("x"), strict=True))
+            chosen = "x".join(flat.get(name, base) for name, base in zip(_SIZE, default.split("x"), strict=True))
             size = "" if chosen == default else chosen
-        rest = tuple(sorted((name, str(value)) for name, value in flat.items() if name not in _SIZE))
+        rest = tuple(sorted((name, value) for name, value in flat.items() if name not in _SIZE))
         return cls(str(config.get("algorithm", "pqn")), config["memory"], network, size, rest)
+
+
+def plain_number(value: Any) -> Any:
+    """A setting with its whole numbers as ints, in lists too: JSON files of one setting may say 1 and 1.0.
+
+    Example:
+        >>> plain_number([1.0, 0.5, "1.0"])
+        [1, 0.5, '1.0']
+    """
+    if isinstance(value, list | tuple):
+        return [plain_number(item) for item in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def preset_size(network: str) -> str:
@@ -93,6 +109,36 @@ def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
     return {agent: first[max(starts, key=len)] for agent, starts in own.items() if starts}
 
 
+def game_names(written: Iterable[str]) -> dict[str, str]:
+    """One name for each game that is written in several ways: with its version, without, or by an alias.
+
+    A name without a version stands for the newest version that is there. A game that is always written in the same way
+    keeps that name.
+
+    Example:
+        >>> game_names(["NoisyPoleEasy", "NoisyCartPoleEasy-v0", "TetrisEasy"])["NoisyPoleEasy"]
+        'NoisyCartPoleEasy-v0'
+    """
+    bare = {name: _bare_name(name) for name in dict.fromkeys(written)}
+    names = dict[str, str]()
+    for name, game in bare.items():
+        same = [other for other in bare if bare[other] == game]
+        versions = [match[0] for other in same if (match := _VERSION.search(other))]
+        match = _VERSION.search(name)
+        newest = max(versions, key=lambda version: int(version[2:]), default="")
+        names[name] = name if len(same) == 1 else game + (match[0] if match else newest)
+    return names
+
+
+def _bare_name(game: str) -> str:
+    """The name of a game without version; an alias is resolved if the game is registered here."""
+    bare = _VERSION.sub("", game)
+    try:
+        return _VERSION.sub("", resolve_id(bare))
+    except ValueError:
+        return bare
+
+
 @dataclass(frozen=True)
 class Score:
     """The raw return of one run, not normalised; of people also who played, for their episodes share seeds."""
@@ -110,11 +156,13 @@ class Run:
     """The folder of a run, to read from; a missing file means "not yet"."""
 
     path: Path
+    settings_file: str = "config.json"  # ``meta.json`` of a single checkpoint
+    game_name: str = ""  # the environment id among others, if it was written otherwise; see `game_names`
 
     @cached_property
     def record(self) -> dict[str, Any]:
         """All of ``config.json``: settings, versions, command."""
-        return read_record(self.path / "config.json")
+        return read_record(self.path / self.settings_file)
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -151,7 +199,7 @@ class Run:
     @property
     def game(self) -> str:
         """Environment id."""
-        return str(self.config["env"])
+        return self.game_name or str(self.config["env"])
 
     @property
     def twin(self) -> str:
@@ -181,14 +229,20 @@ def read_record(file: Path) -> dict[str, Any]:
 
 def open_run(path: Path) -> Run | None:
     """A run from its folder, None if it has not finished; refuses damaged settings by the name of the file."""
-    run, file = Run(path), path / "config.json"
+    run = described(Run(path))
+    return run if run.final is not None else None
+
+
+def described(run: Run) -> Run:
+    """The same run, if its settings say which agent learned which game from which seed; else a ``ValueError``."""
+    file = run.path / run.settings_file
     if not {"env", "memory"} <= set(run.config) or type(run.config.get("seed", 0)) is not int:
         raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
     except ValueError as error:
         raise ValueError(f"{file} is damaged: {error}") from error
-    return run if run.final is not None else None
+    return run
 
 
 @dataclass(frozen=True)
@@ -197,6 +251,11 @@ class Runs:
 
     runs: tuple[Run, ...]
     notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        names = game_names(run.game for run in self.runs)
+        named = (run if names[run.game] == run.game else replace(run, game_name=names[run.game]) for run in self.runs)
+        object.__setattr__(self, "runs", tuple(named))
 
     @cached_property
     def names(self) -> dict[AgentKey, str]:
@@ -229,13 +288,15 @@ def find_runs(paths: Sequence[Path]) -> Runs:
     """All finished runs below some folders, which have to be comparable."""
     if not paths:
         raise ValueError("name the folder with the runs: --runs DIR")
-    opened = {folder: open_run(folder) for path in paths for folder in _folders(path)}
+    search = RunFolders()
+    opened = {folder: open_run(folder) for path in paths for folder in _folders(path, search)}
     runs = [run for run in opened.values() if run is not None]
     if not runs:
         raise ValueError(f"none of the {len(opened)} runs below {listed([str(p) for p in paths])} has finished")
     check_comparable(Runs(tuple(runs)))
     unfinished = [folder.name for folder, run in opened.items() if run is None]
     notes = [f"left out, not finished: {listed(unfinished)}"] if unfinished else []
+    notes += search.notes
     made = [run.record.get("versions") for run in runs]
     several = sorted({str(each.get("arcade_torch", "")) for each in made if isinstance(each, dict)} - {""})
     if len(several) > 1:
@@ -243,51 +304,54 @@ def find_runs(paths: Sequence[Path]) -> Runs:
     return Runs(tuple(runs), notes)
 
 
-def _folders(path: Path) -> list[Path]:
+def _folders(path: Path, search: RunFolders) -> list[Path]:
+    """Run folders below a path: those of a study in the order of its grid."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     if not path.is_dir():
         raise ValueError(f"{path} is a file: give a folder with runs")
     if (path / "meta.json").is_file():
         raise ValueError(f"{path} is a single checkpoint: give its run folder, {path.parent.parent}")
-    rows = read_csv(table) if (table := path / "results.csv").is_file() else []  # of a study: in the order of its grid
-    order = {row.get("run"): place for place, row in enumerate(rows)}
-    found = [file.parent for file in path.rglob("config.json") if "checkpoints" not in file.parts]
-    if not found:
+    again = search.has_seen(path)
+    folders = list(search.below(path))
+    if not folders and not again:
         raise ValueError(f"{path} holds no run: a run folder has a config.json")
-    return sorted(found, key=lambda folder: (order.get(folder.name, len(order)), folder))
+    order: dict[Path, dict[str, int]] = {}
+    for study in {folder.absolute().parent.parent for folder in folders}:
+        table = study / "results.csv"
+        rows = read_csv(table) if table.is_file() else []
+        order[study] = {row.get("run", ""): place for place, row in enumerate(rows)}
+
+    def place(folder: Path) -> tuple[Path, int, Path]:
+        study = folder.absolute().parent.parent
+        return study, order[study].get(folder.name, len(order[study])), folder
+
+    return sorted(folders, key=place)
 
 
 def check_comparable(found: Runs) -> None:
     """Refuse several versions or rules of a game, a run that stands there twice, and seeds that are none."""
-    games = sorted({run.game for run in found.runs if _VERSION.search(run.game)})
+    games = sorted({run.game for run in found.runs})
     for old, new in pairwise(games):
         if _VERSION.sub("", old) == _VERSION.sub("", new):
             raise ValueError(f"runs of {old} and {new} cannot be compared: give one version of a game")
-    for key in ("rules", "obs_size"):
-        values = sorted({str(run.config[key]) for run in found.runs if key in run.config})
+    for name, default in (("rules", TrainConfig.rules), ("obs_size", TrainConfig.obs_size)):
+        values = sorted({str(plain_number(run.config.get(name, default))) for run in found.runs})
         if len(values) > 1:
-            raise ValueError(f"runs with {key} {' and '.join(values)} cannot be compared: give runs with one of them")
-    played: dict[str, Any] = {}
+            raise ValueError(f"runs with {name} {' and '.join(values)} cannot be compared: give runs with one of them")
+    first: dict[str, Run] = {}
     for run in found.runs:
-        own = run.config.get("env_options") or {}
-        if (first := played.setdefault(run.game, own)) != own:
-            raise ValueError(f"{run.game} was played with env_options {first} and {own}: give runs with one of them")
+        same = first.setdefault(run.game, run)
+        own, before = run.config.get("env_options") or {}, same.config.get("env_options") or {}
+        if own != before:
+            raise ValueError(f"{run.game} was played with env_options {before} and {own}: give runs with one of them")
     for (agent, game, twin), runs in found.groups().items():
         for one, run in pairwise(runs):  # by seed
             if one.seed == run.seed:
                 raise ValueError(f"{one.path} and {run.path} are the same cell: give one of them")
-            first, other = _settings(one), _settings(run)
-            if differ := [name for name in first if name in other and first[name] != other[name]]:
-                what = f"{differ[0]}: {first[differ[0]]} and {other[differ[0]]}; give runs with one of them"
-                raise ValueError(f"seeds of {agent} on {game} ({twin}) differ in {what}")
-
-
-def _settings(run: Run) -> dict[str, Any]:
-    """What decides a run's result beside its agent, its game and its seed."""
-    others = _CELL | FREE | ({"pqn", "ppo", "dqn"} - {run.key.algorithm})
-    own = {name: value for name, value in run.config.items() if name not in others}
-    return flatten(own | {"env_options": run.config.get("env_options") or {}})
+            if differ := differing_values(one.config, run.config, _CELL | FREE):
+                what = ", ".join(f"{name}: {this} and {that}" for name, (this, that) in differ.items())
+                raise ValueError(f"seeds of {agent} on {game} ({twin}) differ in {what}; give runs with one of them")
 
 
 Source = str | Path | Sequence[str | Path] | Iterable[Score]
@@ -318,16 +382,17 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
     paths = [Path(part) for part in parts if not isinstance(part, Score)]
     tables = {path: table for path in paths if (table := table_of(path))}
     found = [(AgentKey("", part.agent), part) for part in parts if isinstance(part, Score)]  # agents without names yet
+    stated = list[Run]()  # the runs behind the scores, as far as their settings are known
     if folders := [path for path in paths if path not in tables]:
         opened = find_runs(folders)
+        stated += opened.runs
         found += zip((run.key for run in opened.runs), opened.scores(metric), strict=True)
     for table in tables.values():
         found += _read_table(table, metric)
-    names, newest = agent_names(key for key, _ in found), dict[str, str]()
-    for game in {score.game for _, score in found if _VERSION.search(score.game)}:
-        bare = _VERSION.sub("", game)  # stands for the newest version that is there
-        newest[bare] = max(newest.get(bare, game), game, key=lambda name: int(name.rpartition("-v")[2]))
-    scores = [replace(score, agent=names[key], game=newest.get(score.game, score.game)) for key, score in found]
+        stated += _runs_of_table(table)
+    names = agent_names(key for key, _ in found)
+    games = game_names(score.game for _, score in found)
+    scores = [replace(score, agent=names[key], game=games[score.game]) for key, score in found]
     seen: set[Score] = set()
     for score in scores:
         if any(name.splitlines() != [name] for name in (score.agent, score.game)):
@@ -336,17 +401,30 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         if cell in seen:
             raise ValueError(f"two scores for {score.agent} on {score.game} ({score.observability}), seed {score.seed}")
         seen.add(cell)
+    check_comparable(Runs(tuple(stated)))
     return scores
 
 
 def table_of(path: Path) -> Path | None:
     """The table of scores that a path is: a file, or the ``results.csv`` of a study that has lost its runs."""
-    bare = (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
+    bare = (path / "results.csv").is_file() and next(RunFolders().below(path), None) is None
     return path if path.is_file() else path / "results.csv" if bare else None
 
 
+def _runs_of_table(table: Path) -> list[Run]:
+    """The finished runs in the table of a study, from the configs that the study keeps beside it."""
+    configs = table.parent / "configs"
+    if table.name != "results.csv" or not configs.is_dir():
+        return []
+    names = [row.get("run", "") for row in read_csv(table) if row.get("status") == "finished"]
+    files = [configs / f"{name}.json" for name in names if Path(name).name == name]
+    return [described(Run(configs, file.name)) for file in files if file.exists()]
+
+
 def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
-    rows, found = read_csv(path), []
+    """The scores in a table, with the agents that it names."""
+    rows = [{name.removeprefix(_BOM): value for name, value in row.items()} for row in read_csv(path)]
+    found = list[tuple[AgentKey, Score]]()
     if rows and {"model", "env", "mdp_mean", "pomdp_mean"} <= set(rows[0]):  # means over seeds count as a single seed
         rows = [
             {"model": row["model"], "game": row["env"] + row.get("difficulty", "").capitalize(), "seed": "0"}

@@ -12,7 +12,7 @@ from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
-from arcade_torch.tools.runs import Run, find_runs
+from arcade_torch.tools.runs import Run, find_runs, plain_number
 
 POINTS = 120  # of a curve of training returns
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
@@ -227,11 +227,21 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
 
 def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:
     """Each setting's value, or all its values where runs differ; without the settings of other algorithms."""
-    values: dict[str, set[str]] = {}
-    others, flat = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}, list[dict[str, Any]]()
-    for config in configs:
-        own = flatten({key: value for key, value in config.items() if key not in others})
-        flat.append({name.removeprefix(f"{algorithm}."): value for name, value in own.items() if value != {}})
-    for name in dict.fromkeys(name for settings in flat for name in settings):
-        values[name] = {str(settings.get(name, "-")) for settings in flat}
-    return {name: " / ".join(sorted(found)) for name, found in values.items()}
+    others = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}
+
+    def own(config: Mapping[str, Any]) -> dict[str, str]:
+        flat = flatten({key: value for key, value in config.items() if key not in others})
+        return {name.removeprefix(f"{algorithm}."): _text(value) for name, value in flat.items() if value != {}}
+
+    default = own(TrainConfig().to_dict())  # of a setting that a run does not state
+    stated = [own(config) for config in configs]
+    values = dict[str, str]()
+    for name in dict.fromkeys(name for settings in stated for name in settings):
+        several = {settings.get(name, default.get(name, "-")) for settings in stated}
+        values[name] = " / ".join(sorted(several))
+    return values
+
+
+def _text(value: Any) -> str:
+    """A setting in one form: 0 and 0.0 are the same number."""
+    return str(plain_number(value))

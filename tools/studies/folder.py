@@ -24,7 +24,7 @@ from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.options import command_line
-from arcade_torch.tools.runs import FREE, Run, read_record
+from arcade_torch.tools.runs import FREE, Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -134,8 +134,6 @@ class StudyFolder:
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
-    """In what a run differs from its plan that may change its result."""
-    with contextlib.suppress(OSError, ValueError, TypeError):  # damaged, or of a version with other fields
-        configs, free = (TrainConfig.from_dict(run.config), plan), {name: getattr(plan, name) for name in FREE}
-        return differing_fields(*(replace(config, env=resolve_id(config.env), **free) for config in configs))
-    return []
+    """In what a run differs from its plan that may change its result; damaged settings are refused."""
+    described(run)
+    return differing_fields(run.config | {"env": resolve_id(run.game)}, replace(plan, env=resolve_id(plan.env)), FREE)

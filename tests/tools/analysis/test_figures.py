@@ -446,6 +446,34 @@ def test_runs_named_one_by_one_are_compared_like_those_of_a_folder(
     assert "differ in total_frames: " in refused(capsys, "analyze", "recall-density", *map(str, runs))
 
 
+def test_checkpoints_named_one_by_one_are_compared_like_those_of_a_folder(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
+    newest = [sorted((run / "checkpoints").glob("frames-*"))[-1] for run in runs]
+    record = json.loads((newest[1] / "meta.json").read_text())
+    record["config"] |= {"seed": 1, "amp": True}
+    (newest[1] / "meta.json").write_text(json.dumps(record))
+    assert "differ in amp: False and True" in refused(capsys, "analyze", "recall-density", *map(str, newest))
+    assert "differ in amp: False and True" in refused(capsys, "analyze", "saliency", str(runs[0]), str(newest[1]))
+
+
+def test_seeds_that_learned_different_twins_are_not_pooled_when_one_twin_is_looked_at(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
+    twin = (
+        "full" if json.loads((runs[0] / "config.json").read_text())["config"]["observability"] != "full" else "partial"
+    )
+    change(runs[1], seed=1, observability=twin)
+    for file in (runs[1] / "checkpoints").glob("*/meta.json"):
+        record = json.loads(file.read_text())
+        record["config"] |= {"seed": 1, "observability": twin}
+        file.write_text(json.dumps(record))
+    words = ["analyze", "recall-density", *map(str, runs), "--observability", "full", "--episodes", "2"]
+    assert "learned the twins" in refused(capsys, *words)
+
+
 def test_saliency_of_runs_has_a_row_for_every_agent(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
