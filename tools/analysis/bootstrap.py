@@ -67,7 +67,7 @@ def pooled(values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, s
     """
 
     def cell(seeds: Array) -> Array:
-        known = seeds[np.isfinite(seeds)]
+        known = np.sort(seeds[np.isfinite(seeds)])  # the same interval in whatever order the seeds come
         if known.size < 2:
             return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
         drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
