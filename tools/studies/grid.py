@@ -2,13 +2,14 @@
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten, require
+from arcade_torch.agents.config import Options, Range, Seed, TrainConfig, coerce, flatten, require
 from arcade_torch.agents.presets import preset
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
@@ -132,6 +133,18 @@ class Study:
         agents = [(memory, size) for memory in self.memories for size in sizes[memory]]
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
         return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
+
+    def configs(self, runs: Iterable[RunSpec]) -> dict[RunSpec, TrainConfig]:
+        """The configs of some runs; seeds of one cell share all that was checked, but for the seed."""
+        cells = dict[RunSpec, TrainConfig]()
+        configs = dict[RunSpec, TrainConfig]()
+        for run in runs:
+            cell = replace(run, seed=0)
+            if cell not in cells:
+                cells[cell] = self.config(cell)
+            configs[run] = copy(cells[cell])
+            object.__setattr__(configs[run], "seed", coerce("seed", run.seed, Seed))
+        return configs
 
     def config(self, run: RunSpec) -> TrainConfig:
         """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
