@@ -91,8 +91,18 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
         parts += [key.network] if len(networks) > 1 and key.network else []
         shared = set.intersection(*(set(other.options) for other in same))
         parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
-        found[key] = " ".join([name, *parts])
+        found[key] = printable(" ".join([name, *parts]))
     return found
+
+
+def printable(name: str) -> str:
+    """A name in one line, what no printer prints written out: line breaks, control characters, lone surrogates.
+
+    Example:
+        >>> print(printable("a\\nb"))
+        a\\nb
+    """
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
 
 
 def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
@@ -126,7 +136,7 @@ def game_names(written: Iterable[str]) -> dict[str, str]:
         versions = [match[0] for other in same if (match := _VERSION.search(other))]
         match = _VERSION.search(name)
         newest = max(versions, key=lambda version: int(version[2:]), default="")
-        names[name] = name if len(same) == 1 else game + (match[0] if match else newest)
+        names[name] = printable(name if len(same) == 1 else game + (match[0] if match else newest))
     return names
 
 
@@ -236,7 +246,7 @@ def open_run(path: Path) -> Run | None:
 def described(run: Run) -> Run:
     """The same run, if its settings say which agent learned which game from which seed; else a ``ValueError``."""
     file = run.path / run.settings_file
-    if not {"env", "memory"} <= set(run.config) or type(run.config.get("seed", 0)) is not int:
+    if not all(run.config.get(name) for name in ("env", "memory")) or type(run.config.get("seed", 0)) is not int:
         raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
@@ -390,13 +400,14 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
     for table in tables.values():
         found += _read_table(table, metric)
         stated += _runs_of_table(table)
+    for key, score in found:
+        if any(name.splitlines() != [name] for name in (key.memory, score.game)):
+            raise ValueError(f"names of agents and games are one line, not {key.memory!r} and {score.game!r}")
     names = agent_names(key for key, _ in found)
     games = game_names(score.game for _, score in found)
     scores = [replace(score, agent=names[key], game=games[score.game]) for key, score in found]
     seen: set[Score] = set()
     for score in scores:
-        if any(name.splitlines() != [name] for name in (score.agent, score.game)):
-            raise ValueError(f"names of agents and games are one line, not {score.agent!r} and {score.game!r}")
         cell = replace(score, value=0.0)
         if cell in seen:
             raise ValueError(f"two scores for {score.agent} on {score.game} ({score.observability}), seed {score.seed}")

@@ -178,6 +178,13 @@ def _cells(scores: Sequence[Score]) -> Cells:
     return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
 
 
+def _place(task: str) -> tuple[str, int, str]:
+    """Where a task stands in the order of games, difficulties and ids."""
+    game = game_of(task)
+    rest = re.sub(r"-v\d+$", "", task).removeprefix(game)
+    return game, DIFFICULTIES.index(rest) if rest in DIFFICULTIES else -1, task
+
+
 def _generator(seed: int, agent: str, task: str, twin: str) -> np.random.Generator:
     """The draws of a cell: the same whatever else is in the table, and in which order it was met."""
     game = re.sub(r"-v\d+$", "", task)
@@ -189,7 +196,7 @@ def _rows(
 ) -> tuple[tuple[AgentRow, ...], dict[str, dict[str, Array]]]:
     """A row an agent, and agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its draws."""
     rows, values = list[AgentRow](), dict[str, dict[str, Array]]()
-    tasks = sorted(tasks)  # the same sums, to the bit, in whatever order the runs were met
+    tasks = sorted(tasks, key=_place)  # the same sums, to the bit, in whatever order the runs were met
     for agent, free in baselines.items():
         mine, counts = values.setdefault(agent, {}), list[tuple[int, ...]]()
         for twin, name in zip(TWINS, ("mdp", "pomdp"), strict=True):
