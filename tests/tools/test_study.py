@@ -264,6 +264,15 @@ def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_pa
     }
 
 
+def test_one_episode_has_no_deviation(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "s", small_study())
+    file = folder.run(small_study().runs()[0]).path / "eval.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"returns": [0.5], "lengths": [3], "mean": 0.5}))
+    folder.write_results(small_study())
+    row = read_csv(folder.root / "results.csv")[0]
+    assert (row["eval_mean"], row["eval_std"], row["eval_n"]) == ("0.5", "", "1")
+
+
 def test_sizes_are_an_axis_of_their_own_that_the_memory_free_agent_does_not_have() -> None:
     what = small_study(sizes=["1x64", "2x128"], seeds=1)
     assert [run.agent for run in what.runs() if run.observability == "full"] == ["mingru 1x64", "mingru 2x128", "mlp"]

@@ -38,7 +38,12 @@ class Resumable(Command):
         for name, reason in result.errors.items():
             print(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
-            write_page(result.root)
+            try:
+                write_page(result.root)
+            except Exception:
+                again = command_line(["report", str(result.root)])
+                print(f"the runs are kept, their report failed; write it again with: {again}", file=sys.stderr)
+                raise
         return 1 if result.errors else 0
 
 

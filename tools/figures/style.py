@@ -106,7 +106,7 @@ def subplots(rows: int = 1, columns: int = 1, *, squeeze: bool = True, **options
 
 def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
     """A figure of ``size`` inches and its axes [rows, columns]; options are those of `subplots`."""
-    return subplots(rows, columns, **({"figsize": size, "squeeze": False, "layout": "constrained"} | options))
+    return subplots(rows, columns, squeeze=False, figsize=size, layout="constrained", **options)
 
 
 def legend_name(name: str) -> str:

@@ -135,7 +135,8 @@ class StudyFolder:
         row |= {"run": spec.name, "frames": run.progress()[0]} | {name: getattr(spec, name) for name in _CELL}
         if final := run.final:
             mean, returns = float(final["mean"]), [float(value) for value in final["returns"]]
-            spread = (sum((value - mean) ** 2 for value in returns) / max(1, len(returns) - 1)) ** 0.5
+            squares = sum((value - mean) ** 2 for value in returns)
+            spread = (squares / (len(returns) - 1)) ** 0.5 if len(returns) > 1 else None  # of one episode there is none
             row |= {name: final[name] for name in ("frames", "seconds", "train_max_ewm") if name in final}
             row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
         else:

@@ -111,18 +111,32 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
 
 def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and all checked."""
-    from arcade_torch.envs_jax import make
-    from arcade_torch.models import make_memory, memory_names
-
-    for game in what.games:
-        make(game)
-    for memory in what.memories:
-        if memory not in (*memory_names(), "feedforward"):
-            make_memory(memory, 1, 1)  # refuses it
+    _check_names(what)
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
     return what.configs(what.runs()[int(found[1]) - 1 :: int(found[2])])
+
+
+def _check_names(what: Study) -> None:
+    """Refuse games and memories that do not exist, or stand there twice by two names, and an untrained baseline."""
+    from arcade_torch.envs_jax import make, resolve_id
+    from arcade_torch.models import make_memory, memory_names
+    from arcade_torch.models.registry import ALIASES
+
+    games, memories = dict[str, str](), dict[str, str]()
+    for game in what.games:
+        make(game)
+        bare = resolve_id(game).rpartition("-v")[0]
+        if (first := games.setdefault(bare, game)) != game:
+            raise ValueError(f"games = {first}, {game} are one game: give it once, in one version")
+    for memory in what.memories:
+        if memory not in (*memory_names(), "feedforward"):
+            make_memory(memory, 1, 1)  # refuses it
+        if (first := memories.setdefault(ALIASES.get(memory, memory), memory)) != memory:
+            raise ValueError(f"memories = {first}, {memory} are one memory model: give it once")
+    if what.baseline != Study.baseline:
+        what.require_baseline()
 
 
 class Results:
