@@ -4,8 +4,10 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from arcade_torch.agents.differences import differences
+from arcade_torch.agents.differences import flatten as flatten
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
@@ -366,48 +368,21 @@ class TrainConfig(Checked):
         return cls(**values | groups)
 
 
-def differing_fields(
-    one: TrainConfig | Mapping[str, Any],
-    other: TrainConfig | Mapping[str, Any],
-    free: Iterable[str] = RESUME_MAY_CHANGE,
-) -> list[str]:
+Settings = TrainConfig | Mapping[str, Any]  # a config, or what a ``config.json`` holds
+
+
+def differing_fields(one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE) -> list[str]:
     """Names of the fields that make two configs different runs, as ``name (this != that)``; see `differing_values`."""
     pairs = differing_values(one, other, free).items()
     return [f"{name} ({this!r} != {that!r})" for name, (this, that) in pairs]
 
 
 def differing_values(
-    one: TrainConfig | Mapping[str, Any],
-    other: TrainConfig | Mapping[str, Any],
-    free: Iterable[str] = RESUME_MAY_CHANGE,
+    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
 ) -> dict[str, tuple[Any, Any]]:
-    """The fields in which two configs differ, by dotted name, with both values.
-
-    Args:
-        one: a config, or plain settings as a ``config.json`` holds them. A field that they lack has its default: they
-            may be from before there was that field. Of a field that this version does not know the default is None.
-        other: the same of the other run.
-        free: fields that may differ, of whole groups too.
-
-    Numbers of learners that neither of them uses make no difference.
-    """
-    mine, theirs = _settings(one), _settings(other)
-    unused = set(GROUPS) - {mine["algorithm"], theirs["algorithm"]}
-    skipped = {*free, *unused}
-    names = [name for name in sorted(mine.keys() | theirs.keys()) if not {name, name.partition(".")[0]} & skipped]
-    pairs = {name: (mine.get(name), theirs.get(name)) for name in names}
-    return {name: (this, that) for name, (this, that) in pairs.items() if this != that}
-
-
-def _settings(config: TrainConfig | Mapping[str, Any]) -> dict[str, Any]:
-    """All settings of a run by dotted name; those that it does not state have their defaults."""
-    plain = config.to_dict() if isinstance(config, TrainConfig) else config
-    return _defaults() | flatten({name: value for name, value in plain.items() if value is not None})
-
-
-@lru_cache(maxsize=1)
-def _defaults() -> dict[str, Any]:
-    return flatten(TrainConfig().to_dict())
+    """The same with both values; plain settings that lack a field have its default. See `differences`."""
+    plain = [config.to_dict() if isinstance(config, TrainConfig) else config for config in (one, other)]
+    return differences(plain[0], plain[1], TrainConfig().to_dict(), GROUPS, free)
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
@@ -417,9 +392,3 @@ def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     if unknown := [name for name in values if name not in known]:
         raise ValueError(f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}")
     return dict(values)
-
-
-def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has ``pqn.gamma``."""
-    parts = [flatten(x, f"{prefix}{n}.") if isinstance(x, Mapping) else {prefix + n: x} for n, x in plain.items()]
-    return {name: value for part in parts for name, value in part.items()}

@@ -14,7 +14,8 @@ import arcade_torch
 from arcade_torch.agents import load
 from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.files import cached_arrays
-from arcade_torch.tools.runs import AgentKey, Run, Runs, agent_names, check_comparable, described, find_runs, game_names
+from arcade_torch.tools.names import AgentKey, agent_names, game_names
+from arcade_torch.tools.runs import Run, Runs, check_comparable, described, find_runs
 
 Found = TypeVar("Found")
 SETTINGS_FILES = ("config.json", "meta.json")

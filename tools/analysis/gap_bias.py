@@ -19,7 +19,8 @@ from arcade_torch.agents.config import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
-from arcade_torch.tools.runs import Score, Source, find_baselines, read_scores
+from arcade_torch.tools.names import find_baselines
+from arcade_torch.tools.runs import Score, Source, read_scores
 
 TWINS, BOTH_TWINS = ("full", "partial"), ("mixed", "both")
 NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm")

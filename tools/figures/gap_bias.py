@@ -22,7 +22,8 @@ from arcade_torch.tools.figures.style import (
     whiskers,
 )
 from arcade_torch.tools.files import Table, read_csv
-from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, memory_free, read_scores, table_of
+from arcade_torch.tools.names import agent_names, memory_free
+from arcade_torch.tools.runs import Runs, Score, find_runs, read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from arcade_torch.agents.config import Options, Range, Seed, TrainConfig, coerce, flatten, require
 from arcade_torch.agents.presets import preset
-from arcade_torch.tools.runs import AgentKey, agent_names, find_baselines
+from arcade_torch.tools.names import AgentKey, agent_names, find_baselines
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
