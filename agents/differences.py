@@ -29,7 +29,7 @@ def differences(
     """
     mine = flatten(default) | flatten(_stated(one))
     theirs = flatten(default) | flatten(_stated(other))
-    used = {mine["algorithm"], theirs["algorithm"]}
+    used = {str(mine["algorithm"]), str(theirs["algorithm"])}
     skipped = {*free} | {*algorithms} - used
     pairs = dict[str, tuple[Any, Any]]()
     for name in sorted(mine.keys() | theirs.keys()):

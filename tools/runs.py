@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import TrainConfig, differing_values, require
+from arcade_torch.agents.config import TrainConfig, differing_values, flatten, require
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 from arcade_torch.tools.names import AgentKey as AgentKey
 from arcade_torch.tools.names import agent_names as agent_names
@@ -126,7 +126,8 @@ def described(run: Run) -> Run:
         raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
-    except ValueError as error:
+        flatten(run.config)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error
     return run
 

@@ -170,3 +170,22 @@ def test_settings_in_a_table_that_differ_in_a_default_alone_are_one(tmp_path: Pa
     made = make_figure("hyperparameters", PaperOptions((tmp_path,), tmp_path / "figures"))
     values = {row["setting"]: row["pqn"] for row in made.pictures[0].rows}
     assert values["gamma"] == "0.99"
+
+
+def test_settings_nested_without_end_are_refused(tmp_path: Path) -> None:
+    two_seeds(tmp_path, "amp", False, False)
+    text = (tmp_path / "0" / "config.json").read_text()
+    deep = '{"x": ' * 900 + "1" + "}" * 900
+    (tmp_path / "0" / "config.json").write_text(text.replace('"config": {', f'"config": {{"deep": {deep}, ', 1))
+    with pytest.raises(ValueError, match=r"config\.json (is damaged|does not hold JSON)|differ in deep"):
+        find_runs([tmp_path])
+
+
+def test_settings_of_the_wrong_kind_are_refused_in_one_line(tmp_path: Path) -> None:
+    for name, value in (("algorithm", [1]), ("pqn", 5), ("total_frames", {"a": 1}), ("rules", None), ("obs_size", [])):
+        two_seeds(tmp_path / name, "amp", False, False)
+        change_config(tmp_path / name / "0", lambda config, name=name, value=value: config.update({name: value}))
+        try:
+            find_runs([tmp_path / name])
+        except ValueError as error:
+            assert "\n" not in str(error)

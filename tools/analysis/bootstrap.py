@@ -60,11 +60,11 @@ def student_half_width(values: Any, confidence: float = 0.95) -> float:
         >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
         (6.35, nan)
     """
-    known = np.asarray(values, dtype=np.float64)
-    if known.size < 2:
+    numbers = np.asarray(values, dtype=np.float64)
+    if numbers.size < 2:
         return float("nan")
-    quantile = need("scipy.special").stdtrit(known.size - 1, (1 + confidence) / 2)
-    return float(quantile * known.std(ddof=1) / np.sqrt(known.size))
+    quantile = need("scipy.special").stdtrit(numbers.size - 1, (1 + confidence) / 2)
+    return float(quantile * numbers.std(ddof=1) / np.sqrt(numbers.size))
 
 
 class Pooled(NamedTuple):

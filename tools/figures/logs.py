@@ -243,12 +243,12 @@ def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str,
     """Each setting's value, or all its values where runs differ; without the settings of other algorithms."""
     others = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}
 
-    def own(config: Mapping[str, Any]) -> dict[str, str]:
+    def stated_by(config: Mapping[str, Any]) -> dict[str, str]:
         flat = flatten({key: value for key, value in config.items() if key not in others})
         return {name.removeprefix(f"{algorithm}."): _text(value) for name, value in flat.items() if value != {}}
 
-    default = own(TrainConfig().to_dict())  # of a setting that a run does not state
-    stated = [own(config) for config in configs]
+    default = stated_by(TrainConfig().to_dict())  # of a setting that a run does not state
+    stated = [stated_by(config) for config in configs]
     values = dict[str, str]()
     for name in dict.fromkeys(name for settings in stated for name in settings):
         several = {settings.get(name, default.get(name, "-")) for settings in stated}

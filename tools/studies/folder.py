@@ -113,17 +113,17 @@ class StudyFolder:
         if made != old:
             write_json(self.root / "study.json", made)
 
-    def write_results(self, study: Study, known: dict[RunSpec, Row] | None = None) -> list[Row]:
+    def write_results(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
         """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined.
 
-        ``known`` keeps the rows of finished runs from one call to the next: they are not read again.
+        ``finished`` keeps the rows of finished runs from one call to the next: they are not read again.
         """
-        known = {} if known is None else known
+        finished = {} if finished is None else finished
         rows = list[Row]()
         for run in study.runs():
-            row = known.get(run) or self._row(run)
+            row = finished.get(run) or self._row(run)
             if row["status"] == "finished":
-                known[run] = row
+                finished[run] = row
             rows.append(row)
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
         write_csv(self.root / "timings.csv", [row for row in rows if row["seconds"] is not None], TIMING_COLUMNS)

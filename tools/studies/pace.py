@@ -25,9 +25,9 @@ class Pace:
         """Seconds until the next piece of work is due; 0 if it is."""
         return max(0.0, self._next_s - self._clock())
 
-    def work(self, what: Callable[[], object]) -> None:
+    def work(self, task: Callable[[], object]) -> None:
         """Do a piece of work, and rest."""
         start_s = self._clock()
-        what()
+        task()
         end_s = self._clock()
         self._next_s = end_s + max(self._least_s, (end_s - start_s) / SHARE)

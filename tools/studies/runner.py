@@ -145,12 +145,12 @@ class Results:
     def __init__(self, folder: StudyFolder, study: Study) -> None:
         self.folder = folder
         self.study = study
-        self._known = dict[RunSpec, Row]()
+        self._finished = dict[RunSpec, Row]()
         self._pace = Pace()
 
     def write(self) -> list[Row]:
         """Write them."""
-        return self.folder.write_results(self.study, self._known)
+        return self.folder.write_results(self.study, self._finished)
 
     def write_if_due(self) -> None:
         """Write them, unless that has taken much of the time lately."""
