@@ -2,9 +2,12 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+from arcade_torch.agents.differences import differences
+from arcade_torch.agents.differences import flatten as flatten
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
@@ -367,15 +370,21 @@ class TrainConfig(Checked):
         return cls(**values | groups)
 
 
-def differing_fields(one: TrainConfig, other: TrainConfig) -> list[str]:
-    """Names of the fields that make two configs different runs, as ``name (this != that)``.
+Settings = TrainConfig | Mapping[str, Any]  # a config, or what a ``config.json`` holds
 
-    Numbers of learners that neither of them uses make no difference.
-    """
-    mine, theirs = flatten(one.to_dict()), flatten(other.to_dict())
-    unused = tuple(f"{name}." for name in GROUPS if name not in (one.algorithm, other.algorithm))
-    names = [n for n in mine.keys() | theirs.keys() if n not in RESUME_MAY_CHANGE and not n.startswith(unused)]
-    return [f"{n} ({mine.get(n)!r} != {theirs.get(n)!r})" for n in sorted(names) if mine.get(n) != theirs.get(n)]
+
+def differing_fields(one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE) -> list[str]:
+    """Names of the fields that make two configs different runs, as ``name (this != that)``; see `differing_values`."""
+    pairs = differing_values(one, other, free).items()
+    return [f"{name} ({this!r} != {that!r})" for name, (this, that) in pairs]
+
+
+def differing_values(
+    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
+) -> dict[str, tuple[Any, Any]]:
+    """The same with both values; plain settings that lack a field have its default. See `differences`."""
+    plain = [config.to_dict() if isinstance(config, TrainConfig) else config for config in (one, other)]
+    return differences(plain[0], plain[1], TrainConfig().to_dict(), GROUPS, free)
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
@@ -385,9 +394,3 @@ def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     if unknown := [name for name in values if name not in known]:
         raise ValueError(f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}")
     return dict(values)
-
-
-def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has ``pqn.gamma``."""
-    parts = [flatten(x, f"{prefix}{n}.") if isinstance(x, Mapping) else {prefix + n: x} for n, x in plain.items()]
-    return {name: value for part in parts for name, value in part.items()}

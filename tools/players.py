@@ -11,6 +11,7 @@ import numpy as np
 from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import make
+from arcade_torch.tools.analysis.bootstrap import student_half_width
 from arcade_torch.tools.files import markdown_table, measured_rows
 
 PLAYERS = ("random", "state", "frames")
@@ -21,8 +22,8 @@ EPISODES = 256
 
 
 class Baseline(NamedTuple):
-    """What one player earned in one game: mean undiscounted return, half its 95 % interval (normal approximation), mean
-    length of an episode, and the seconds it took, compilation included.
+    """What one player earned in one game: mean undiscounted return, half its 95 % interval (Student's; NaN of one
+    episode), mean length of an episode, and the seconds it took, compilation included.
     """
 
     id: str
@@ -49,7 +50,7 @@ def measure(
     who = RandomPlayer(0) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
     played = play(game, who, episodes, 0, frames=player == "frames", block=min(episodes, block), seconds=seconds)
     returns = played.returns.astype(np.float64)
-    half_width = 1.96 * (float(returns.std(ddof=1)) if returns.size > 1 else math.nan) / math.sqrt(returns.size)
+    half_width = student_half_width(returns)
     mean, half_width, steps = (round(float(each), 5) for each in (returns.mean(), half_width, played.lengths.mean()))
     return Baseline(game.id, player, returns.size, mean, half_width, steps, round(time.monotonic() - started, 1))
 
@@ -87,6 +88,15 @@ def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) ->
     return measured_rows(out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds))
 
 
+def _mean_cell(row: Baseline | None) -> str:
+    """A mean return with its interval, if it has one."""
+    if row is None:
+        return ""
+    if math.isnan(row.half_width):
+        return f"{row.mean:.3f}"
+    return f"{row.mean:.3f} ± {row.half_width:.3f}"
+
+
 def markdown(rows: Iterable[Baseline]) -> str:
     """The rows as a Markdown table, one line a game."""
     games: dict[str, dict[str, Baseline]] = {}
@@ -96,7 +106,7 @@ def markdown(rows: Iterable[Baseline]) -> str:
     lines = []
     for id, by_player in games.items():
         found = [by_player.get(player) for player in PLAYERS]
-        returns = [f"{r.mean:.3f} ± {r.half_width:.3f}" if r else "" for r in found]
+        returns = [_mean_cell(row) for row in found]
         steps = ", ".join(f"{r.steps:.0f}" if r else "" for r in found)
         count = ", ".join(dict.fromkeys(f"{r.episodes}" for r in found if r))
         lines.append([f"`{id}`", *returns, f"{make(id).return_range[1]:.4g}", steps, count])

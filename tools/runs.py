@@ -3,94 +3,26 @@
 Whatever pools seeds (report, figures, gap and bias, curves, measures of checkpoints) asks here.
 """
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import flatten, require
+from arcade_torch.agents.config import TrainConfig, differing_values, flatten, require
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
+from arcade_torch.tools.names import AgentKey as AgentKey
+from arcade_torch.tools.names import agent_names as agent_names
+from arcade_torch.tools.names import bare_name, game_names, plain_number
+from arcade_torch.tools.run_folders import RunFolders
 
 METRICS = ("eval_final", "train_max_ewm")
 """``eval_final``: mean of the final greedy evaluation. ``train_max_ewm``: the paper's, best smoothed training score."""
-_SIZE = ("layers", "hidden_size")
-_VERSION = re.compile(r"-v\d+$")
+_BOM = "\ufeff"  # what some programs write in front of a table
 FREE = {"device", "threads", "checkpoint_every", "eval_every", "eval_episodes", "logger", "compile", "cuda_graphs"}
 """Settings that may differ among runs that are compared."""
 _CELL = {"env", "observability", "memory", "seed", "algorithm", "network", "network_options", "rules", "obs_size"}
-
-
-@dataclass(frozen=True)
-class AgentKey:
-    """What makes two runs seeds of the same agent."""
-
-    algorithm: str  # name of the learner; empty in tables that do not say
-    memory: str  # name of the memory model, or of the agent in such a table
-    network: str = ""  # preset of the network
-    size: str = ""  # of the memory block, ``LAYERSxWIDTH``; empty for that of the preset
-    options: tuple[tuple[str, str], ...] = ()  # other options of the network, (name, value), sorted
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any]) -> "AgentKey":
-        """The key of a run, from its resolved settings."""
-        options = config.get("network_options") or {}
-        if not isinstance(options, Mapping) or not isinstance(config.get("memory"), str):
-            raise ValueError("its memory or its network_options are of no use")
-        flat, network, size = flatten(options), str(config.get("network", "paper")), ""
-        if any(name in flat for name in _SIZE):
-            default = preset_size(network)
-            chosen = "x".join(str(flat.get(name, base)) for name, base in zip(_SIZE, default.split("x"), strict=True))
-            size = "" if chosen == default else chosen
-        rest = tuple(sorted((name, str(value)) for name, value in flat.items() if name not in _SIZE))
-        return cls(str(config.get("algorithm", "pqn")), config["memory"], network, size, rest)
-
-
-def preset_size(network: str) -> str:
-    """Layers and width of the memory block of a network preset, ``2x512``."""
-    from arcade_torch.models.presets import preset_of
-
-    preset = preset_of(network)
-    return f"{preset.layers}x{preset.hidden_size}"
-
-
-def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey, str]:
-    """The shortest names that tell agents apart: the memory, and whatever else differs among those that share it.
-
-    Example:
-        >>> list(agent_names([AgentKey("pqn", "lru"), AgentKey("ppo", "lru")]).values())
-        ['pqn-lru', 'ppo-lru']
-    """
-    every = list(dict.fromkeys(keys))
-    algorithms = {key.algorithm for key in every if key.algorithm}
-    networks = {key.network for key in every if key.network}
-    found = {}
-    for key in every:
-        same = [other for other in every if other.memory == key.memory]
-        name = f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
-        several = sized or len({other.size for other in same}) > 1
-        parts = [key.size or preset_size(key.network or "paper")] if several else []
-        parts += [key.network] if len(networks) > 1 and key.network else []
-        shared = set.intersection(*(set(other.options) for other in same))
-        parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
-        found[key] = " ".join([name, *parts])
-    return found
-
-
-def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
-    """Whether an agent is the memory-free one, in any case and size; group 1 is its algorithm, ``ppo-``, or empty."""
-    return re.fullmatch(rf"(|\S*-){re.escape(baseline)}( .*)?", agent, re.IGNORECASE)
-
-
-def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
-    """Agent -> the memory-free agent of its algorithm, where there is one; that of the very name or of PQN is first."""
-    algorithm = {agent: found[1].lower() for agent in agents if (found := memory_free(agent, baseline))}
-    free = sorted(algorithm, key=lambda agent: (agent.lower() != baseline.lower(), algorithm[agent] != "pqn-"))
-    first = {algorithm[agent]: agent for agent in reversed(free)}
-    own = {agent: [start for start in first if agent.lower().startswith(start)] for agent in (*free, *agents)}
-    return {agent: first[max(starts, key=len)] for agent, starts in own.items() if starts}
 
 
 @dataclass(frozen=True)
@@ -110,11 +42,13 @@ class Run:
     """The folder of a run, to read from; a missing file means "not yet"."""
 
     path: Path
+    settings_file: str = "config.json"  # ``meta.json`` of a single checkpoint
+    game_name: str = ""  # the environment id among others, if it was written otherwise; see `game_names`
 
     @cached_property
     def record(self) -> dict[str, Any]:
         """All of ``config.json``: settings, versions, command."""
-        return read_record(self.path / "config.json")
+        return read_record(self.path / self.settings_file)
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -151,7 +85,7 @@ class Run:
     @property
     def game(self) -> str:
         """Environment id."""
-        return str(self.config["env"])
+        return self.game_name or str(self.config["env"])
 
     @property
     def twin(self) -> str:
@@ -181,14 +115,21 @@ def read_record(file: Path) -> dict[str, Any]:
 
 def open_run(path: Path) -> Run | None:
     """A run from its folder, None if it has not finished; refuses damaged settings by the name of the file."""
-    run, file = Run(path), path / "config.json"
-    if not {"env", "memory"} <= set(run.config) or type(run.config.get("seed", 0)) is not int:
+    run = described(Run(path))
+    return run if run.final is not None else None
+
+
+def described(run: Run) -> Run:
+    """The same run, if its settings say which agent learned which game from which seed; else a ``ValueError``."""
+    file = run.path / run.settings_file
+    if not all(run.config.get(name) for name in ("env", "memory")) or type(run.config.get("seed", 0)) is not int:
         raise ValueError(f"{file} does not describe a run: it needs an env, a memory and a seed, a whole number")
     try:
         run.key  # noqa: B018  (refuses damaged options)
-    except ValueError as error:
+        flatten(run.config)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is damaged: {error}") from error
-    return run if run.final is not None else None
+    return run
 
 
 @dataclass(frozen=True)
@@ -197,6 +138,11 @@ class Runs:
 
     runs: tuple[Run, ...]
     notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        names = game_names(run.game for run in self.runs)
+        named = (run if names[run.game] == run.game else replace(run, game_name=names[run.game]) for run in self.runs)
+        object.__setattr__(self, "runs", tuple(named))
 
     @cached_property
     def names(self) -> dict[AgentKey, str]:
@@ -229,13 +175,15 @@ def find_runs(paths: Sequence[Path]) -> Runs:
     """All finished runs below some folders, which have to be comparable."""
     if not paths:
         raise ValueError("name the folder with the runs: --runs DIR")
-    opened = {folder: open_run(folder) for path in paths for folder in _folders(path)}
+    search = RunFolders()
+    opened = {folder: open_run(folder) for path in paths for folder in _folders(path, search)}
     runs = [run for run in opened.values() if run is not None]
     if not runs:
         raise ValueError(f"none of the {len(opened)} runs below {listed([str(p) for p in paths])} has finished")
     check_comparable(Runs(tuple(runs)))
     unfinished = [folder.name for folder, run in opened.items() if run is None]
     notes = [f"left out, not finished: {listed(unfinished)}"] if unfinished else []
+    notes += search.notes
     made = [run.record.get("versions") for run in runs]
     several = sorted({str(each.get("arcade_torch", "")) for each in made if isinstance(each, dict)} - {""})
     if len(several) > 1:
@@ -243,51 +191,54 @@ def find_runs(paths: Sequence[Path]) -> Runs:
     return Runs(tuple(runs), notes)
 
 
-def _folders(path: Path) -> list[Path]:
+def _folders(path: Path, search: RunFolders) -> list[Path]:
+    """Run folders below a path: those of a study in the order of its grid."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist")
     if not path.is_dir():
         raise ValueError(f"{path} is a file: give a folder with runs")
     if (path / "meta.json").is_file():
         raise ValueError(f"{path} is a single checkpoint: give its run folder, {path.parent.parent}")
-    rows = read_csv(table) if (table := path / "results.csv").is_file() else []  # of a study: in the order of its grid
-    order = {row.get("run"): place for place, row in enumerate(rows)}
-    found = [file.parent for file in path.rglob("config.json") if "checkpoints" not in file.parts]
-    if not found:
+    again = search.has_seen(path)
+    folders = list(search.below(path))
+    if not folders and not again:
         raise ValueError(f"{path} holds no run: a run folder has a config.json")
-    return sorted(found, key=lambda folder: (order.get(folder.name, len(order)), folder))
+    order: dict[Path, dict[str, int]] = {}
+    for study in {folder.absolute().parent.parent for folder in folders}:
+        table = study / "results.csv"
+        rows = read_csv(table) if table.is_file() else []
+        order[study] = {row.get("run", ""): place for place, row in enumerate(rows)}
+
+    def place(folder: Path) -> tuple[Path, int, Path]:
+        study = folder.absolute().parent.parent
+        return study, order[study].get(folder.name, len(order[study])), folder
+
+    return sorted(folders, key=place)
 
 
 def check_comparable(found: Runs) -> None:
     """Refuse several versions or rules of a game, a run that stands there twice, and seeds that are none."""
-    games = sorted({run.game for run in found.runs if _VERSION.search(run.game)})
+    games = sorted({run.game for run in found.runs})
     for old, new in pairwise(games):
-        if _VERSION.sub("", old) == _VERSION.sub("", new):
+        if bare_name(old) == bare_name(new):
             raise ValueError(f"runs of {old} and {new} cannot be compared: give one version of a game")
-    for key in ("rules", "obs_size"):
-        values = sorted({str(run.config[key]) for run in found.runs if key in run.config})
+    for name, default in (("rules", TrainConfig.rules), ("obs_size", TrainConfig.obs_size)):
+        values = sorted({str(plain_number(run.config.get(name, default))) for run in found.runs})
         if len(values) > 1:
-            raise ValueError(f"runs with {key} {' and '.join(values)} cannot be compared: give runs with one of them")
-    played: dict[str, Any] = {}
+            raise ValueError(f"runs with {name} {' and '.join(values)} cannot be compared: give runs with one of them")
+    first: dict[str, Run] = {}
     for run in found.runs:
-        own = run.config.get("env_options") or {}
-        if (first := played.setdefault(run.game, own)) != own:
-            raise ValueError(f"{run.game} was played with env_options {first} and {own}: give runs with one of them")
+        same = first.setdefault(run.game, run)
+        own, before = run.config.get("env_options") or {}, same.config.get("env_options") or {}
+        if own != before:
+            raise ValueError(f"{run.game} was played with env_options {before} and {own}: give runs with one of them")
     for (agent, game, twin), runs in found.groups().items():
         for one, run in pairwise(runs):  # by seed
             if one.seed == run.seed:
                 raise ValueError(f"{one.path} and {run.path} are the same cell: give one of them")
-            first, other = _settings(one), _settings(run)
-            if differ := [name for name in first if name in other and first[name] != other[name]]:
-                what = f"{differ[0]}: {first[differ[0]]} and {other[differ[0]]}; give runs with one of them"
-                raise ValueError(f"seeds of {agent} on {game} ({twin}) differ in {what}")
-
-
-def _settings(run: Run) -> dict[str, Any]:
-    """What decides a run's result beside its agent, its game and its seed."""
-    others = _CELL | FREE | ({"pqn", "ppo", "dqn"} - {run.key.algorithm})
-    own = {name: value for name, value in run.config.items() if name not in others}
-    return flatten(own | {"env_options": run.config.get("env_options") or {}})
+            if differ := differing_values(one.config, run.config, _CELL | FREE):
+                what = ", ".join(f"{name}: {this} and {that}" for name, (this, that) in differ.items())
+                raise ValueError(f"seeds of {agent} on {game} ({twin}) differ in {what}; give runs with one of them")
 
 
 Source = str | Path | Sequence[str | Path] | Iterable[Score]
@@ -318,35 +269,50 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
     paths = [Path(part) for part in parts if not isinstance(part, Score)]
     tables = {path: table for path in paths if (table := table_of(path))}
     found = [(AgentKey("", part.agent), part) for part in parts if isinstance(part, Score)]  # agents without names yet
+    stated = list[Run]()  # the runs behind the scores, as far as their settings are known
     if folders := [path for path in paths if path not in tables]:
         opened = find_runs(folders)
+        stated += opened.runs
         found += zip((run.key for run in opened.runs), opened.scores(metric), strict=True)
     for table in tables.values():
         found += _read_table(table, metric)
-    names, newest = agent_names(key for key, _ in found), dict[str, str]()
-    for game in {score.game for _, score in found if _VERSION.search(score.game)}:
-        bare = _VERSION.sub("", game)  # stands for the newest version that is there
-        newest[bare] = max(newest.get(bare, game), game, key=lambda name: int(name.rpartition("-v")[2]))
-    scores = [replace(score, agent=names[key], game=newest.get(score.game, score.game)) for key, score in found]
+        stated += _runs_of_table(table)
+    for key, score in found:
+        if any(name.splitlines() != [name] for name in (key.memory, score.game)):
+            raise ValueError(f"names of agents and games are one line, not {key.memory!r} and {score.game!r}")
+    names = agent_names(key for key, _ in found)
+    games = game_names(score.game for _, score in found)
+    scores = [replace(score, agent=names[key], game=games[score.game]) for key, score in found]
     seen: set[Score] = set()
     for score in scores:
-        if any(name.splitlines() != [name] for name in (score.agent, score.game)):
-            raise ValueError(f"names of agents and games are one line, not {score.agent!r} and {score.game!r}")
         cell = replace(score, value=0.0)
         if cell in seen:
             raise ValueError(f"two scores for {score.agent} on {score.game} ({score.observability}), seed {score.seed}")
         seen.add(cell)
+    check_comparable(Runs(tuple(stated)))
     return scores
 
 
 def table_of(path: Path) -> Path | None:
     """The table of scores that a path is: a file, or the ``results.csv`` of a study that has lost its runs."""
-    bare = (path / "results.csv").is_file() and next(path.rglob("config.json"), None) is None
+    bare = (path / "results.csv").is_file() and next(RunFolders().below(path), None) is None
     return path if path.is_file() else path / "results.csv" if bare else None
 
 
+def _runs_of_table(table: Path) -> list[Run]:
+    """The finished runs in the table of a study, from the configs that the study keeps beside it."""
+    configs = table.parent / "configs"
+    if table.name != "results.csv" or not configs.is_dir():
+        return []
+    names = [row.get("run", "") for row in read_csv(table) if row.get("status") == "finished"]
+    files = [configs / f"{name}.json" for name in names if Path(name).name == name]
+    return [described(Run(configs, file.name)) for file in files if file.exists()]
+
+
 def _read_table(path: Path, metric: str) -> list[tuple[AgentKey, Score]]:
-    rows, found = read_csv(path), []
+    """The scores in a table, with the agents that it names."""
+    rows = [{name.removeprefix(_BOM): value for name, value in row.items()} for row in read_csv(path)]
+    found = list[tuple[AgentKey, Score]]()
     if rows and {"model", "env", "mdp_mean", "pomdp_mean"} <= set(rows[0]):  # means over seeds count as a single seed
         rows = [
             {"model": row["model"], "game": row["env"] + row.get("difficulty", "").capitalize(), "seed": "0"}

@@ -7,6 +7,7 @@ import pytest
 
 from arcade_torch.envs_jax import make
 from arcade_torch.tools import cli, players
+from arcade_torch.tools.analysis.bootstrap import student_half_width
 from arcade_torch.tools.play.recording import scene, sheet
 
 
@@ -83,3 +84,16 @@ def test_a_scene_shows_the_same_moment_to_both_twins() -> None:
 
 def test_a_sheet_has_a_place_for_every_frame() -> None:
     assert sheet(["SignpostEasy"], columns=2).shape == (264, 2 * (2 * 256 + 2 * 128 + 4 * 8), 3)
+
+
+def test_few_episodes_have_students_interval_and_one_has_none() -> None:
+    few = players.measure("SignpostEasy", "random", episodes=3)
+    one = players.measure("SignpostEasy", "random", episodes=1)
+    returns = [0.25, 0.5, 1.0]
+    spread = float(np.std(returns, ddof=1))
+    assert student_half_width(returns) == pytest.approx(4.302653 * spread / np.sqrt(3))  # 1.96 for very many
+    assert student_half_width(np.zeros(10**5) + np.arange(10**5) % 2) == pytest.approx(1.96 * 0.5 / 10**2.5, rel=1e-3)
+    assert np.isnan(student_half_width([0.5])) and np.isnan(student_half_width([]))
+    assert np.isnan(one.half_width) and not np.isnan(few.half_width)
+    page = players.markdown([one])
+    assert f"| {one.mean:.3f} |" in page and "nan" not in page and "±" not in page

@@ -180,6 +180,7 @@ def change_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None
         (lambda config: config.update(amp=True), "amp"),
         (lambda config: config.update(env_options={"mine_reward": -1}), "env_options.mine_reward"),
         (lambda config: config["pqn"].pop("lam"), r"pqn.lam \(0.95 != 0.65\)"),  # from before there was that field
+        (lambda config: config.update(no_longer=1), r"no_longer \(1 != None\)"),  # a field that is gone
     ],
 )
 def test_a_finished_run_that_was_made_with_other_settings_is_refused(
@@ -202,7 +203,6 @@ def test_a_finished_run_that_was_made_with_other_settings_is_refused(
         lambda config: config.update(env="MineSweeperEasy-v0"),  # as `train` pins it
         lambda config: config["ppo"].update(clip=0.7),  # another algorithm's
         lambda config: (config["pqn"].pop("bootstrap"), config.pop("amp")),  # from before there were these fields
-        lambda config: config.update(no_longer=1),  # a field that is gone: it cannot be compared
     ],
 )
 def test_what_does_not_change_a_result_lets_a_study_go_on(
@@ -262,6 +262,15 @@ def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_pa
     assert {row["run"]: row["seconds"] for row in read_csv(tmp_path / "s" / "timings.csv")} == {
         run.name: "95.0" for run in what.runs()
     }
+
+
+def test_one_episode_has_no_deviation(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "s", small_study())
+    file = folder.run(small_study().runs()[0]).path / "eval.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"returns": [0.5], "lengths": [3], "mean": 0.5}))
+    folder.write_results(small_study())
+    row = read_csv(folder.root / "results.csv")[0]
+    assert (row["eval_mean"], row["eval_std"], row["eval_n"]) == ("0.5", "", "1")
 
 
 def test_sizes_are_an_axis_of_their_own_that_the_memory_free_agent_does_not_have() -> None:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from arcade_torch.tools.errors import need
+
 Array = NDArray[np.float64]
 
 
@@ -51,6 +53,20 @@ def percentile_interval(value: Any, draws: Array, confidence: float, known: bool
     return Interval(float(value), float(low), float(high))
 
 
+def student_half_width(values: Any, confidence: float = 0.95) -> float:
+    """Half the width of Student's interval of the mean of some values; NaN where one value alone gives none.
+
+    Example:
+        >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
+        (6.35, nan)
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    if numbers.size < 2:
+        return float("nan")
+    quantile = need("scipy.special").stdtrit(numbers.size - 1, (1 + confidence) / 2)
+    return float(quantile * numbers.std(ddof=1) / np.sqrt(numbers.size))
+
+
 class Pooled(NamedTuple):
     """Values of every seed [n_seeds, ...], their mean and the ends of its percentile interval, each [...]."""
 
@@ -67,7 +83,7 @@ def pooled(values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, s
     """
 
     def cell(seeds: Array) -> Array:
-        known = seeds[np.isfinite(seeds)]
+        known = np.sort(seeds[np.isfinite(seeds)])  # the same interval in whatever order the seeds come
         if known.size < 2:
             return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
         drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))

@@ -14,9 +14,12 @@ import arcade_torch
 from arcade_torch.agents import load
 from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.files import cached_arrays
-from arcade_torch.tools.runs import AgentKey, Runs, agent_names, check_comparable, find_runs, open_run
+from arcade_torch.tools.names import AgentKey, agent_names, game_names
+from arcade_torch.tools.runs import Run, Runs, check_comparable, described, find_runs
 
 Found = TypeVar("Found")
+SETTINGS_FILES = ("config.json", "meta.json")
+"""Files with the settings: of a run folder, and of a single checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class Label:
     seed: int  # of the training
     path: Path  # run folder or checkpoint
     agent: str  # its name among those it is compared with; that of its memory until then
+    trained_on: str = ""  # the twin that it learned
 
     @property
     def task(self) -> tuple[str, str, str]:
@@ -41,10 +45,10 @@ class Label:
 
 
 def by_task(measured: Sequence[tuple[Label, Found]]) -> dict[tuple[str, str, str], list[Found]]:
-    """(agent, game, observability) -> the measures of its seeds."""
-    tasks: dict[tuple[str, str, str], list[Found]] = {}
-    for label, found in measured:
-        tasks.setdefault(label.task, []).append(found)
+    """(agent, game, observability) -> the measures of its seeds, by seed."""
+    tasks: dict[tuple[str, str, str], list[Found]] = {label.task: [] for label, _ in measured}
+    for label, found in sorted(measured, key=lambda pair: pair[0].seed):
+        tasks[label.task].append(found)
     return tasks
 
 
@@ -52,14 +56,15 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Run folders and checkpoints as they are, and the finished runs below other folders; notes on the rest."""
     found, notes = list[Path](), list[str]()
     for path in paths:
-        if any((path / name).exists() for name in ("meta.json", "config.json", "checkpoints")):
+        has_checkpoint = next((path / "checkpoints").glob("frames-*"), None) is not None
+        if has_checkpoint or any((path / name).exists() for name in SETTINGS_FILES):
             found.append(path)
         else:
             runs = find_runs([path])
             found += [run.path for run in runs.runs]
             notes += runs.notes
-    folders = [open_run(path) for path in found if (path / "config.json").exists()]
-    check_comparable(Runs(tuple(run for run in folders if run is not None)))
+    stated = [Run(path, name) for path in found for name in SETTINGS_FILES if (path / name).exists()]
+    check_comparable(Runs(tuple(described(run) for run in stated)))
     return found, notes
 
 
@@ -74,7 +79,7 @@ def measure_run(
     agent, how, given = load(path), signature(measure), {**options, "progress": progress}
     config, key = agent.config, AgentKey.of(agent.config.to_dict())
     twin = options.get("observability") or config.observability
-    label = Label(key, config.env, twin, config.seed, path, key.memory)
+    label = Label(key, config.env, twin, config.seed, path, key.memory, config.observability)
     known = {name: given.get(name, one.default) for name, one in how.parameters.items() if name not in ("agent", "env")}
     weights = hashlib.sha256()
     for name, value in sorted(agent.network.state_dict().items()):
@@ -101,8 +106,13 @@ def measure_runs(
     each = [(path, partial(progress, path.name) if progress else None) for path in paths]
     measured = [measure_run(path, measure, options, tell) for path, tell in each]
     names, seen = agent_names(label.key for label, _ in measured), dict[Any, Path]()
-    named = [(replace(label, agent=names[label.key]), found) for label, found in measured]
+    games = game_names(label.game for label, _ in measured)
+    named = [(replace(label, agent=names[label.key], game=games[label.game]), found) for label, found in measured]
+    twins = dict[Any, str]()
     for label, _ in named:
+        if (learned := twins.setdefault(label.task, label.trained_on)) != label.trained_on:
+            task = f"{label.agent} on {label.game}"
+            raise ValueError(f"seeds of {task} learned the twins {learned} and {label.trained_on}: give runs of one")
         if (cell := (label.task, label.seed)) in seen:
             raise ValueError(f"{seen[cell]} and {label.path} are both {label}: give one of them")
         seen[cell] = label.path

@@ -8,6 +8,7 @@ Source: POPGym Arcade (ICML 2026), definitions of Gap and Bias. Intervals: strat
 """
 
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +19,8 @@ from arcade_torch.agents.config import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
-from arcade_torch.tools.runs import Score, Source, find_baselines, read_scores
+from arcade_torch.tools.names import find_baselines
+from arcade_torch.tools.runs import Score, Source, read_scores
 
 TWINS, BOTH_TWINS = ("full", "partial"), ("mixed", "both")
 NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm")
@@ -177,16 +179,33 @@ def _cells(scores: Sequence[Score]) -> Cells:
     return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
 
 
+def _place(task: str) -> tuple[str, int, str]:
+    """Where a task stands in the order of games, difficulties and ids."""
+    game = game_of(task)
+    rest = re.sub(r"-v\d+$", "", task).removeprefix(game)
+    return game, DIFFICULTIES.index(rest) if rest in DIFFICULTIES else -1, task
+
+
+def _generator(seed: int, agent: str, task: str, twin: str) -> np.random.Generator:
+    """The draws of a cell: the same whatever else is in the table, and in which order it was met."""
+    game = re.sub(r"-v\d+$", "", task)
+    return np.random.default_rng([seed, zlib.crc32(f"{agent}\n{game}\n{twin}".encode(errors="backslashreplace"))])
+
+
 def _rows(
     cells: Cells, baselines: Baselines, tasks: Sequence[str], draws: int, confidence: float, seed: int, iqm: bool
 ) -> tuple[tuple[AgentRow, ...], dict[str, dict[str, Array]]]:
     """A row an agent, and agent -> name in `NUMBERS` -> float64 [1 + draws]: the number itself, then its draws."""
     rows, values = list[AgentRow](), dict[str, dict[str, Array]]()
-    for i, (agent, free) in enumerate(baselines.items()):
+    tasks = sorted(tasks, key=_place)  # the same sums, to the bit, in whatever order the runs were met
+    for agent, free in baselines.items():
         mine, counts = values.setdefault(agent, {}), list[tuple[int, ...]]()
-        for j, (twin, name) in enumerate(zip(TWINS, ("mdp", "pomdp"), strict=True)):
+        for twin, name in zip(TWINS, ("mdp", "pomdp"), strict=True):
             seeds = [cells[agent, task, twin] for task in tasks]
-            drawn = bootstrap.resampled(seeds, draws, np.random.default_rng([seed, i, j]))
+            drawn = [
+                bootstrap.resampled([cells[agent, task, twin]], draws, _generator(seed, agent, task, twin))[0]
+                for task in tasks
+            ]
             raw = [np.vstack([first, again]) for first, again in zip(seeds, drawn, strict=True)]
             scaled = [normalise(task, each) for task, each in zip(tasks, raw, strict=True)]
             mine[f"{name}_raw"], mine[name] = bootstrap.mean_over_tasks(raw), bootstrap.mean_over_tasks(scaled)

@@ -4,6 +4,7 @@ They differ in where the files go by default: ``figure`` writes into ``figures``
 of the first run.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +14,6 @@ from typing import Any
 import tyro
 
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import FIGURES, Options, make_figure
 from arcade_torch.tools.files import csv_text
 from arcade_torch.tools.machine import keep_freed_memory
@@ -47,11 +47,15 @@ class Figure(Command):
 
     def run(self) -> int:
         """Measure, draw, save, print."""
+        from arcade_torch.tools.figures.style import import_matplotlib
+
         keep_freed_memory()
-        need("matplotlib")
+        import_matplotlib()
         with Bars() as bars:
             made = make_figure(self.name, self.options, bars.update)
         if self.options.csv:
+            for line in made.notes:
+                print(line, file=sys.stderr)
             print(csv_text([row for picture in made.pictures for row in picture.rows]), end="")
             return 0
         for table in made.tables:

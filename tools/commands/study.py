@@ -38,7 +38,12 @@ class Resumable(Command):
         for name, reason in result.errors.items():
             print(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
-            write_page(result.root)
+            try:
+                write_page(result.root)
+            except Exception:
+                again = command_line(["report", str(result.root)])
+                print(f"the runs are kept, their report failed; write it again with: {again}", file=sys.stderr)
+                raise
         return 1 if result.errors else 0
 
 
@@ -73,10 +78,12 @@ class StudyCommand(Resumable):
         what = study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
         if self.dry_run:
             plan = planned(what, self.shard)
-            frames = {run.name: config.num_updates * config.learner.frames_per_update for run, config in plan.items()}
-            for name, count in frames.items():
-                print(f"{name}  {count:,} frames")
-            print(f"{len(plan):,} runs, {sum(frames.values()):,} frames in all", file=sys.stderr)
+            total = 0
+            for run, config in plan.items():
+                frames = config.num_updates * config.learner.frames_per_update
+                total += frames
+                print(f"{run.name}  {frames:,} frames")
+            print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
             return 0
         engine = make_engine(self.engine, self.workers, self.ray)
         return self.carry_out(what, self.out or Path("runs") / what.name, engine, self.shard, self.report)

@@ -74,7 +74,8 @@ def _example(label: Label, found: measure.Example) -> tuple[Any, str, list[dict[
         early = range(measure.FIRST + 1, measure.FIRST + 4) if shuffle else (0, max(found.hits[row], found.hits[1]))
         for axis, t in zip(pictures, (*early, *range(n - 2 * shuffle, n + 1)), strict=True):
             axis.imshow(found.frames[row, t], interpolation="nearest")
-            axis.set(xticks=[], yticks=[], frame_on=False, title=f"$o_{{{found.order[row, t]}}}$")
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            axis.set_title(f"$o_{{{found.order[row, t]}}}$", parse_math=True)
         pictures[0].set_ylabel(names[row], fontsize="small")
         bars.bar(ACTION_NAMES, found.values[row], color=REST)
         bars.patches[best[row]].set_facecolor(OTHER_BEST)
@@ -84,7 +85,7 @@ def _example(label: Label, found: measure.Example) -> tuple[Any, str, list[dict[
         hit = None if found.hits[row] < 0 else found.hits[row]
         numbers += style.rows_of(**task, row=names[row], hit=hit, action=ACTION_NAMES, value=found.values[row])
     outputs = "probabilities" if found.target == "probs" else f"centred {found.target}"
-    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$")
+    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
     figure.suptitle(f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}", x=0.01, ha="left")
     noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {found.sigma:g}"
     note = f"n = 1 episode, {noise}; blue: best action when clean, red: best if another"
@@ -154,7 +155,8 @@ def plot(
         mean, low, high = (part[column, : len(delays)] for part in value[name][1:])
         x = np.arange(len(delays)) + 0.1 * (place - (len(agents) - 1) / 2)
         bars = {"fmt": "none", "ecolor": colours[agent], "capsize": 2, "lw": 1}
-        axis.plot(x, mean, color=colours[agent], marker=style.MARKERS[place % len(style.MARKERS)], label=agent)
+        marker = style.MARKERS[place % len(style.MARKERS)]
+        axis.plot(x, mean, color=colours[agent], marker=marker, label=style.legend_name(agent))
         axis.errorbar(x, mean, style.whiskers(mean, low, high), **bars)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(range(len(delays)), [str(delay) for delay in delays])

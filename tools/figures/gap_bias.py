@@ -11,9 +11,19 @@ from arcade_torch.tools.analysis.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.analysis.gap_bias import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, ScoreOptions, SweepOptions
-from arcade_torch.tools.figures.style import MARKERS, NEUTRAL, TWIN_COLOURS, agent_colours, panels, seeds_note, whiskers
+from arcade_torch.tools.figures.style import (
+    MARKERS,
+    NEUTRAL,
+    TWIN_COLOURS,
+    agent_colours,
+    legend_name,
+    panels,
+    seeds_note,
+    whiskers,
+)
 from arcade_torch.tools.files import Table, read_csv
-from arcade_torch.tools.runs import Runs, Score, agent_names, find_runs, memory_free, read_scores, table_of
+from arcade_torch.tools.names import agent_names, memory_free
+from arcade_torch.tools.runs import Runs, Score, find_runs, read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),
@@ -139,7 +149,7 @@ def _without_each(table: GapBias) -> Any:
                 continue
             ends = np.array([getattr(rows[place], name) for rows in columns.values()]).T
             look = {"fmt": MARKERS[place % len(MARKERS)], "lw": 1, "color": agent_colours(agents)[agent]}
-            axis.errorbar(places + offsets[place], ends[0], whiskers(*ends), label=agent, **look)
+            axis.errorbar(places + offsets[place], ends[0], whiskers(*ends), label=legend_name(agent), **look)
         axis.set_title(PANELS[name][0], loc="left")
         axis.set_ylabel(PANELS[name][1])
         axis.axvline(0.5, color=NEUTRAL, lw=0.8)

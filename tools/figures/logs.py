@@ -12,12 +12,14 @@ from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
+from arcade_torch.tools.names import plain_number, printable
 from arcade_torch.tools.runs import Run, find_runs
 
 POINTS = 120  # of a curve of training returns
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
 
 OURS = {"compiled step": "step+draw", "ArcadeEnv": "env", "ArcadeCollector": "collector"}
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LIMIT = "writing the same bytes"
 
 NOT_SETTINGS = ("env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every")
@@ -51,7 +53,7 @@ def curves(options: CurveOptions, progress: Progress | None) -> Made:
         plot(here, axis, agents)
         axis.set(title=f"{game}, {style.TWIN_NAMES.get(twin, twin)}", ylabel=AXIS[kind])
     handles = {handle.get_label(): handle for axis in axes.flat for handle in axis.get_lines()}
-    shown = [handles[agent] for agent in agents if agent in handles]
+    shown = [handles[label] for label in map(style.legend_name, agents) if label in handles]
     figure.legend(handles=shown, loc="outside upper center", ncols=min(8, len(shown)))
     rows = []
     for (agent, game, twin), (frames, (seeds, mean, low, high)) in every.items():
@@ -73,7 +75,7 @@ def plot(
             axis.fill_between(x, returns.low, returns.high, color=colour, alpha=0.18, lw=0)
         marker = style.MARKERS[place % len(style.MARKERS)] if x.size <= 12 else None
         line = style.DASHES[place % len(style.DASHES)]
-        axis.plot(x, returns.mean, color=colour, label=agent, marker=marker, ls=line)
+        axis.plot(x, returns.mean, color=colour, label=style.legend_name(agent), marker=marker, ls=line)
     for level, value in (levels or {}).items():
         axis.axhline(value, color=style.NEUTRAL, lw=1, ls="--")
         axis.annotate(level, (1, value), (-2, 2), xycoords=("axes fraction", "data"), textcoords="offset points",
@@ -136,6 +138,7 @@ def throughput(options: Options, progress: Progress | None) -> Made:
         raise ValueError(f"{options.runs[0]}: obs_size, num_envs and rates must be numbers above 0")
     if not any(row.measure == "step+draw" for row in rows):
         raise ValueError(f"{options.runs[0]} has no row with the measure step+draw: nothing to draw")
+    rows = [row._replace(game=printable(row.game)) for row in rows]
     sizes = sorted({row.obs_size for row in rows})
     here = [row for row in rows if row.obs_size == sizes[0]]
     notes = [f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"] * (len(sizes) > 1)
@@ -147,7 +150,7 @@ def throughput(options: Options, progress: Progress | None) -> Made:
         spare = len(style.SPARE_COLOURS)
         marker = style.MARKERS[(place + place // spare) % len(style.MARKERS)]
         look = {"color": style.SPARE_COLOURS[place % spare], "marker": marker}
-        _line(left, drawn[game], label=game, **look)
+        _line(left, drawn[game], label=style.legend_name(game), **look)
         _line(left, bare[game], ls=":", **look)
     left.plot([], [], color=style.NEUTRAL, ls=":", label="the same without drawing")
     for name, marker, size in zip(OURS, "*vo", (11, None, None), strict=True):
@@ -157,6 +160,7 @@ def throughput(options: Options, progress: Progress | None) -> Made:
         axis.set_xscale("log", base=2)
         axis.set_yscale("log", base=10)
         axis.set_xticks(counts, [str(count) for count in counts])
+        axis.yaxis.set_major_formatter(lambda rate, place: power_of_ten(rate))
         axis.minorticks_off()
         axis.set(xlabel="environments", title=title)
         columns = 2 if len(axis.lines) < 9 else 3
@@ -172,6 +176,16 @@ def throughput(options: Options, progress: Progress | None) -> Made:
         for name, line in lines.items():
             numbers += style.rows_of(series=name, kind=kind, num_envs=list(line), frames_per_s=list(line.values()))
     return Made([Picture("throughput", figure, note, numbers)], notes)
+
+
+def power_of_ten(value: float) -> str:
+    """A tick of an axis whose ticks are powers of ten.
+
+    Example:
+        >>> power_of_ten(1e6)
+        '10⁶'
+    """
+    return "10" + str(round(math.log10(value))).translate(SUPERSCRIPT) if value > 0 else ""
 
 
 def series(rows: Sequence[Rate], game: str, measure: str) -> dict[int, float]:
@@ -227,11 +241,21 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
 
 def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:
     """Each setting's value, or all its values where runs differ; without the settings of other algorithms."""
-    values: dict[str, set[str]] = {}
-    others, flat = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}, list[dict[str, Any]]()
-    for config in configs:
-        own = flatten({key: value for key, value in config.items() if key not in others})
-        flat.append({name.removeprefix(f"{algorithm}."): value for name, value in own.items() if value != {}})
-    for name in dict.fromkeys(name for settings in flat for name in settings):
-        values[name] = {str(settings.get(name, "-")) for settings in flat}
-    return {name: " / ".join(sorted(found)) for name, found in values.items()}
+    others = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}
+
+    def stated_by(config: Mapping[str, Any]) -> dict[str, str]:
+        flat = flatten({key: value for key, value in config.items() if key not in others})
+        return {name.removeprefix(f"{algorithm}."): _text(value) for name, value in flat.items() if value != {}}
+
+    default = stated_by(TrainConfig().to_dict())  # of a setting that a run does not state
+    stated = [stated_by(config) for config in configs]
+    values = dict[str, str]()
+    for name in dict.fromkeys(name for settings in stated for name in settings):
+        several = {settings.get(name, default.get(name, "-")) for settings in stated}
+        values[name] = " / ".join(sorted(several))
+    return values
+
+
+def _text(value: Any) -> str:
+    """A setting in one form: 0 and 0.0 are the same number."""
+    return str(plain_number(value))

@@ -12,8 +12,9 @@ from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.options import at_least
-from arcade_torch.tools.runs import listed, memory_free
+from arcade_torch.tools.runs import listed
 
 BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
 MEMORY_FREE = ("mlp", "feedforward")

@@ -10,7 +10,7 @@ from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, SaliencyOptions
-from arcade_torch.tools.figures.style import TWIN_NAMES, rows_of
+from arcade_torch.tools.figures.style import TWIN_NAMES, new_figure, rows_of
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.options import at_least
 from arcade_torch.tools.runs import find_runs
@@ -42,27 +42,30 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         f"n = 1 episode a row, decision at n; {options.reduce}, {options.norm} of the gradient, "
         f"{measured[0][1].target}, brightness is its square root; no interval"
     )
-    picture = Picture("saliency", saliency_figure(drawn, show=options.show), note, numbers, arrays)
+    picture = Picture("saliency", saliency_figure(drawn, show=options.show, figure=new_figure()), note, numbers, arrays)
     table = Table("gradient of the last decision", ("run", "frames", "on the last frame"), cells)
     return Made([picture], notes, [table])
 
 
-def saliency_figure(rows: Sequence[Row], *, show: int = 8) -> Any:
+def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -> Any:
     """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose top it names.
 
     Args:
         rows: one ``(title, frames, maps)`` each, see `Row`.
         show: how many of the last frames are drawn.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default, which notebooks show.
 
     Returns:
         A matplotlib figure.
     """
     columns = min(show, max(frames.shape[0] for _, frames, _ in rows))
-    figure = need("matplotlib.pyplot").figure(figsize=(1.7 * columns, 2.2 * len(rows)), layout="constrained")
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    figure.set_size_inches(1.7 * columns, 2.2 * len(rows))
+    figure.set_layout_engine("constrained")
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
         peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0])
-        part.suptitle(f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left")
+        part.suptitle(f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False)
     return figure
 
 
@@ -89,5 +92,5 @@ def plot(
             axis.imshow(frames[t], interpolation="nearest")
             axis.imshow(heat[t], cmap="afmhot", vmin=0, vmax=1, alpha=0.5, interpolation="nearest")
             name, share = "n" if t == n else f"n-{n - t}", "" if below is None else f": {below[t]:.1f} %"
-            axis.set_title(f"$o_{{{name}}}${share}", fontsize="small")
+            axis.set_title(f"$o_{{{name}}}${share}", fontsize="small", parse_math=True)
     return peak

@@ -1,12 +1,15 @@
 """How figures look, and how they are saved: the one place for colours, sizes and files."""
 
+import os
 import re
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from io import BytesIO, StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from arcade_torch.tools.analysis.bootstrap import Array, measured_coverage
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
+from arcade_torch.tools.names import printable
 
 AGENT_COLOURS = {
     "mlp": "#6b6b6b",
@@ -43,27 +47,71 @@ TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
 
 STYLES = Path(__file__).resolve().parents[1] / "data"
-"""Folder of the style sheets, for `matplotlib.style.use`: light.mplstyle, and print.mplstyle for what differs."""
+"""Folder of the style sheets, in matplotlib's format: light.mplstyle, and print.mplstyle for what differs."""
+_PLAIN = {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
+"""Environment in which matplotlib can be imported."""
+_OF_AXES = ("sharex", "sharey", "width_ratios", "height_ratios", "subplot_kw", "gridspec_kw")
 _PRINT_SCALE = 0.62  # sizes of figures are given for a screen; on a page they are so much smaller
+
+
+def import_matplotlib() -> Any:
+    """Import matplotlib, also where the user's matplotlibrc file, or MPLBACKEND, holds what matplotlib refuses.
+
+    The environment is left as it is, and so are settings of a matplotlib that is imported already.
+    """
+    try:
+        return need("matplotlib")
+    except ImportError:
+        raise
+    except Exception:
+        before = {name: os.environ.get(name) for name in _PLAIN}
+        os.environ.update(_PLAIN)
+        for half in [name for name in sys.modules if name.startswith("matplotlib.")]:
+            del sys.modules[half]  # left over from the import that failed
+        try:
+            return need("matplotlib")
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
 
 
 @contextmanager
 def drawing(style: str) -> Iterator[Any]:
-    """matplotlib.pyplot in a style, without a window: ``light`` for screens, ``print`` (smaller, serif) for a page."""
-    need("matplotlib").use("Agg")
-    plt = need("matplotlib.pyplot")
-    with plt.style.context([STYLES / f"{name}.mplstyle" for name in dict.fromkeys(("light", style))]):
-        try:
-            yield plt
-        finally:
-            plt.close("all")
+    """Draw in a style of ours: ``light`` for screens, ``print`` (smaller, serif) for a page.
+
+    It begins from matplotlib's defaults, whatever the user has set, and puts the user's settings back. Figures are none
+    of ``pyplot``: no window, no backend, and the user's own figures stay open. Gives a namespace with `subplots`.
+    """
+    matplotlib = import_matplotlib()
+    look = {name: value for name, value in matplotlib.rcParamsDefault.items() if not name.startswith("backend")}
+    for sheet in dict.fromkeys(("light", style)):
+        look |= matplotlib.rc_params_from_file(STYLES / f"{sheet}.mplstyle", use_default_template=False)
+    with matplotlib.rc_context(look):
+        yield SimpleNamespace(subplots=subplots)
+
+
+def new_figure(**options: Any) -> Any:
+    """A figure that pyplot knows nothing of; options are those of ``matplotlib.figure.Figure``."""
+    return need("matplotlib.figure").Figure(**options)
+
+
+def subplots(rows: int = 1, columns: int = 1, *, squeeze: bool = True, **options: Any) -> tuple[Any, Any]:
+    """A figure and its axes; options are those of ``matplotlib.pyplot.subplots``."""
+    of_axes = {name: options.pop(name) for name in _OF_AXES if name in options}
+    figure = new_figure(**options)
+    return figure, figure.subplots(rows, columns, squeeze=squeeze, **of_axes)
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Any, Any]:
-    """A figure of ``size`` inches and its axes [rows, columns]; options are those of ``matplotlib.pyplot.subplots``."""
-    how = {"figsize": size, "squeeze": False, "layout": "constrained"} | options
-    found: tuple[Any, Any] = need("matplotlib.pyplot").subplots(rows, columns, **how)
-    return found
+    """A figure of ``size`` inches and its axes [rows, columns]; options are those of `subplots`."""
+    return subplots(rows, columns, squeeze=False, figsize=size, layout="constrained", **options)
+
+
+def legend_name(name: str) -> str:
+    """A name as the label of an artist: matplotlib leaves labels with an underscore in front out of legends."""
+    return f"\u200b{name}" if name.startswith("_") else name
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
@@ -121,7 +169,9 @@ def rows_of(**columns: Any) -> list[dict[str, Any]]:
 
 def save(options: Options, picture: Picture) -> list[Path]:
     """Write a figure with its note, and its numbers beside it."""
-    (base, endings), figure, written = options.path(picture.name), picture.figure, []
+    base, endings = options.path(picture.name)
+    figure = picture.figure
+    written = list[Path]()
     if options.style == "print":
         figure.set_size_inches(_PRINT_SCALE * figure.get_size_inches())
     if picture.note:  # wrapped to the width of the figure
@@ -143,20 +193,18 @@ def svg(figure: Any, name: str) -> str:
     """A figure as an SVG element that can stand in a page beside others."""
     buffer = StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    need("matplotlib.pyplot").close(figure)
     text = buffer.getvalue()
     text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text)
     text = re.sub(r"-?\d+\.\d{2,}", lambda found: f"{float(found[0]):.4g}", text)
     prefix = re.sub(r"\W+", "-", name)
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", re.sub(r">\s+<", "><", text))
-    return text.replace("<svg", f'<svg role="img" aria-label="{escape(name)}"', 1)
+    return text.replace("<svg", f'<svg role="img" aria-label="{escape(printable(name))}"', 1)
 
 
 def png(figure: Any, colours: int = 128) -> bytes:
     """A figure as a small PNG file, its colours counted."""
     buffer, packed = BytesIO(), BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
-    need("matplotlib.pyplot").close(figure)
     need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(packed, "PNG", optimize=True)
     return packed.getvalue()

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from arcade_torch.agents.config import flatten, require
+from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
@@ -223,7 +223,10 @@ def learning_sentence(game: str, twin: str, finals: Mapping[str, Sequence[float]
 def _repeat(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Commands, versions and settings; settings of a run where they differ from those that all runs share."""
     record, here = folder.record(), {run.name: folder.run(run) for run in study.runs()}
-    settings = {name: flatten(run.config) for name, run in here.items() if (run.path / "config.json").exists()}
+    stated = {name: flatten(run.config) for name, run in here.items() if (run.path / "config.json").exists()}
+    names = {key for run in stated.values() for key in run}
+    default = {key: value for key, value in flatten(TrainConfig().to_dict()).items() if key in names}
+    settings = {name: default | run for name, run in stated.items()}  # one that is missing has its default
     first, every = next(iter(settings.values()), {}), settings.values()
     shared = {key: value for key, value in first.items() if all(key in run and run[key] == value for run in every)}
     commands = record["runs"] if isinstance(record.get("runs"), dict) else {}

@@ -20,7 +20,8 @@ from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.figures import Progress, contamination, gap_bias, logs, recall_density, saliency, style
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
-from arcade_torch.tools.runs import Runs, memory_free
+from arcade_torch.tools.names import memory_free
+from arcade_torch.tools.runs import Runs
 
 FULL, SMALL = (4.9, 3.0), (3.3, 2.3)  # inches; small ones for many tasks
 BINS = 8  # parts of an episode, or as many as the shortest episode of a task has frames

@@ -24,10 +24,11 @@ from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.options import command_line
-from arcade_torch.tools.runs import FREE, Run, read_record
+from arcade_torch.tools.runs import FREE, Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
+Row = dict[str, Any]
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
 RESULT_COLUMNS = ("run", *_CELL, "status", "frames", "eval_mean", "eval_std", "eval_n", "train_max_ewm", "error")
 TIMING_COLUMNS = ("run", "frames", "seconds")
@@ -97,8 +98,10 @@ class StudyFolder:
                 raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
         elif foreign:
             raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
-        for spec in study.runs():
-            if (run := self.run(spec)).final is not None and (fields := _other_settings(run, study.config(spec))):
+        finished = [spec for spec in study.runs() if self.run(spec).final is not None]
+        for spec, config in study.configs(finished).items():
+            run = self.run(spec)
+            if fields := _other_settings(run, config):
                 raise FileExistsError(f"{run.path} has other settings, {', '.join(fields)}: choose another --out")
         jobs = [self.job(run) for run in study.runs()]
         commands = {job.name: command_line(["train", *job.words]) for job in jobs}
@@ -110,20 +113,30 @@ class StudyFolder:
         if made != old:
             write_json(self.root / "study.json", made)
 
-    def write_results(self, study: Study) -> list[dict[str, Any]]:
-        """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined."""
-        rows = [self._row(run) for run in study.runs()]
+    def write_results(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
+        """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined.
+
+        ``finished`` keeps the rows of finished runs from one call to the next: they are not read again.
+        """
+        finished = {} if finished is None else finished
+        rows = list[Row]()
+        for run in study.runs():
+            row = finished.get(run) or self._row(run)
+            if row["status"] == "finished":
+                finished[run] = row
+            rows.append(row)
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
         write_csv(self.root / "timings.csv", [row for row in rows if row["seconds"] is not None], TIMING_COLUMNS)
         return rows
 
-    def _row(self, spec: RunSpec) -> dict[str, Any]:
+    def _row(self, spec: RunSpec) -> Row:
         run, error = self.run(spec), ""
-        row: dict[str, Any] = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
+        row: Row = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
         row |= {"run": spec.name, "frames": run.progress()[0]} | {name: getattr(spec, name) for name in _CELL}
         if final := run.final:
             mean, returns = float(final["mean"]), [float(value) for value in final["returns"]]
-            spread = (sum((value - mean) ** 2 for value in returns) / max(1, len(returns) - 1)) ** 0.5
+            squares = sum((value - mean) ** 2 for value in returns)
+            spread = (squares / (len(returns) - 1)) ** 0.5 if len(returns) > 1 else None  # of one episode there is none
             row |= {name: final[name] for name in ("frames", "seconds", "train_max_ewm") if name in final}
             row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
         else:
@@ -134,8 +147,6 @@ class StudyFolder:
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
-    """In what a run differs from its plan that may change its result."""
-    with contextlib.suppress(OSError, ValueError, TypeError):  # damaged, or of a version with other fields
-        configs, free = (TrainConfig.from_dict(run.config), plan), {name: getattr(plan, name) for name in FREE}
-        return differing_fields(*(replace(config, env=resolve_id(config.env), **free) for config in configs))
-    return []
+    """In what a run differs from its plan that may change its result; damaged settings are refused."""
+    described(run)
+    return differing_fields(run.config | {"env": resolve_id(run.game)}, replace(plan, env=resolve_id(plan.env)), FREE)

@@ -2,18 +2,22 @@
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from arcade_torch.agents.config import Options, Range, TrainConfig, coerce, flatten, require
+from arcade_torch.agents.config import Options, Range, Seed, TrainConfig, coerce, flatten, require
 from arcade_torch.agents.presets import preset
+from arcade_torch.tools.names import AgentKey, agent_names, find_baselines
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
 """``seeds = N`` beyond this is a slip."""
+MOST_BYTES = 1 << 20
+"""Of a file with a study."""
 _FOLDERS = "names of folders, of letters, digits, dots and dashes"
 _FOLDER = r"(?!\.*$)[\w.\-]{1,80}"
 
@@ -110,17 +114,31 @@ class Study:
         """Read a study from a TOML file; a ``ValueError`` names the file if it is none."""
         path = Path(path)
         try:
-            return cls.from_dict({"name": path.stem} | tomllib.loads(path.read_text(encoding="utf-8")))
+            values = tomllib.loads(_text_of(path))
+            study = cls.from_dict({"name": path.stem} | values)
+            if "baseline" in values:
+                study.require_baseline()
         except FileNotFoundError:
             raise FileNotFoundError(f"no study at {path}: give a TOML file with games, memories and seeds") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise ValueError(f"{path} is not TOML: {error}") from error
+            raise ValueError(f"{path} is not TOML in UTF-8: {error}") from error
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path}: {error}") from error
+        return study
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+    def require_baseline(self) -> None:
+        """Refuse a memory-free agent that the study does not train: there would be no Bias to report."""
+        keys = [AgentKey(algorithm, memory) for algorithm in self.algorithms for memory in self.memories]
+        names = list(agent_names(keys).values())
+        if not find_baselines(names, self.baseline):
+            raise ValueError(
+                f"baseline = {self.baseline!r} is none of the agents that this study trains, {', '.join(names)}: "
+                "add it to memories, or name one of them"
+            )
 
     def fixed(self) -> dict[str, Any]:
         """What may not change between two invocations in one folder: everything that decides a run's result."""
@@ -132,6 +150,18 @@ class Study:
         agents = [(memory, size) for memory in self.memories for size in sizes[memory]]
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
         return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
+
+    def configs(self, runs: Iterable[RunSpec]) -> dict[RunSpec, TrainConfig]:
+        """The configs of some runs; seeds of one cell share all that was checked, but for the seed."""
+        cells = dict[RunSpec, TrainConfig]()
+        configs = dict[RunSpec, TrainConfig]()
+        for run in runs:
+            cell = replace(run, seed=0)
+            if cell not in cells:
+                cells[cell] = self.config(cell)
+            configs[run] = copy(cells[cell])
+            object.__setattr__(configs[run], "seed", coerce("seed", run.seed, Seed))
+        return configs
 
     def config(self, run: RunSpec) -> TrainConfig:
         """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
@@ -164,6 +194,15 @@ def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
     what = Study.from_dict(demo.to_dict() | {"games": games, "seeds": seeds, "total_frames": frames})
     question = f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and POMDPs (partial)?"
     return what if games == demo.games else replace(what, question=question)
+
+
+def _text_of(path: Path) -> str:
+    """The text of a file; what is no regular file, or too large to be a study, is not read."""
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no regular file: give a TOML file with games, memories and seeds")
+    if path.exists() and path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"it has more than {MOST_BYTES:,} bytes: give a TOML file with games, memories and seeds")
+    return path.read_text(encoding="utf-8-sig")  # some editors put a mark in front
 
 
 def _axis(axis: str, value: Any) -> tuple[Any, ...]:

@@ -16,9 +16,12 @@ from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.runs import Run
 from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, RayOptions
-from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.folder import Row, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
+from arcade_torch.tools.studies.pace import Pace
 
+LOOK_EVERY_S = 0.5
+"""The display is drawn this often, or less often where a look at all runs takes long."""
 LEAST_FREE_BYTES = 1 << 20
 """A run that fails with less space than this on the disk failed for want of space."""
 
@@ -78,12 +81,13 @@ def study(
     plan, folder = planned(what, shard), StudyFolder(Path(out))
     try:
         folder.claim(what, command)
-        folder.write_results(what)
+        results = Results(folder, what)
+        results.write()
         jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
         for run, job in jobs.items():
             write_json(job.config, plan[run].to_dict())
-        errors = _carry_out(what, folder, list(plan), list(jobs.values()), engine, stream) if jobs else {}
-        return StudyResult(folder.root, folder.write_results(what), errors)
+        errors = _carry_out(results, list(plan), list(jobs.values()), engine, stream) if jobs else {}
+        return StudyResult(folder.root, results.write(), errors)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
@@ -107,30 +111,72 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
 
 def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and all checked."""
-    from arcade_torch.envs_jax import make
-    from arcade_torch.models import make_memory, memory_names
-
-    for game in what.games:
-        make(game)
-    for memory in what.memories:
-        if memory not in (*memory_names(), "feedforward"):
-            make_memory(memory, 1, 1)  # refuses it
+    _check_names(what)
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
-    return {run: what.config(run) for run in what.runs()[int(found[1]) - 1 :: int(found[2])]}
+    return what.configs(what.runs()[int(found[1]) - 1 :: int(found[2])])
 
 
-def _carry_out(
-    what: Study, folder: StudyFolder, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
-) -> dict[str, str]:
+def _check_names(what: Study) -> None:
+    """Refuse games and memories that do not exist, or stand there twice by two names, and an untrained baseline."""
+    from arcade_torch.envs_jax import make, resolve_id
+    from arcade_torch.models import make_memory, memory_names
+    from arcade_torch.models.registry import ALIASES
+
+    games, memories = dict[str, str](), dict[str, str]()
+    for game in what.games:
+        make(game)
+        bare = resolve_id(game).rpartition("-v")[0]
+        if (first := games.setdefault(bare, game)) != game:
+            raise ValueError(f"games = {first}, {game} are one game: give it once, in one version")
+    for memory in what.memories:
+        if memory not in (*memory_names(), "feedforward"):
+            make_memory(memory, 1, 1)  # refuses it
+        if (first := memories.setdefault(ALIASES.get(memory, memory), memory)) != memory:
+            raise ValueError(f"memories = {first}, {memory} are one memory model: give it once")
+    if what.baseline != Study.baseline:
+        what.require_baseline()
+
+
+class Results:
+    """The tables of a study while it goes on, which cost little however many runs it has."""
+
+    def __init__(self, folder: StudyFolder, study: Study) -> None:
+        self.folder = folder
+        self.study = study
+        self._finished = dict[RunSpec, Row]()
+        self._pace = Pace()
+
+    def write(self) -> list[Row]:
+        """Write them."""
+        return self.folder.write_results(self.study, self._finished)
+
+    def write_if_due(self) -> None:
+        """Write them, unless that has taken much of the time lately."""
+        if not self._pace.rest_s:
+            self._pace.work(self.write)
+
+
+def _carry_out(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any) -> dict[str, str]:
+    """Run the jobs and watch them; the tables are written in the end too, whatever ends it."""
+    try:
+        return _watch(results, plan, jobs, engine, stream)
+    except BaseException:
+        with contextlib.suppress(OSError):  # a full disk, which is told already
+            results.write()
+        raise
+
+
+def _watch(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any) -> dict[str, str]:
+    what, folder = results.study, results.folder
     runs, errors = {run.name: run for run in plan}, dict[str, str]()
     ended = set(runs) - {job.name for job in jobs}
     bars = shown(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
-    with bars as note, contextlib.closing(engine.run(jobs)) as results:  # type: ignore[type-var]
+    with bars as note, contextlib.closing(engine.run(jobs)) as ends:  # type: ignore[type-var]
         if ended:
             note(f"{len(ended)} of {len(runs)} runs are finished already")
-        for name, error in results:
+        for name, error in ends:
             run = runs[name]
             ended.add(name)
             if folder.run(run).final is not None:  # a process killed after its last word has done its work
@@ -140,7 +186,7 @@ def _carry_out(
                 errors[name] = f"{error} (log: {folder.job(run).log})"
                 note(f"{name} failed: {errors[name]}")
             folder.note_failure(run, error)
-            folder.write_results(what)
+            results.write_if_due()
             if error and ("No space left" in error or shutil.disk_usage(folder.root).free < LEAST_FREE_BYTES):
                 raise DiskFullError(f"the disk with {folder.root} is full ({error}); make room and start it again")
     return errors
@@ -154,10 +200,15 @@ def shown(title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = No
     """
     stop = threading.Event()
     with Bars(stream, "frames", first_line_s=3.0) as bars:
+        kept = dict[str, tuple[int, int, str]]()
+        pace = Pace(LOOK_EVERY_S)
+
+        def look() -> None:
+            show_progress(bars, title, runs, ended, kept)
 
         def loop() -> None:
-            while not stop.wait(0.5):
-                show_progress(bars, title, runs, ended)
+            while not stop.wait(pace.rest_s):
+                pace.work(look)
 
         thread = threading.Thread(target=loop, daemon=True, name="study-progress")
         thread.start()
@@ -166,12 +217,24 @@ def shown(title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = No
         finally:
             stop.set()
             thread.join()
-            show_progress(bars, title, runs, ended)
+            look()
 
 
-def show_progress(bars: Bars, title: str, runs: Mapping[str, Run], ended: set[str]) -> None:
-    """Read the folders of all runs once and draw the bars."""
-    seen = {name: run.progress() for name, run in runs.items()}
+def show_progress(
+    bars: Bars,
+    title: str,
+    runs: Mapping[str, Run],
+    ended: set[str],
+    kept: dict[str, tuple[int, int, str]] | None = None,
+) -> None:
+    """Read the folders of all runs and draw the bars; ``kept`` gathers what those that have ended said at last."""
+    kept = {} if kept is None else kept
+    seen = dict[str, tuple[int, int, str]]()
+    for name, run in runs.items():
+        has_ended = name in ended  # before it is read: what is read after the end stays as it is
+        seen[name] = kept.get(name) or run.progress()
+        if has_ended:
+            kept[name] = seen[name]
     usual = next((wanted for _, wanted, _ in seen.values() if wanted), 0)
     frames = total = 0
     for name, (done, wanted, status) in seen.items():

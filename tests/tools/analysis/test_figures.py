@@ -37,7 +37,7 @@ from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
 from arcade_torch.tools.runs import AgentKey, Run, Score
 from arcade_torch.tools.studies.grid import RunSpec
-from tests.tools.fabricated import write_run
+from tests.tools.fabricated import small_study, write_run, write_study
 
 AGENTS = {"mlp": 0.3, "lru": 0.5, "gru": 0.6}
 
@@ -202,6 +202,21 @@ def test_unfinished_runs_and_missing_twins_are_left_out_and_named(
     text = figure(capsys, "gap-bias", "--runs", str(runs), "--out", str(tmp_path / "f"))
     assert "left out, not finished: slow" in text
     assert "left out, some agent lacks one of its twins: TetrisEasy-v0" in text
+
+
+@pytest.mark.parametrize("command", ["figure gap-bias", "figure returns", "figure curves", "analyze gap-bias"])
+def test_numbers_as_csv_stand_alone_and_what_was_left_out_is_said_on_standard_error(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_study(tmp_path / "s", small_study())
+    (folder.run(small_study().runs()[0]).path / "eval.json").unlink()
+    (tmp_path / "s" / "runs" / "lost").symlink_to(tmp_path / "nowhere")
+    assert cli.main([*command.split(), str(tmp_path / "s"), "--csv", "--out", str(tmp_path / "f")]) == 0
+    said = capsys.readouterr()
+    assert "left out, not finished: MineSweeperEasy__full__mingru__pqn__seed0" in said.err
+    assert "leads nowhere" in said.err and "left out" not in said.out
+    (tmp_path / "printed.csv").write_text(said.out)
+    assert read_csv(tmp_path / "printed.csv")
 
 
 def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -444,6 +459,34 @@ def test_runs_named_one_by_one_are_compared_like_those_of_a_folder(
     runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
     change(runs[1], seed=1, total_frames=7)
     assert "differ in total_frames: " in refused(capsys, "analyze", "recall-density", *map(str, runs))
+
+
+def test_checkpoints_named_one_by_one_are_compared_like_those_of_a_folder(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
+    newest = [sorted((run / "checkpoints").glob("frames-*"))[-1] for run in runs]
+    record = json.loads((newest[1] / "meta.json").read_text())
+    record["config"] |= {"seed": 1, "amp": True}
+    (newest[1] / "meta.json").write_text(json.dumps(record))
+    assert "differ in amp: False and True" in refused(capsys, "analyze", "recall-density", *map(str, newest))
+    assert "differ in amp: False and True" in refused(capsys, "analyze", "saliency", str(runs[0]), str(newest[1]))
+
+
+def test_seeds_that_learned_different_twins_are_not_pooled_when_one_twin_is_looked_at(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
+    twin = (
+        "full" if json.loads((runs[0] / "config.json").read_text())["config"]["observability"] != "full" else "partial"
+    )
+    change(runs[1], seed=1, observability=twin)
+    for file in (runs[1] / "checkpoints").glob("*/meta.json"):
+        record = json.loads(file.read_text())
+        record["config"] |= {"seed": 1, "observability": twin}
+        file.write_text(json.dumps(record))
+    words = ["analyze", "recall-density", *map(str, runs), "--observability", "full", "--episodes", "2"]
+    assert "learned the twins" in refused(capsys, *words)
 
 
 def test_saliency_of_runs_has_a_row_for_every_agent(

@@ -1,0 +1,103 @@
+"""Names in figures are text: never mathematics, never markup, and never missing from a legend."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.tools import cli, saliency_figure
+from arcade_torch.tools.figures import FIGURES, logs
+from arcade_torch.tools.figures.style import drawing, new_figure, svg
+from arcade_torch.tools.names import printable
+from arcade_torch.tools.runs import find_runs
+from tests.tools.test_runs import write
+
+HOSTILE = [
+    r"$\frac{$", "$$", "$x^{$", r"\frac{1}{2}", "$" + "{" * 3000 + "$", "a_b^c%d", "_hidden", "__", "50 % #1 & ~", "\\",
+    "<b>&amp;</b>", "\u202e\u200b", "a\x07\x1b[2J", "é", " ", "=1+1", "x" * 200,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("figure", ["returns", "gap-bias"])
+def test_any_name_in_a_table_of_scores_is_drawn(
+    figure: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = ["agent,game,observability,seed,score"]
+    for agent in (*HOSTILE, "mlp"):
+        for game in ("TetrisEasy", "$x^{$", "$y_{\x07$"):
+            cells = ",".join('"' + cell.replace('"', '""') + '"' for cell in (agent, game))
+            lines += [f"{cells},{twin},{seed},0.{seed + 2}" for twin in ("full", "partial") for seed in (0, 1)]
+    (tmp_path / "scores.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    words = ["figure", figure, "--runs", str(tmp_path / "scores.csv"), "--out", str(tmp_path / "f.pdf")]
+    words = words if figure == "gap-bias" else [*words[:-1], str(tmp_path)]
+    assert cli.main(words) == 0, capsys.readouterr().err
+
+
+def test_any_name_in_a_run_is_drawn_as_it_is_written(tmp_path: Path) -> None:
+    names = [*HOSTILE, "\ud800", "mlp"]
+    for place, memory in enumerate(names):
+        write(tmp_path / "runs" / f"{place:02}", memory, "full", 0, 0.5, env="$x^{$\x07Easy")
+    options = logs.CurveOptions((tmp_path / "runs",), tmp_path / "curves.png")
+    with drawing("light"):
+        (picture,) = logs.curves(options, None).pictures
+        shown = [text.get_text().lstrip("\u200b") for text in picture.figure.legends[0].get_texts()]
+        text = svg(picture.figure, "\ud800\x07")
+    assert shown == [printable(name) for name in names]
+    assert picture.figure.axes[0].get_title() == r"$x^{$\x07Easy, MDP"
+    for prefix in ("href", "xlink:href"):
+        text = text.replace(f" {prefix}=", " link=")
+    words = " ".join(ElementTree.fromstring(text).itertext())
+    assert all(re.sub(r"\s+", " ", printable(name)).strip() in words for name in names)
+
+
+def test_a_line_break_in_a_name_is_written_out(tmp_path: Path) -> None:
+    write(tmp_path / "0", "a\nb", "full", 0, 0.5)
+    write(tmp_path / "1", "mlp", "full", 0, 0.5, network_options={"note": "x\r\n\x1b"})
+    write(tmp_path / "2", "mlp", "full", 0, 0.5)
+    assert set(find_runs([tmp_path]).names.values()) == {r"a\nb", "mlp", r"mlp note=x\r\n\x1b"}
+
+
+def test_options_and_settings_with_dollars_are_drawn(tmp_path: Path) -> None:
+    write(tmp_path / "0", "lru", "full", 0, 0.5, network_options={r"$\frac{": r"$\sqrt{"})
+    for figure in ("curves", "hyperparameters"):
+        assert cli.main(["figure", figure, str(tmp_path / "0"), "--out", str(tmp_path / "f")]) == 0
+
+
+def test_names_of_games_in_a_file_of_rates_are_drawn(tmp_path: Path) -> None:
+    lines = ["game,measure,obs_size,num_envs,frames_per_s_with_check,jax_device"]
+    for game in (r"$\frac{", "_x", "a\x1bb"):
+        lines += [f"{game},step+draw,128,{count},{1000 * count},$\\frac{{ cpu" for count in (1, 16, 256)]
+    (tmp_path / "rates.csv").write_text("\n".join(lines) + "\n")
+    assert cli.main(["figure", "throughput", str(tmp_path / "rates.csv"), "--out", str(tmp_path / "f")]) == 0
+    assert {row["series"] for row in read_csv(tmp_path / "f" / "throughput.csv")} >= {r"$\frac{", "_x", r"a\x1bb"}
+
+
+def test_ticks_of_rates_are_powers_of_ten(tmp_path: Path) -> None:
+    lines = ["game,measure,obs_size,num_envs,frames_per_s_with_check"]
+    lines += [f"A,step+draw,128,{count},{rate}" for count, rate in ((1, 900), (16, 12_000), (256, 1_200_000))]
+    (tmp_path / "rates.csv").write_text("\n".join(lines) + "\n")
+    with drawing("light"):
+        (picture,) = logs.throughput(logs.Options((tmp_path / "rates.csv",)), None).pictures
+        picture.figure.draw_without_rendering()
+        shown = [text.get_text() for text in picture.figure.axes[0].get_yticklabels()]
+    assert {"10³", "10⁴", "10⁵", "10⁶"} <= set(shown)
+
+
+def test_titles_of_saliency_are_text_and_its_times_are_mathematics() -> None:
+    frames, maps = np.zeros((2, 4, 4, 3), np.uint8), np.ones((2, 4, 4), np.float32)
+    for given in (new_figure(), None):  # outside of our style
+        figure = saliency_figure([(r"$\frac{ 50 %", frames, maps)], figure=given)
+        figure.canvas.draw()
+        (part,) = figure.subfigs
+        assert part._suptitle.get_text().startswith(r"$\frac{ 50 %") and not part._suptitle.get_parse_math()
+        assert all(axis.title.get_parse_math() for axis in part.axes)
+
+
+def test_every_maker_of_figures_is_covered_here_or_has_no_names() -> None:
+    drawn_here = {"returns", "gap-bias", "curves", "hyperparameters", "throughput", "saliency"}
+    others: Any = {"human", "size-sweep", "recall-density", "contamination"}  # fixed names, or by the style alone
+    assert set(FIGURES) == drawn_here | others
