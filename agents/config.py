@@ -26,8 +26,9 @@ class Range(NamedTuple):
 Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
 DEVICES = ("cpu", "cpu:0", "cuda", *(f"cuda:{index}" for index in range(128)))
 Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", lambda x: x in DEVICES)]
-Count = Annotated[int, Range("a whole number >= 1", lambda x: x >= 1)]
-CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: x >= 0)]
+# Bounded, so that no slip and no file of somebody else asks for all memory there is.
+Count = Annotated[int, Range("a whole number >= 1 (and at most 10**6)", lambda x: 1 <= x <= 10**6)]
+CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: 0 <= x <= 10**15)]
 Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
 Positive = Annotated[float, Range("a number > 0", lambda x: x > 0.0)]
 PositiveOrZero = Annotated[float, Range("a number >= 0", lambda x: x >= 0.0)]
@@ -315,7 +316,7 @@ class TrainConfig(Checked):
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
     eval_every: CountOrZero = 1_000_000
     """Frames between greedy evaluations; 0 evaluates only at the end."""
-    eval_episodes: Count = 128
+    eval_episodes: Annotated[int, Range("from 1 to 65536", lambda x: 1 <= x <= 2**16)] = 128
     """Episodes of each evaluation, one in each of as many fresh environments."""
     checkpoint_every: CountOrZero = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""

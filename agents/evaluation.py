@@ -1,6 +1,5 @@
 """Greedy evaluation on seeds that training never sees."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,6 +9,10 @@ from numpy.typing import NDArray
 
 import arcade_torch
 from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
+from arcade_torch.agents.metrics import student_half_width
+
+MOST_EPISODES = 2**16
+"""Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB at 128 pixels."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,20 @@ class EvalResult:
 
     @property
     def ci(self) -> float:
-        """Half width of the normal 95 % interval of the mean return."""
-        return 1.96 * self.std / math.sqrt(len(self.returns))
+        """Half width of Student's 95 % interval of the mean return; NaN for one episode, which tells none."""
+        return student_half_width(self.returns)
+
+    @property
+    def half_width(self) -> float | None:
+        """The same for JSON, which has no NaN."""
+        return None if len(self.returns) == 1 else self.ci
+
+    @property
+    def text(self) -> str:
+        """The mean with its interval, and of how many episodes."""
+        if len(self.returns) == 1:
+            return f"return {self.mean:.3f} of one episode, which gives no interval"
+        return f"mean return {self.mean:.3f} +- {self.ci:.3f} (95 %) over {len(self.returns)} episodes"
 
 
 def held_out_seed(seed: int) -> int:
@@ -87,7 +102,7 @@ def evaluate(
     Raises:
         ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is unknown.
     """
-    require(episodes >= 1, "episodes", episodes, "a whole number >= 1")
+    require(1 <= episodes <= MOST_EPISODES, "episodes", episodes, f"a whole number from 1 to {MOST_EPISODES}")
     require(observability in (None, "full", "partial"), "observability", observability, "'full' or 'partial'")
     if env is None:
         device = str(next(agent.network.parameters()).device)

@@ -24,6 +24,22 @@ def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
     return smooth
 
 
+def student_half_width(values: ArrayLike, confidence: float = 0.95) -> float:
+    """Half the width of Student's interval of the mean of some values; NaN where one value alone gives none.
+
+    Example:
+        >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
+        (6.35, nan)
+    """
+    from scipy.special import stdtrit  # which JAX brings
+
+    numbers = np.asarray(values, dtype=np.float64)
+    if numbers.size < 2:
+        return float("nan")
+    quantile = stdtrit(numbers.size - 1, (1 + confidence) / 2)
+    return float(quantile * numbers.std(ddof=1) / np.sqrt(numbers.size))
+
+
 def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None = None) -> float:
     """The number the paper reports for a run: the best smoothed training return.
 

@@ -142,6 +142,15 @@ def compile_network(network: nn.Module, backend: str = "inductor") -> None:
                 part.compile(backend=backend)
 
 
+def _check_weights(path: Path, saved: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """Raise CheckpointError for weights that would load without a word and mean nothing."""
+    for name, value in saved.items():
+        if name in wanted and value.dtype != wanted[name].dtype:
+            raise CheckpointError(f"the weight {name} in {path} is {value.dtype}, the network has {wanted[name].dtype}")
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            raise CheckpointError(f"the weight {name} in {path} is not finite: take the checkpoint before")
+
+
 def load(path: str | PathLike[str], device: str | torch.device | None = None) -> Agent:
     """Load an agent.
 
@@ -158,6 +167,7 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
+    _check_weights(checkpoint.path, checkpoint.weights, network.state_dict())
     try:
         network.load_state_dict(checkpoint.weights)
     except RuntimeError as error:

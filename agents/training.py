@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from arcade_torch.agents.ppo import PPO
 from arcade_torch.agents.pqn import PQN
 from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, write_json
-from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder
+from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.dlpack import pick_devices
 from arcade_torch.envs_jax import resolve_id
@@ -206,9 +206,9 @@ def train(
 ) -> TrainResult:
     """Train an agent in a run folder.
 
-    SIGINT and SIGTERM end the run at the next update with a checkpoint and status ``"interrupted"``; a second SIGINT
-    ends it at once. A killed run goes on from its last checkpoint, to the bit on one machine. Torch's global generator
-    is seeded for the run and put back afterwards.
+    SIGINT, SIGTERM and SIGHUP (a dropped connection) end the run at the next update with a checkpoint and status
+    ``"interrupted"``; a second SIGINT ends it at once. A killed run goes on from its last checkpoint, to the bit on
+    one machine. Torch's global generator is seeded for the run and put back afterwards.
 
     Args:
         config: what to train.
@@ -223,7 +223,8 @@ def train(
         How it ended.
 
     Raises:
-        RunFolderError: the folder is taken, holds another run, or cannot be written. Nothing was changed.
+        RunFolderError: the folder is taken, holds another run, or cannot be written: nothing was changed. Or it was
+            removed, or its disk is full, during the training: the last checkpoint is whole.
         CheckpointError: ``resume`` found only damaged checkpoints.
         NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last checkpoint is good.
         LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
@@ -274,10 +275,22 @@ class _Run:
                 newest = list_checkpoints(self.folder.checkpoints)[:1]
                 left = f"the last good checkpoint is {newest[0]}" if newest else "there was no checkpoint yet"
                 raise NonFiniteError(f"{error}; {left}") from error
+            except OSError as error:  # a full disk, for one
+                with suppress(OSError):
+                    self._report("failed", error=f"{type(error).__name__}: {error}")
+                raise RunFolderError(self._not_written(error)) from error
             except BaseException as error:
                 status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-                self._report(status, error=f"{type(error).__name__}: {error}")
+                with suppress(OSError):
+                    self._report(status, error=f"{type(error).__name__}: {error}")
                 raise
+
+    def _not_written(self, error: OSError) -> str:
+        """What could not be written, what is safe, and how to go on."""
+        where = error.filename or self.folder.path
+        newest = list_checkpoints(self.folder.checkpoints)[:1]
+        safe = f"{newest[0].name} is whole" if newest else "there is no checkpoint yet"
+        return f"could not write {where}: {error.strerror or error}; {safe}: make room, then go on with --resume"
 
     def _loop(self) -> TrainResult:
         trainer, config = self.trainer, self.config
@@ -320,6 +333,7 @@ class _Run:
     def _save(self) -> None:
         """Write a checkpoint, unless there is one of this moment."""
         trainer = self.trainer
+        self.folder.check_there()
         if self.saved_at != trainer.frames:
             weights = trainer.acting.state_dict()
             save_checkpoint(self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict())
@@ -336,8 +350,12 @@ class _Run:
             "frames": self.trainer.frames,
             "seconds": self.trainer.seconds,
             "eval_seconds": time.perf_counter() - began,
-            **{"mean": result.mean, "std": result.std, "ci": result.ci, "train_max_ewm": score},
-            **{"returns": result.returns.tolist(), "lengths": result.lengths.tolist()},
+            "mean": result.mean,
+            "std": result.std,
+            "ci": result.half_width,
+            "train_max_ewm": score,
+            "returns": result.returns.tolist(),
+            "lengths": result.lengths.tolist(),
         }
         write_json(self.folder.path / "eval.json", final)
         self._report("finished", mean=result.mean)
@@ -386,7 +404,10 @@ def own_settings(config: TrainConfig) -> Iterator[None]:
 
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], bool]]:
-    """Turn SIGINT and SIGTERM into a request to stop; outside the main thread, signals stay as they are."""
+    """Turn SIGINT, SIGTERM and SIGHUP into a request to stop.
+
+    A signal that is ignored (SIGHUP under ``nohup``) stays so, and outside the main thread all stay as they are.
+    """
     asked = threading.Event()
 
     def ask(number: int, frame: object) -> None:
@@ -394,8 +415,11 @@ def stop_signals() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked.set()
 
-    main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM) if main}
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                before[number] = signal.signal(number, ask)
     try:
         yield asked.is_set
     finally:

@@ -54,7 +54,7 @@ class Encoder(nn.Module):
             float [..., E], dtype of the parameters.
 
         Raises:
-            ValueError: the last three dimensions are neither.
+            ValueError: the last three dimensions are neither, or the frames are floats in 0..1.
         """
         frames = self._frames(pixels)
         if self.amp:
@@ -79,8 +79,27 @@ class Encoder(nn.Module):
                 + ("" if full == stored else f" or compressed [..., {self.stored_size}, {self.stored_size}, 3]")
                 + f", got {list(pixels.shape)}"
             )
+        _check_floats(pixels)
         frames = pixels.reshape(-1, *size)
         return frames if size == stored else self.compress(frames)
+
+
+def _check_floats(pixels: Tensor) -> None:
+    """Refuse frames that somebody has divided by 255 already: the encoder does that itself.
+
+    Floats are looked at where that waits for nothing: on the CPU, outside of compiled and vectorised functions.
+    """
+    if not pixels.is_floating_point() or pixels.device.type != "cpu" or torch.compiler.is_compiling():
+        return
+    try:
+        largest = float(pixels.detach().amax()) if pixels.numel() else 0.0
+    except RuntimeError:  # vmap
+        return
+    if 0.0 < largest <= 1.0:
+        raise ValueError(
+            f"frames of floats go up to {largest:.3g}, expected uint8, or floats from 0 to 255 (not 0 to 1): "
+            "take ToTensorImage away, or multiply by 255"
+        )
 
 
 # (kernel, stride) of the four convolutions and of the pool behind each; None: no pool.

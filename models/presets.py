@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -18,6 +19,12 @@ __all__ = ["FEED_FORWARD", "HEADS", "PRESETS", "NetworkPreset", "make_head", "ma
 
 FEED_FORWARD = "feedforward"
 """In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see :class:`FeedForward`)."""
+
+
+MOST = {"hidden_size": 2**15, "layers": 256, "towers": 256, "feedforward_size": 2**15}
+"""Largest sizes of a network: a slip of the pen, or a file that somebody else wrote, asks for no more memory."""
+MOST_OPTION = 2**20
+"""Largest number in the options of a memory."""
 
 
 @dataclass(frozen=True)
@@ -138,11 +145,18 @@ def make_network(
     chosen = replace(chosen, **options)
     kinds = {int: "a whole number", bool: "True or False"}
     for name in fields:
-        value, kind = getattr(chosen, name), fields[name].type
+        kind = fields[name].type
+        value = getattr(chosen, name)
+        if kind is int and isinstance(value, np.integer):
+            value = int(value)
+        if kind is bool and isinstance(value, np.bool_):
+            value = bool(value)
+        object.__setattr__(chosen, name, value)
         if kind in kinds and type(value) is not kind:
             raise ValueError(f"{name} must be {kinds[kind]}, got {value!r}")
-        if kind is int and value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+        if kind is int and not 1 <= value <= MOST[name]:
+            raise ValueError(f"{name} must be at least 1 and at most {MOST[name]}, got {value}")
+    _check_sizes(memory_options or {})
     for name, allowed in {"skip": SKIPS, "head": HEADS, "actor_critic_head": HEADS, "towers": (1, 2)}.items():
         if (value := getattr(chosen, name)) not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
@@ -170,6 +184,13 @@ def make_network(
         keys["predictor"] = nn.Sequential(nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size))
     zero_action = chosen.zero_action_on_reset and (store != "step" or "zero_action_on_reset" in options)
     return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys)
+
+
+def _check_sizes(memory_options: dict[str, Any]) -> None:
+    """Refuse what no machine could hold, before anything is allocated."""
+    for name, value in memory_options.items():
+        if isinstance(value, int) and abs(value) > MOST_OPTION:
+            raise ValueError(f"memory_options.{name} must be at most {MOST_OPTION}, got {value}")
 
 
 HEADS = ("reference", "paper", "actor_critic", "linear", "plain")

@@ -1,6 +1,7 @@
 """Every algorithm in its trainer: acting is learning, updates work, a saved moment goes on to the bit."""
 
 import io
+import math
 import re
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, make_actor, preset
+from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, make_actor, preset, training
 from arcade_torch.agents.config import GROUPS
 from arcade_torch.agents.learner import Training
 from arcade_torch.agents.runs.checkpoint import Checkpoint
@@ -109,6 +110,7 @@ def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(algor
     wanted = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     assert all(torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items())
     monkeypatch.setattr(trainer.stats, "update", lambda *window: None)
+    trainer.return_range = (0.0, 1.0)
     for reached, newest in ((None, 1), (-1.0, 1), (0.5, 32 / 35), (1.0, 1 / 3), (7.0, 2 / 7)):  # shares of new weights
         trainer.stats.smooth = reached
         trainer.update()
@@ -119,6 +121,36 @@ def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(algor
     assert any(not torch.equal(value, trained[name]) for name, value in wanted.items())
     acts = {id(p) for p in trainer.policy.parameters()}
     assert acts == {id(p) for p in trainer.acting.parameters()}
+
+
+@pytest.mark.parametrize(
+    ("training_return", "span", "share"),
+    [
+        (None, (0.0, 1.0), 0.0),
+        (-1.0, (-1.0, 1.0), 0.0),
+        (0.0, (-1.0, 1.0), 0.5),
+        (-0.5, (-1.0, 0.0), 0.5),
+        (30.0, (0.0, 40.0), 0.75),
+        (50.0, (0.0, 40.0), 1.0),
+        (-2.0, (-1.0, 1.0), 0.0),
+    ],
+)
+def test_a_return_counts_as_a_share_of_what_the_game_can_pay(training_return, span, share):
+    """Before: the raw return, so no mean at all at 0 and below, and always the full one above 1."""
+    assert training.share_reached(training_return, span) == share
+
+
+def test_the_mean_goes_by_the_range_of_the_runs_own_game():
+    trainer = Trainer(config("pqn", env="NavigatorEasy", pqn={"average_share": 0.5}))
+    assert trainer.return_range == trainer.env.game.return_range and trainer.return_range[0] < -0.9
+
+
+@pytest.mark.parametrize("span", [(0.0, 0.0), (0.0, math.inf), (-math.inf, 1.0)])
+def test_a_mean_of_a_game_without_a_range_is_refused(span, monkeypatch):
+    with pytest.raises(
+        ValueError, match=r"average_share goes by .* but MineEasy-v0 has return_range .* or set it to 0"
+    ):
+        training.check_return_range("MineEasy-v0", span)
 
 
 def test_without_a_mean_the_same_weights_act_and_learn():

@@ -1,6 +1,7 @@
 """Evaluation plays one whole episode in each fresh environment."""
 
 import pytest
+import scipy.stats
 import torch
 from tensordict import TensorDict
 
@@ -81,7 +82,9 @@ def test_numbers_about_the_returns(env):
     r = torch.tensor(result.returns)
     assert result.mean == pytest.approx(r.mean().item())
     assert result.std == pytest.approx(r.std().item(), abs=1e-6)
-    assert result.ci == pytest.approx(1.96 * r.std().item() / EPISODES**0.5, abs=1e-6)
+    quantile = scipy.stats.t.ppf(0.975, EPISODES - 1)
+    assert result.ci == pytest.approx(quantile * r.std().item() / EPISODES**0.5, abs=1e-6)
+    assert result.text.endswith(f"+- {result.ci:.3f} (95 %) over {EPISODES} episodes")
 
 
 def test_an_environment_is_all_that_the_config_says_about_it(monkeypatch):

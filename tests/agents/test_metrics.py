@@ -1,5 +1,7 @@
 """The paper's score, episode bookkeeping, schedules, optimiser."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -99,8 +101,10 @@ def test_an_environment_that_has_not_ended_yet_is_no_success():
 
 
 def test_the_interval_is_that_of_the_normal_mean():
-    assert EvalResult(np.array([1.0, 3.0]), np.ones(2)).ci == pytest.approx(1.96)
-    assert EvalResult(np.array([1.0]), np.ones(1)).ci == 0.0
+    assert EvalResult(np.array([1.0, 3.0]), np.ones(2)).ci == pytest.approx(12.706, abs=1e-3)  # Student's, not 1.96
+    one = EvalResult(np.array([1.0]), np.ones(1))  # before: +- 0.000 (95 %)
+    assert math.isnan(one.ci) and one.half_width is None
+    assert one.text == "return 1.000 of one episode, which gives no interval"
 
 
 def test_linear_meets_both_ends_and_stays():

@@ -188,3 +188,16 @@ def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_o
     wanted = [plain, *torch.autograd.grad(plain, parameters, cotangent)]
     for one, other in zip([found, *torch.autograd.grad(found, parameters, cotangent)], wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=tolerance * float(other.detach().abs().max()))
+
+
+@pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
+def test_frames_that_were_divided_by_255_already_are_refused(make):
+    """Before: they were divided again, and the network saw black."""
+    encoder = make(128)
+    frames = torch.randint(0, 256, (2, 128, 128, 3), dtype=torch.uint8)
+    torch.testing.assert_close(encoder(frames.float()), encoder(frames), atol=0.05, rtol=0.1)
+    assert encoder(torch.zeros(2, 128, 128, 3)).isfinite().all()
+    with pytest.raises(ValueError, match=r"floats go up to 1, expected uint8, or floats from 0 to 255 \(not 0 to 1\)"):
+        encoder(frames / 255)
+    vectorised = torch.func.vmap(encoder)(frames.float()[:, None])
+    torch.testing.assert_close(vectorised.squeeze(1), encoder(frames.float()), atol=1e-4, rtol=1e-4)

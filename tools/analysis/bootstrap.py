@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.errors import need
-
 Array = NDArray[np.float64]
 
 
@@ -51,20 +49,6 @@ def percentile_interval(value: Any, draws: Array, confidence: float, known: bool
         return Interval(float(value), float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(value), float(low), float(high))
-
-
-def student_half_width(values: Any, confidence: float = 0.95) -> float:
-    """Half the width of Student's interval of the mean of some values; NaN where one value alone gives none.
-
-    Example:
-        >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
-        (6.35, nan)
-    """
-    numbers = np.asarray(values, dtype=np.float64)
-    if numbers.size < 2:
-        return float("nan")
-    quantile = need("scipy.special").stdtrit(numbers.size - 1, (1 + confidence) / 2)
-    return float(quantile * numbers.std(ddof=1) / np.sqrt(numbers.size))
 
 
 class Pooled(NamedTuple):

@@ -118,11 +118,10 @@ class Evaluate(Command):
         result = evaluate(agent, self.observability, self.episodes)
         config, twin = agent.config, self.observability or agent.config.observability
         which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
-        mean = f"mean return {result.mean:.3f} +- {result.ci:.3f} (95 %) over {len(result.returns)} episodes"
-        print(f"{which}, {agent.frames:,} frames of training: {mean}")
+        print(f"{which}, {agent.frames:,} frames of training: {result.text}")
         if self.json is not None:
             found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
-            write_json(self.json, found | {"mean": result.mean, "half_width_95": result.ci})
+            write_json(self.json, found | {"mean": result.mean, "half_width_95": result.half_width})
         return 0
 
 
