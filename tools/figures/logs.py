@@ -197,7 +197,7 @@ def series(rows: Sequence[Rate], game: str, measure: str) -> dict[int, float]:
 def mean_series(rows: Sequence[Rate], games: Sequence[str], measure: str) -> dict[int, float]:
     """Mean rate over games, at the numbers of envs that all of them were measured with."""
     every = [series(rows, game, measure) for game in games]
-    shared = sorted(set.intersection(*map(set, every)))
+    shared = sorted(set.intersection(*map(set, every))) if every else []
     return {count: float(np.mean([one[count] for one in every])) for count in shared}
 
 
