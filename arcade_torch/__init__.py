@@ -6,6 +6,11 @@ Public names are resolved on first use: importing the package costs little, ``ar
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from arcade_torch import program
+
+if program.is_command_line():  # before the imports that take long: a signal during them is answered in one line
+    program.begin()
+
 import arcade_torch.gym  # puts the games into Gymnasium's registry
 import arcade_torch.process  # noqa: F401  (notes forks)
 
