@@ -57,6 +57,8 @@ def begin() -> None:
     if _Process.begun or threading.current_thread() is not threading.main_thread():
         return
     _Process.begun = True
+    if sys.flags.optimize > 1:
+        _start_with_docstrings()
     _repair_streams()
     for number in STOP_SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -99,6 +101,26 @@ def leave(code: int) -> NoReturn:
         with suppress(Exception):
             stream.flush()
     os._exit(code)
+
+
+def _start_with_docstrings() -> None:
+    """Run this program again without ``-OO``: TorchRL adds to docstrings while it is imported, and fails without."""
+    words: list[str] = []
+    rest = iter(sys.orig_argv[1:])
+    for word in rest:
+        if word in ("-W", "-X"):
+            words += [word, next(rest, "")]
+        elif word.startswith(("-W", "-X")):
+            words.append(word)
+        elif not word.startswith("-") or word.startswith(("-m", "-c")):
+            words.append(word)
+            break
+        elif (kept := word.replace("O", "")) != "-":
+            words.append(kept)
+    words += rest
+    if words != sys.orig_argv[1:] or os.environ.get("PYTHONOPTIMIZE", "1") != "1":
+        os.environ["PYTHONOPTIMIZE"] = "1"
+        os.execv(sys.executable, [sys.executable, *words])
 
 
 def _repair_streams() -> None:

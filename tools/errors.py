@@ -125,6 +125,8 @@ def trouble_of_the_machine(error: BaseException) -> str:
     short = ("RESOURCE_EXHAUSTED", "out of memory", "can't allocate memory", "Unable to allocate", "std::bad_alloc")
     if isinstance(error, MemoryError) or any(words in said for words in short):
         return f"there is not enough memory: ask for less at once ({one_line(error)[:200]})"
+    if sys.flags.optimize > 1 and isinstance(error, TypeError | AttributeError) and "NoneType" in said:
+        return "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the place of -OO"
     platforms = os.environ.get("JAX_PLATFORMS") or os.environ.get("JAX_PLATFORM_NAME")
     if not platforms or "jax" not in sys.modules:
         return ""

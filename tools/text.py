@@ -7,6 +7,7 @@ page. HTML pages are escaped by their templates, figures by `arcade_torch.tools.
 import html
 import sys
 import unicodedata
+from numbers import Number
 from typing import Any
 
 _HIDDEN = frozenset(("Cc", "Cf", "Cs", "Zl", "Zp"))
@@ -52,7 +53,7 @@ def csv_cell(value: Any) -> Any:
         >>> csv_cell("=1+1"), csv_cell("-0.5"), csv_cell(-0.5)
         ("'=1+1", '-0.5', -0.5)
     """
-    if not isinstance(value, str):
+    if value is None or isinstance(value, Number):
         return value
     text = printable(value)
     if text.startswith(_FORMULA) and not _is_number(text):

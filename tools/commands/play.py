@@ -10,6 +10,7 @@ import tyro
 from arcade_torch.agents.config import require
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.options import at_least, name_and_value
+from arcade_torch.tools.text import say
 
 
 @dataclass(kw_only=True)
@@ -71,13 +72,16 @@ class Play(Shown):
         session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
         reason = None if self.terminal else screens.why_no_window()
         if reason is not None:
-            print(f"playing in the terminal: {reason}")
+            if (blocked := screens.why_no_terminal()) is not None:
+                raise ValueError(f"playing needs a window or a terminal: {reason}, and {blocked}")
+            say(f"playing in the terminal: {reason}")
         if self.terminal or reason is not None:
             screens.play_in_terminal(session)
         else:
             print(LEGEND)
             screens.play_in_window(session, self.scale, self.key_repeat)
-        print("\n".join(said) or "no episode was played")
+        for line in said or ["no episode was played"]:
+            say(line)
         return 0
 
 
@@ -132,15 +136,15 @@ class Record(Shown):
             if resolve_id(config.env) == game_id:
                 options = {**config.env_options, **options}
             else:
-                print(f"note: this agent was trained on {config.env}")
+                say(f"note: this agent was trained on {config.env}")
         if self.observability is not None:
             partial = self.observability == "partial"
 
-        def say(attempt: Any) -> None:
-            print(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
+        def tell(attempt: Any) -> None:
+            say(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
 
         game, views = compiled_game(game_id, obs_size, rules, options), {"partial": partial, "both": self.both}
-        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=say, **views)
+        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=tell, **views)
         player = (
             recording.trained(agent, partial) if agent else recording.scripted(self.player, session.game, self.seed)
         )
@@ -153,5 +157,5 @@ class Record(Shown):
                     yield frame
 
             write(self.out, counted(), self.fps)
-        print(f"recording: {self.out}")
+        say(f"recording: {self.out}")
         return 0

@@ -13,6 +13,7 @@ from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.options import command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.text import say
 
 
 @dataclass
@@ -86,8 +87,8 @@ class Train(Command):
             result = train(run, folder, self.resume, show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
-        print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
-        print(f"finished: {result.run_dir}")
+        say(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
+        say(f"finished: {result.run_dir}")
         return 0
 
     def resume_hint(self) -> str:
@@ -119,7 +120,7 @@ class Evaluate(Command):
         config, twin = agent.config, self.observability or agent.config.observability
         which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
         mean = f"mean return {result.mean:.3f} +- {result.ci:.3f} (95 %) over {len(result.returns)} episodes"
-        print(f"{which}, {agent.frames:,} frames of training: {mean}")
+        say(f"{which}, {agent.frames:,} frames of training: {mean}")
         if self.json is not None:
             found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
             write_json(self.json, found | {"mean": result.mean, "half_width_95": result.ci})
