@@ -46,7 +46,8 @@ class Table:
                 parts.append(list(range(self.left)))
             parts[-1].append(i)
         for part in parts:
-            title, caption = self.title if part is parts[0] else "", self.caption if part is parts[-1] else ""
+            title = _lines(self.title) if part is parts[0] else ""
+            caption = _lines(self.caption) if part is parts[-1] else ""
             table = need("rich.table").Table(title=title or None, caption=caption or None)
             table.title_justify = table.caption_justify = "left"
             for i in part:
