@@ -2,11 +2,11 @@
 
 import errno
 import opcode
-import os
 import sys
 from importlib import import_module
 from typing import Any
 
+from arcade_torch.process import missing_platform
 from arcade_torch.tools.text import printable
 
 EXTRA_OF = {
@@ -127,12 +127,4 @@ def trouble_of_the_machine(error: BaseException) -> str:
         return f"there is not enough memory: ask for less at once ({one_line(error)[:200]})"
     if sys.flags.optimize > 1 and isinstance(error, TypeError | AttributeError) and "NoneType" in said:
         return "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the place of -OO"
-    platforms = os.environ.get("JAX_PLATFORMS") or os.environ.get("JAX_PLATFORM_NAME")
-    if not platforms or "jax" not in sys.modules:
-        return ""
-    try:
-        sys.modules["jax"].devices()
-    except Exception as problem:
-        why = one_line(problem)[:200]
-        return f"JAX_PLATFORMS is {platforms!r}, but JAX has no such device here: unset it, or set it to cpu ({why})"
-    return ""
+    return missing_platform()

@@ -111,6 +111,14 @@ def test_a_platform_that_jax_has_not_is_one_line(platform: str, words: str, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_make_says_in_one_line_that_jax_has_no_such_platform(tmp_path: Path) -> None:
+    result = shell(
+        "python -c 'import arcade_torch; arcade_torch.make(\"CartPoleEasy\")'", tmp_path, JAX_PLATFORMS="cuda"
+    )
+    last = result.stderr.decode().splitlines()[-1]
+    assert last.startswith("ValueError: JAX_PLATFORMS is 'cuda', but JAX has no such device here"), last
+
+
 def test_play_names_the_stream_that_is_no_terminal(tmp_path: Path) -> None:
     master, slave = pty.openpty()
     words = [sys.executable, "-m", "arcade_torch.tools", "play", "CartPoleEasy", "--terminal"]

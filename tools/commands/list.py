@@ -54,7 +54,7 @@ class List(Command):
         return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
 
     def _baselines(self) -> None:
-        at_least(self, episodes=1)
+        at_least(self, episodes=1, seconds=0)
         ids = [resolve_id(name) for name in self.games] or registered_ids()
         rows, total = [], len(ids) * len(players.PLAYERS)
         with Bars() as bars:

@@ -9,8 +9,10 @@ import tyro
 
 from arcade_torch.agents.config import require
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import at_least, name_and_value
+from arcade_torch.tools.options import at_least, at_most, name_and_value
 from arcade_torch.tools.text import say
+
+LARGEST_SCALE = 32
 
 
 @dataclass(kw_only=True)
@@ -23,6 +25,11 @@ class Shown(Command):
     scale: int = 2  # Width of a frame's pixel in the picture.
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
+
+    def check_scale(self) -> None:
+        """Refuse pictures without a pixel, and those that no screen and no memory holds."""
+        at_least(self, scale=1)
+        at_most(self, scale=LARGEST_SCALE)
 
 
 @dataclass(kw_only=True)
@@ -52,7 +59,8 @@ class Play(Shown):
         from arcade_torch.tools.play import scores, screens
         from arcade_torch.tools.play.session import LEGEND, Session
 
-        at_least(self, scale=1, key_repeat=0)
+        at_least(self, key_repeat=0)
+        self.check_scale()
         fits = self.scores is None or self.scores.suffix == ".csv"
         require(fits, "--scores", str(self.scores), "a file that ends in .csv")
         options = dict(map(name_and_value, self.env_option))
@@ -115,7 +123,8 @@ class Record(Shown):
         from arcade_torch.tools.progress import Bars
 
         write = recording.writer_for(self.out)
-        at_least(self, episodes=1, max_steps=1, scale=1)
+        at_least(self, episodes=1, max_steps=1)
+        self.check_scale()
         fastest = recording.FASTEST_FPS[self.out.suffix]
         require(
             0.01 <= self.fps <= fastest, "--fps", self.fps, f"at least 0.01 and at most {fastest} for {self.out.suffix}"

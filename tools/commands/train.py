@@ -11,7 +11,7 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import command_line, name_and_value
+from arcade_torch.tools.options import at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
 
@@ -69,6 +69,7 @@ class Train(Command):
         from arcade_torch.tools.studies.engines import watch_parent
         from arcade_torch.tools.studies.grid import RunSpec
 
+        at_least(self, wait=0)
         watch_parent()
         keep_freed_memory()
         run, film = self.settings, None
