@@ -49,8 +49,8 @@ class Options(BenchOptions):
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
-    at_least(options, batches=1, repeats=1, seconds=0)
     at_most(options, batches=LARGEST_BATCH)
+    at_least(options, batches=1, repeats=1, seconds=0)
     for game, size in product(games, options.sizes):
         make(game, obs_size=size)  # refuse what does not exist before anything is measured
     for game, size, count in product(games, options.sizes, options.batches):

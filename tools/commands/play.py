@@ -28,8 +28,8 @@ class Shown(Command):
 
     def check_scale(self) -> None:
         """Refuse pictures without a pixel, and those that no screen and no memory holds."""
-        at_least(self, scale=1)
         at_most(self, scale=LARGEST_SCALE)
+        at_least(self, scale=1)
 
 
 @dataclass(kw_only=True)
