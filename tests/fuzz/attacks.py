@@ -111,7 +111,7 @@ def of_files(seed: int) -> Iterator[Case]:
     for file, readers in READERS.items():
         for fault, spoil in FAULTS.items():
             command = rng.choice(readers)
-            if rng.random() < 0.4:
+            if rng.random() < 0.5:
                 continue
             do = partial(_spoil, file=file, spoil=spoil, seed=rng.randrange(2**32))
             yield Case(f"file/{fault}/{file}/{command}", COMMANDS[command], do)

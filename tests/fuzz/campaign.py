@@ -212,7 +212,7 @@ def main() -> int:
     """Run the campaign; exit code 1 if a case is not fine."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--moments", type=int, default=10, help="signals to each command")
+    parser.add_argument("--moments", type=int, default=6, help="signals to each command")
     parser.add_argument("--only", default="", help="beginning of the names of cases")
     parser.add_argument("--every", type=int, default=1, help="of the cases only each such one")
     parser.add_argument("--page", type=Path, help="Markdown file that gets the table between its marks")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.tools.files import write_between
 from tests.fuzz import contract
 
 
@@ -34,12 +35,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _table_of_inputs() -> Iterator[None]:
     yield
     if contract.counts and not contract.few and (name := os.environ.get("FUZZ_TABLE")):
-        Path(name).write_text(
-            "# Fuzzing\n\nWritten by `FUZZ_TABLE=results/fuzz.md make test-slow ARGS=tests/fuzz`: generated inputs by "
-            "entry point.\nEach of them worked or was refused in one line of ours; see `tests/fuzz/contract.py`.\n\n"
-            f"{contract.table()}\n",
-            encoding="utf-8",
-        )
+        write_between(Path(name), "<!-- inputs -->", "<!-- end of inputs -->", contract.table())
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

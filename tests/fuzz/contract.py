@@ -73,7 +73,7 @@ def attempt(entry: str, call: Callable[[], object]) -> bool:
     row = counts.setdefault(entry, Counter())
     row["inputs"] += 1
     try:
-        with _time_limit(), warnings.catch_warnings():
+        with time_limit(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             call()
     except Hang:
@@ -116,12 +116,14 @@ def _raises(filename: str) -> list[range]:
 
 
 @contextmanager
-def _time_limit() -> Iterator[None]:
+def time_limit(seconds: float = LIMIT_S) -> Iterator[None]:
+    """Raise `Hang` inside after so many seconds."""
+
     def late(number: int, frame: object) -> None:
         raise Hang
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
