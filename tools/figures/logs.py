@@ -12,8 +12,9 @@ from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
-from arcade_torch.tools.names import plain_number, printable
+from arcade_torch.tools.names import plain_number
 from arcade_torch.tools.runs import Run, find_runs
+from arcade_torch.tools.text import printable
 
 POINTS = 120  # of a curve of training returns
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
