@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from arcade_torch.agents import preset, train
-
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "arcade_torch.tools")
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -132,6 +130,7 @@ def test_an_interruption_that_comes_back_as_an_error_is_still_one(tmp_path: Path
 def test_a_second_ctrl_c_ends_at_once_even_while_c_computes(tmp_path: Path) -> None:
     process = run_with(COMPUTES, tmp_path)
     assert process.stdout is not None and process.stdout.readline() == "computing\n"
+    time.sleep(1.0)  # until it is in C
     process.send_signal(signal.SIGINT)
     time.sleep(0.2)
     assert process.poll() is None
@@ -161,6 +160,8 @@ def test_signals_that_are_ignored_stay_ignored(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from arcade_torch.agents import preset, train
+
     folder = tmp_path_factory.mktemp("signals") / "run"
     train(preset("smoke", env="CartPoleEasy-v0", total_frames=256), folder)
     return folder
@@ -171,10 +172,10 @@ COMMANDS = {
     "record": "record CartPoleEasy --out out.gif",
     "record-agent": "record CartPoleEasy --player {agent} --out out.gif",
     "figure": "figure saliency {agent} --out out.png",
-    "analyze": "analyze contamination {agent} --out out.png",
+    "analyze": "analyze saliency {agent} --max-steps 20 --out figures",
     "list": "list memories",
     "sheet": "list sheet CartPoleEasy --steps 1 2 --out out.png",
-    "bench": "bench envs --envs CartPoleEasy --batches 4 --repeats 1 --out out.json",
+    "bench": "bench envs --games CartPoleEasy --batches 4 --repeats 1 --seconds 0.05 --out out.json",
 }
 RUNS = int(os.environ.get("SIGNAL_RUNS", "30"))
 """Of each command, in the slow test."""
