@@ -16,7 +16,7 @@ from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
 from arcade_torch.envs_jax.mixture import Batched
-from arcade_torch.envs_jax.validation import format_value
+from arcade_torch.envs_jax.validation import format_value, plain
 
 # Columns of ``Step.numbers``.
 REWARD, EPISODE_REWARD, STEP_COUNT, TERMINATED, TRUNCATED = range(5)
@@ -303,7 +303,8 @@ def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: d
         TypeError: An option that one of the games does not have, or ids that are neither a string nor a list.
     """
     ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))  # what a bare name means may change
-    options = dict(sorted(options.items()))
+    obs_size = plain(obs_size)
+    options = {name: plain(options[name]) for name in sorted(options)}
     try:
         return _compile(ids, obs_size, rules, **options)
     except TypeError as error:
