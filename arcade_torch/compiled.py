@@ -15,6 +15,7 @@ from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
 from arcade_torch.envs_jax.mixture import Batched
+from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.validation import format_value
 
 # Columns of ``Step.numbers``.
@@ -43,12 +44,12 @@ class CompiledGame:
 
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
-        self.step = jax.jit(self._step, donate_argnums=2, keep_unused=True)
-        self.reset_or_step = jax.jit(self._reset_or_step)
-        self.step_only = jax.jit(self._step_only, donate_argnums=2, keep_unused=True)
-        self.draw = jax.jit(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
+        self.step = compiled(self._step, donate_argnums=2, keep_unused=True)
+        self.reset_or_step = compiled(self._reset_or_step)
+        self.step_only = compiled(self._step_only, donate_argnums=2, keep_unused=True)
+        self.draw = compiled(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
         draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
-        self.draw_rows = tuple(jax.jit(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
+        self.draw_rows = tuple(compiled(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
 
     def _step(self, batch: Batch, action: jax.Array, spare: Spare = None, at: Any = None) -> Step:
         """Step, begin anew where an episode ended, draw once (into ``spare[:, at]``, if given), and pack."""
