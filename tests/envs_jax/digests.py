@@ -96,10 +96,14 @@ def in_process(
     return found
 
 
-def compare(ids: Sequence[str]) -> int:
-    """Print for each setting how many digests differ from those without any; returns 1 if some do."""
+def compare(ids: Sequence[str], cache: str | None = None) -> int:
+    """Print for each setting how many digests differ from those without any; returns 1 if some do.
+
+    Compiled programs are kept in ``cache``: where a setting changes a program, it is compiled anew.
+    """
     wrong = 0
-    with tempfile.TemporaryDirectory() as cache:
+    with tempfile.TemporaryDirectory() as spare:
+        cache = cache or spare
         expected = in_process({}, ids, cache)
         for name, settings in SETTINGS.items():
             found = in_process(settings, ids, cache)
@@ -117,9 +121,10 @@ def main() -> int:
     parser.add_argument("ids", nargs="*", default=registered_ids())
     parser.add_argument("--sizes", nargs="*", type=int, default=OBS_SIZES, help="sides of the pictures in pixels")
     parser.add_argument("--compare", action="store_true", help="compare all settings, each in a process of its own")
+    parser.add_argument("--cache", help="a folder for compiled programs")
     arguments = parser.parse_args()
     if arguments.compare:
-        return compare(arguments.ids)
+        return compare(arguments.ids, arguments.cache)
     print(json.dumps(digests(arguments.ids, arguments.sizes)))
     return 0
 
