@@ -185,8 +185,8 @@ class ArcadeEnv(EnvBase):
         """Copy everything that determines the future: game states, random keys, observability, counts.
 
         Returns:
-            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. It does
-            not say which episodes have ended: reset those first.
+            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. Episodes
+            that have ended stay so: a step gives their flags again and the reward 0, until they are reset.
         """
         return self._snapshots.export(self._live.batch)
 
