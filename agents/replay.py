@@ -6,7 +6,6 @@ room. The oldest leaves when the capacity is reached, and its file when no kept 
 TorchRL's ``TensorDictReplayBuffer`` stores the same batches, but writes everything again for every checkpoint.
 """
 
-import re
 import tempfile
 from collections import deque
 from collections.abc import Mapping
@@ -19,9 +18,8 @@ from safetensors.torch import load_file, save
 from tensordict import TensorDict, TensorDictBase
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.runs.files import CheckpointError, checksum, write_atomic
+from arcade_torch.agents.runs.files import CheckpointError, checksum, is_our_name, is_ours, write_atomic
 
-_WINDOW = re.compile(r"window-\d{9,12}\.safetensors")  # the only names that are read or removed
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
 
 
@@ -113,7 +111,7 @@ class SequenceReplay:
         names = {segment.file.name: segment.checksum for segment in self._segments}
         needed = set(names).union(*self._lists)
         for file in self._folder.glob("window-*"):
-            if _WINDOW.fullmatch(file.name) and file.name not in needed:
+            if is_ours(file, "window") and file.name not in needed:
                 file.unlink()
         self._lists.append(set(names))
         return {"files": names, "added": self._added}
@@ -124,10 +122,10 @@ class SequenceReplay:
         self._added = state["added"]
         self._segments.clear()
         for name, digest in state["files"].items():
-            if not isinstance(name, str) or not _WINDOW.fullmatch(name):
+            if not is_our_name(name, "window"):
                 raise CheckpointError(f"the checkpoint names {name!r}, which is no window of a replay")
             file = self._folder / name
-            if file.is_symlink() or not file.is_file():
+            if not is_ours(file, "window"):
                 raise CheckpointError(f"{file} is missing: the replay of this checkpoint is not whole")
             if checksum(file) != digest:
                 raise CheckpointError(f"{file} is damaged: it does not have the checksum in the checkpoint")

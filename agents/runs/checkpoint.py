@@ -14,7 +14,6 @@ Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights
 import io
 import os
 import pickle
-import re
 import shutil
 import warnings
 import zipfile
@@ -32,6 +31,7 @@ from arcade_torch.agents.runs.files import (
     MOST_TENSORS,
     CheckpointError,
     checksum,
+    is_ours,
     open_regular,
     read_bytes,
     read_json,
@@ -44,8 +44,6 @@ FORMAT = 2
 """Format of checkpoints and run folders; 1 is that of arcade-torch 0.1, which is refused."""
 KEEP = 2
 _WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.json", "latest"
-_NAME = re.compile(r"frames-\d{12}")
-_DRAFT = re.compile(r"\.frames-\d{12}\.\d+")
 
 
 class _OtherRunError(CheckpointError):
@@ -76,6 +74,26 @@ def save_checkpoint(
     final = folder / f"frames-{frames:012d}"
     draft = folder / f".{final.name}.{os.getpid()}"
     shutil.rmtree(draft, ignore_errors=True)
+    try:
+        _write_parts(draft, config, frames, weights, trainer)
+        if final.is_symlink():
+            final.unlink()
+        shutil.rmtree(final, ignore_errors=True)
+        os.replace(draft, final)
+    except BaseException:  # a full disk, for one: what is half written makes room
+        shutil.rmtree(draft, ignore_errors=True)
+        raise
+    write_atomic(folder / _LATEST, final.name + "\n")
+    for old in list_checkpoints(folder)[KEEP:]:
+        shutil.rmtree(old, ignore_errors=True)
+    remove_draft_checkpoints(folder)
+    return final
+
+
+def _write_parts(
+    draft: Path, config: TrainConfig, frames: int, weights: dict[str, Tensor], trainer: dict[str, Any]
+) -> None:
+    """Write the files of a checkpoint into a folder that is made."""
     draft.mkdir(parents=True)
     tensors = {key: value.detach().cpu().contiguous().clone() for key, value in weights.items()}
     write_atomic(draft / _WEIGHTS, save(tensors))
@@ -84,25 +102,18 @@ def save_checkpoint(
     write_atomic(draft / _TRAINER, state.getvalue())
     sums = {part: checksum(draft / part) for part in (_WEIGHTS, _TRAINER)}
     write_json(draft / _META, {"format": FORMAT, "frames": frames, "config": config.to_dict(), "sha256": sums})
-    shutil.rmtree(final, ignore_errors=True)
-    os.replace(draft, final)
-    write_atomic(folder / _LATEST, final.name + "\n")
-    for old in list_checkpoints(folder)[KEEP:]:
-        shutil.rmtree(old, ignore_errors=True)
-    remove_draft_checkpoints(folder)
-    return final
 
 
 def remove_draft_checkpoints(folder: Path) -> None:
     """Remove what a killed process left of a checkpoint, and nothing else."""
     for path in folder.iterdir() if folder.is_dir() else ():
-        if _DRAFT.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+        if is_ours(path, "checkpoint draft"):
             shutil.rmtree(path, ignore_errors=True)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
     """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames) first."""
-    checkpoints = [path for path in folder.glob("frames-*") if _NAME.fullmatch(path.name) and path.is_dir()]
+    checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
     try:
         latest = read_text(folder / _LATEST).strip()
     except (OSError, ValueError):
@@ -120,7 +131,7 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
     meta = _read_meta(path)
     try:
         config, frames, sums = TrainConfig.from_dict(meta["config"]), meta["frames"], dict(meta["sha256"])
-        require(type(frames) is int, "frames", frames, "a whole number")
+        require(type(frames) is int and 0 <= frames < 10**12, "frames", frames, "a count of frames")
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error
     weights = _read_part(path / _WEIGHTS, sums, _load_weights)
@@ -202,7 +213,9 @@ def _load_tensors(file: Path) -> dict[str, Any]:
         if packed:
             raise ValueError(f"{packed[0]} is compressed, which torch.save does not do")
         stream.seek(0)
-        state: dict[str, Any] = torch.load(stream, map_location="cpu", weights_only=True)
+        state: Any = torch.load(stream, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise ValueError("it holds no table of names and values")
         return state
 
 

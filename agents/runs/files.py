@@ -1,6 +1,8 @@
 """Small files of a run: read with a bound, replaced atomically, or tables that grow by whole rows."""
 
+import contextlib
 import csv
+import errno
 import hashlib
 import io
 import json
@@ -13,10 +15,22 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 MOST_TEXT = 256 * 2**20
-"""Bytes of the largest text that is read: JSON, TOML, CSV."""
+"""Bytes of the largest text that is read, such as a table."""
+MOST_JSON = 64 * 2**20
+"""Bytes of the largest JSON that is read; in memory it may take thirty times as much."""
+MOST_ROWS = 2_000_000
+"""Lines of the longest table that is read; in memory a short line takes a hundred times as much."""
+MOST_CELLS = 2**25
+"""Cells of the largest table that is read."""
 MOST_TENSORS = 16 * 2**30
 """Bytes of the largest file of tensors that is read."""
-_DRAFT = re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL)
+_END_BYTES = 2**16
+_OUR_NAMES = {
+    "draft": re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL),
+    "window": re.compile(r"window-\d{9,12}\.safetensors", re.ASCII),
+    "checkpoint": re.compile(r"frames-\d{12}", re.ASCII),
+    "checkpoint draft": re.compile(r"\.frames-\d{12}\.\d+", re.ASCII),
+}
 
 
 class CheckpointError(RuntimeError):
@@ -26,41 +40,88 @@ class CheckpointError(RuntimeError):
         super().__init__(" ".join(message.splitlines()))  # names of files may have line breaks
 
 
-def open_regular(path: Path, most_bytes: int = MOST_TEXT) -> BinaryIO:
+def is_our_name(name: object, kind: str) -> bool:
+    """Whether a name is one that we give: to a ``draft``, a ``window``, a ``checkpoint`` or a ``checkpoint draft``.
+
+    Whatever reads, lists or removes files by names that stand in a file or a folder asks here.
+    """
+    return isinstance(name, str) and _OUR_NAMES[kind].fullmatch(name) is not None
+
+
+def is_ours(path: Path, kind: str) -> bool:
+    """Whether a path has a name that we give, and is what we make of it: a file or a folder, and no link."""
+    if not is_our_name(path.name, kind) or path.is_symlink():
+        return False
+    return path.is_dir() if kind.startswith("checkpoint") else path.is_file()
+
+
+def open_regular(path: Path, most_bytes: int | None = MOST_TEXT) -> BinaryIO:
     """Open a file for reading, if it is a regular one of a size that can be meant.
 
     What is opened is looked at, so that nothing can take its place in between; nothing is waited for.
 
     Args:
         path: the file, or a link to it.
-        most_bytes: the largest size.
+        most_bytes: the largest size; None for any.
 
     Raises:
         FileNotFoundError, PermissionError: as ``open`` raises them.
         ValueError: it is a folder, a pipe, a socket or a device, or too large.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    stream = _open(path, os.O_RDONLY, "rb")
+    size = os.fstat(stream.fileno()).st_size
+    if most_bytes is not None and size > most_bytes:
+        stream.close()
+        raise ValueError(f"{path} has {size:,} bytes, at most {most_bytes:,} are read")
+    return stream
+
+
+def open_append(path: Path) -> BinaryIO:
+    """Open a file to write at its end; it is made if there is none.
+
+    Raises:
+        OSError: as ``open`` raises it.
+        ValueError: it is a link, a folder, a pipe, a socket or a device.
+    """
     try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
+        return _open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, "ab")
+    except OSError as error:
+        if error.errno not in (errno.ENXIO, errno.ELOOP, errno.EISDIR):
+            raise
+        raise ValueError(f"{path} is not a regular file") from error
+
+
+def _open(path: Path, flags: int, mode: str) -> BinaryIO:
+    """Open a regular file; nothing is waited for."""
+    descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError(f"{path} is not a regular file")
-        if status.st_size > most_bytes:
-            raise ValueError(f"{path} has {status.st_size:,} bytes, at most {most_bytes:,} are read")
-        return os.fdopen(descriptor, "rb")
+        stream: Any = os.fdopen(descriptor, mode)
     except BaseException:
         os.close(descriptor)
         raise
+    return stream  # type: ignore[no-any-return]
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_TEXT) -> bytes:
     """What a regular file holds; raises as :func:`open_regular`."""
     with open_regular(path, most_bytes) as stream:
-        return stream.read(most_bytes)
+        size = os.fstat(stream.fileno()).st_size
+        return stream.read(size)  # not most_bytes, which would be reserved
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most_bytes: int = MOST_TEXT) -> str:
     """What a regular file of text in UTF-8 holds, without a byte order mark; a ``ValueError`` if it is no such file."""
-    return read_bytes(path).decode("utf-8-sig")
+    return read_bytes(path, most_bytes).decode("utf-8-sig")
+
+
+def read_end(path: Path) -> str:
+    """The last 64 KiB of a regular file of any size, as text; raises as :func:`open_regular`."""
+    with open_regular(path, None) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        stream.seek(max(0, size - _END_BYTES))
+        return stream.read(_END_BYTES).decode("utf-8", errors="replace")
 
 
 def write_atomic(path: Path, data: str | bytes) -> Path:
@@ -87,7 +148,7 @@ def write_atomic(path: Path, data: str | bytes) -> Path:
 def remove_drafts(folder: Path) -> None:
     """Remove what :func:`write_atomic` of a killed process left in a folder, and nothing else."""
     for path in folder.iterdir() if folder.is_dir() else ():
-        if _DRAFT.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+        if is_ours(path, "draft"):
             path.unlink(missing_ok=True)
 
 
@@ -98,8 +159,9 @@ def write_json(path: Path, value: Any) -> Path:
 
 def read_json(path: Path) -> Any:
     """Read a JSON file; a ``ValueError`` if it does not hold JSON."""
+    data = read_bytes(path, MOST_JSON)
     try:
-        return json.loads(read_text(path))
+        return json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # no text, no JSON, too many digits, nested too deeply
         raise ValueError(f"{path} does not hold JSON: {error}") from error
 
@@ -134,16 +196,20 @@ class CsvLog:
         rows = read_csv(path, strict=False) if path.exists() else []
         kept = [[row.get(name, "") for name in columns] for row in rows if int(row["frames"]) <= keep_frames]
         write_atomic(path, "".join(",".join(cells) + "\n" for cells in [columns, *kept]))
-        self._stream = path.open("a", newline="", encoding="utf-8")
+        self._stream = io.TextIOWrapper(open_append(path), encoding="utf-8", newline="")
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Add one row and hand it to the operating system at once; None is written as an empty cell."""
-        self._stream.write(",".join(_cell(row.get(name)) for name in self.columns) + "\n")
-        self._stream.flush()
+        try:
+            self._stream.write(",".join(_cell(row.get(name)) for name in self.columns) + "\n")
+            self._stream.flush()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def close(self) -> None:
-        """Close the file."""
-        self._stream.close()
+        """Close the file; what could not be written before, and was told then, is left out."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
 
 
 def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
@@ -160,6 +226,7 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
     """
     try:
         text = read_text(path)
+        _check_size(path, text)
         text = text if strict else text[: text.rfind("\n") + 1]
         header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
     except (UnicodeDecodeError, csv.Error) as error:
@@ -176,6 +243,16 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
         which = "more" if len(wrong) > len(header) else "fewer"
         raise ValueError(f"{path} has a line with {which} cells than its header names")
     return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def _check_size(path: Path, text: str) -> None:
+    """Refuse a table that would take far more memory than its file has bytes."""
+    lines = text.count("\n") + text.count("\r")
+    cells = lines + text.count(",")
+    if lines > MOST_ROWS:
+        raise ValueError(f"{path} has {lines:,} lines, at most {MOST_ROWS:,} are read")
+    if cells > MOST_CELLS:
+        raise ValueError(f"{path} has {cells:,} cells, at most {MOST_CELLS:,} are read")
 
 
 def _cell(value: Any) -> str:

@@ -34,6 +34,9 @@ LOCK = "lock"
 loses the lock at once."""
 
 
+_WRITTEN = (LOCK, "checkpoints", "replay", "tensorboard", "wandb", "wandb_id.txt")  # in place, so never behind a link
+
+
 class RunFolderError(RuntimeError):
     """A run folder cannot be used: taken, of another run, of version 0.1, or not writable."""
 
@@ -68,6 +71,9 @@ class RunFolder:
         Raises:
             RunFolderError: another process trains here, the folder holds another run, or it cannot be written.
         """
+        for name in _WRITTEN:
+            if (self.path / name).is_symlink():
+                raise RunFolderError(f"{self.path / name} is a link: a run writes and removes files there; remove it")
         with contextlib.ExitStack() as held:
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
@@ -80,9 +86,6 @@ class RunFolder:
             yield
 
     def _prepare(self, config: TrainConfig) -> None:
-        for folder in (self.checkpoints, self.replay):
-            if folder.is_symlink():
-                raise RunFolderError(f"{folder} is a link: a run removes files there, so make it a folder")
         for folder in (self.path, self.replay):
             remove_drafts(folder)
         remove_draft_checkpoints(self.checkpoints)
@@ -114,6 +117,8 @@ class RunFolder:
         """The final ``eval.json`` if the run is finished; a damaged one is made again from the last checkpoint."""
         try:
             result = read_json(self.path / "eval.json")
+        except PermissionError as error:
+            raise RunFolderError(f"{self.path / 'eval.json'} may not be read: {error.strerror}") from error
         except (OSError, ValueError):
             return None
         needed = ("status", "frames", "seconds", "returns", "lengths", "train_max_ewm")
@@ -131,7 +136,7 @@ class RunFolder:
 
 def wait_until_free(path: Path, limit_s: float) -> None:
     """Wait until no process trains in a run folder, at most so many seconds."""
-    if (path / LOCK).is_file():
+    if (path / LOCK).is_file() and not (path / LOCK).is_symlink():
         with contextlib.suppress(OSError), FileLock(path / LOCK).acquire(timeout=limit_s):  # Timeout is an OSError
             pass
 
