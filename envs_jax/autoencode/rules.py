@@ -1,6 +1,6 @@
 """The rules of AutoEncode: watch a row of cards, then name their suits from the last to the first."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -17,8 +17,8 @@ class AutoEncodeState(NamedTuple):
     given: Array  # int32, answers given
     selected: Array  # int32, suit 0..3 that the selector points at
     score: Array  # int32, right answers
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> AutoEncodeState:

@@ -63,7 +63,8 @@ class FramesOracle:
             zero = np.zeros(len(seen), np.int32)
             no = zero > 0
             numbers = [zero] * 6
-            self.belief = rules.BreakoutState(*numbers, bricks, no, zero, zero, no, no)
+            fields: Any = (*numbers, bricks, no, zero, zero, no, no)
+            self.belief = rules.BreakoutState(*fields)
         else:
             self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
         belief = self.belief

@@ -1,6 +1,6 @@
 """The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed [row, column]."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +37,8 @@ class BreakoutState(NamedTuple):
     strike: Array  # bool, whether the last step touched a brick
     score: Array  # int32, bricks paid
     time: Array  # int32, steps taken
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def velocity(direction: Array) -> tuple[Array, Array]:

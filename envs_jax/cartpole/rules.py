@@ -4,7 +4,7 @@ Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole
 (ICML 2026).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,8 +34,8 @@ class CartPoleState(NamedTuple):
     score: Array  # int32, paid steps
     time: Array  # int32, steps taken
     noise: Array  # float32 [4], added to (x, x_dot, theta, theta_dot) in the picture alone
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def is_out(state: CartPoleState) -> Array:

@@ -1,6 +1,6 @@
 """The rules of CountRecall: in every turn say how often a suit has been dealt before."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -18,8 +18,8 @@ class CountRecallState(NamedTuple):
     answer: Array  # int32, what the counter shows
     score: Array  # int32, right answers
     moves: Array  # int32, steps taken
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> CountRecallState:

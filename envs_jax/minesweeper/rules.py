@@ -1,6 +1,6 @@
 """The rules of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y]."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +23,8 @@ class MineSweeperState(NamedTuple):
     score: Array  # int32, safe cells swept
     repeats: Array  # int32, sweeps of swept cells
     timestep: Array  # int32, steps taken
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def count_neighbours(mines: Array) -> Array:

@@ -1,6 +1,6 @@
 """The rules of Signpost: read the sign, walk to the gate, press what the sign said."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ class SignpostState(NamedTuple):
     x: Array  # int32, cells walked; the gate is the last
     score: Array  # int32, 1 once the gate is open
     timestep: Array  # int32, steps taken
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array) -> SignpostState:

@@ -3,7 +3,7 @@
 Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits beyond the board
 are set, so that walls and floor are blocks like any other."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,8 +53,8 @@ class TetrisState(NamedTuple):
     just_locked: Array  # bool, the piece lies: the next step clears rows and brings the next piece
     frames_since_spawn: Array  # int32, 0..10
     terminal: Array  # bool, a new piece found no room
-    terminated: Array | None = None  # bool, whether the game has ended
-    truncated: Array | None = None  # bool, whether the time limit was reached
+    terminated: Any = None  # bool, whether the game has ended
+    truncated: Any = None  # bool, whether the time limit was reached
 
 
 def shuffled(key: Array) -> Array:
