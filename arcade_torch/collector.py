@@ -17,6 +17,7 @@ from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner
 from arcade_torch.rollout_buffer import FinalFrames, RolloutBuffer
+from arcade_torch.validation import check_flags, whole
 
 
 class ArcadeCollector(BaseCollector):
@@ -88,6 +89,11 @@ class ArcadeCollector(BaseCollector):
         post_collect_hook: Callable[[TensorDictBase], None] | None = None,
     ) -> None:
         super().__init__(post_collect_hook=post_collect_hook)
+        frames_per_batch = whole("frames_per_batch", frames_per_batch)
+        total_frames = whole("total_frames", total_frames)
+        overlap = whole("overlap", overlap)
+        seed = None if seed is None else whole("seed", seed)
+        check_flags("return_same_td compact_obs store_states", (return_same_td, compact_obs, store_states))
         _check_arguments(env, policy, frames_per_batch, overlap, final_frames)
         self.env: ArcadeEnv = env
         self.policy = policy
@@ -110,6 +116,7 @@ class ArcadeCollector(BaseCollector):
         self._frames = 0
         self._iter = -1
         self._next_traj_id = 0
+        self._gave_numbers = False  # to batches that somebody may hold
         self.reset()
         if seed is not None:
             self.set_seed(seed)
@@ -170,6 +177,8 @@ class ArcadeCollector(BaseCollector):
             batch["collector"] = TensorDict({"traj_ids": self._trajectories(buffer)}, batch_size=batch.batch_size)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
+            self._numbered = self._iter  # a window that a hook refused was not
+            self._gave_numbers = True
             yield batch
 
     @torch.no_grad()
@@ -272,7 +281,6 @@ class ArcadeCollector(BaseCollector):
         """
         if self._iter != self._numbered + 1:
             self._begin_trajectories()
-        self._numbered = self._iter
         done = buffer.done[:, self._overlap :].T  # [T, N]: numbered in order of time
         new = torch.cumsum(done.reshape(-1), 0).reshape(done.shape) - 1 + self._next_traj_id
         ids = torch.cat([self._traj_ids.unsqueeze(0), new * done]).cummax(0).values
@@ -347,7 +355,8 @@ class ArcadeCollector(BaseCollector):
         self._generator.set_state(state_dict["generator"].cpu())
         self.reset()
         self._frames, self._iter = int(state_dict["frames"]), int(state_dict["iter"])
-        if "traj_ids" in state_dict:
+        given = self._gave_numbers and self._next_traj_id > int(state_dict.get("next_traj_id", 0))
+        if "traj_ids" in state_dict and not given:  # an older state: its numbers stand in batches that came after it
             self._traj_ids = state_dict["traj_ids"].to(self.env.device)
             self._next_traj_id = int(state_dict["next_traj_id"])
         self._numbered = int(state_dict.get("numbered", self._iter))
@@ -387,9 +396,9 @@ def _check_arguments(env: Any, policy: Any, frames_per_batch: int, overlap: int,
             f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or None for random actions"
         )
     num_envs = env.num_envs
-    if isinstance(frames_per_batch, float) or frames_per_batch < num_envs or frames_per_batch % num_envs:
+    if frames_per_batch < num_envs or frames_per_batch % num_envs:
         raise ValueError(f"frames_per_batch is {frames_per_batch}, expected an int multiple of num_envs ({num_envs})")
-    if isinstance(overlap, float) or overlap < 0:
+    if overlap < 0:
         raise ValueError(f"overlap is {overlap}, expected an int of 0 or more")
     if final_frames not in get_args(FinalFrames):
         raise ValueError(f"final_frames is {final_frames!r}, allowed: {', '.join(map(repr, get_args(FinalFrames)))}")

@@ -45,6 +45,16 @@ class CompiledGame:
     Functions that draw take ``spare``, memory of the size of the frames, and draw into it; see ``FrameMemory``.
     """
 
+    recipe: tuple[Any, ...] | None = None  # arguments of ``compiled_game`` that give it; None: it was made by hand
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is the shared one itself, and another process makes it again."""
+        if self.recipe is None:
+            raise TypeError(
+                f"{self.batched.game!r} was made by hand and not by its id, so it cannot be copied or pickled"
+            )
+        return compiled_game, self.recipe
+
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
         self.step = compiled(self._step, donate_argnums=2, keep_unused=True)
@@ -76,13 +86,16 @@ class CompiledGame:
             The step without ``pixels``, which are in the canvas.
         """
         shape = canvas.memory.shape
-        if self._known.get(shape) == self._step_into._cache_size():
+        before = self._step_into._cache_size()
+        if self._known.get(shape) == before:
             leaves = canvas.draw(self._step_into, at, batch, action)
         else:
             # Python traces and compiles: in a thread of its own, for Python's signals interrupt the main thread alone.
             with ThreadPoolExecutor(1) as thread:
                 leaves = thread.submit(canvas.draw, self._step_into, at, batch, action).result()
-            self._known[shape] = self._step_into._cache_size()
+            # Known is what was found and not made: a second call may have arguments of another kind, committed ones.
+            if self._step_into._cache_size() == before:
+                self._known[shape] = before
         step: Step = jax.tree.unflatten(self._structure, leaves)
         return step
 
@@ -307,11 +320,13 @@ def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: d
     obs_size = plain(obs_size)
     options = {name: plain(options[name]) for name in sorted(options)}
     try:
-        return _compile(ids, obs_size, rules, **options)
+        compiled = _compile(ids, obs_size, rules, **options)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
-        return _compile.__wrapped__(ids, obs_size, rules, **options)
+        compiled = _compile.__wrapped__(ids, obs_size, rules, **options)
+    compiled.recipe = (ids, obs_size, rules, options)
+    return compiled
 
 
 def _checked(ids: Any) -> Sequence[str]:

@@ -1,5 +1,6 @@
 """Notices envs that play the very same episodes because nobody gave them a seed."""
 
+import logging
 import multiprocessing
 import warnings
 import weakref
@@ -23,8 +24,10 @@ def note(env: Any, plays: Hashable) -> None:
 
 def forget(env: Any) -> None:
     """It was seeded, or is known to have begun."""
-    for envs in _LIVE.values():
+    for plays, envs in list(_LIVE.items()):
         envs.discard(env)
+        if not envs:
+            del _LIVE[plays]
 
 
 def warn_of_twins(env: Any) -> None:
@@ -33,15 +36,19 @@ def warn_of_twins(env: Any) -> None:
     noted = [envs for envs in _LIVE.values() if env in envs]
     if not noted or _warned:
         return
-    if multiprocessing.parent_process() is not None:
+    in_worker = multiprocessing.parent_process() is not None
+    if in_worker:
         others = "every worker process that makes its env so"
     elif any(len(envs) > 1 for envs in noted):
         others = "another env of this process that was made so"
     else:
         return
     _warned = True
-    warnings.warn(
+    says = (
         f"this env has the default seed, 0, and plays the very same episodes as {others}: give each its own "
-        "(arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them",
-        stacklevel=2,
+        "(arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them"
     )
+    if in_worker:  # where TorchRL silences warnings
+        logging.getLogger("arcade_torch").warning(says)
+    else:
+        warnings.warn(says, stacklevel=2)

@@ -380,7 +380,7 @@ class ArcadeEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         """Give every env a new random key and forget the last action; running episodes go on until they are reset."""
         if seed is None:
-            seed = int(torch.randint(2**32, ()))
+            seed = int(torch.randint(2**32, (), device="cpu"))
         default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)

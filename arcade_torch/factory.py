@@ -82,5 +82,5 @@ def make(
         debug=debug,
     )
     if isinstance(seed, default_seeds.DefaultSeed):
-        default_seeds.note(env, (compiled, num_envs))
+        default_seeds.note(env, (repr(env.game), num_envs, flags.tobytes()))
     return env

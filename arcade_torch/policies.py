@@ -52,8 +52,9 @@ class PolicyRunner:
             for key, spec in primer.primers.items(True, True):
                 default = primer.default_value.get(key, 0.0) if hasattr(primer.default_value, "get") else 0.0
                 shape = spec.shape[len(primer.primers.shape) :]
+                value = default() if callable(default) else default
                 zeros = torch.zeros((*self._size, *shape), dtype=spec.dtype, device=self._device)
-                state[key] = (zeros + (default() if callable(default) else default)).to(spec.dtype)
+                state[key] = zeros + torch.as_tensor(value, dtype=spec.dtype, device=self._device)
         written = [unravel_key(key) for key in getattr(self._policy, "out_keys", [])]
         for key in getattr(self._policy, "in_keys", []):
             if unravel_key(("next", key)) in written and key not in state.keys(True, True):

@@ -128,7 +128,13 @@ class RolloutBuffer:
     def place(self, step: int) -> Place | None:
         """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends before it."""
         canvas, config = self._new_pixels.canvas, cast(Any, jax.config)
-        if canvas is None or step == self.length or config.jax_disable_jit or config.jax_debug_nans:
+        if (
+            canvas is None
+            or step == self.length
+            or config.jax_disable_jit
+            or config.jax_debug_nans
+            or config.jax_debug_infs
+        ):
             return None
         if not draws_in_place():
             return None

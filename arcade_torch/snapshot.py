@@ -89,7 +89,7 @@ class Snapshots:
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
             name = ".".join(key)
             is_older = key[-1] in _ENDS and td.get(key, None) is None
-            tensor = torch.zeros(shape, dtype=torch.bool) if is_older else _entry(td, key)
+            tensor = torch.zeros(shape, dtype=torch.bool, device="cpu") if is_older else _entry(td, key)
             same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
             if tensor.dtype not in same_bits or tensor.shape != shape:
                 found = str(tensor.dtype).removeprefix("torch.")

@@ -5,18 +5,25 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 
-from arcade_torch.envs_jax.validation import format_value
+from arcade_torch.envs_jax.validation import format_value, plain
 
 
 def check_flags(names: str, values: Sequence[Any]) -> None:
     """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also be None."""
     for name, value in zip(names.split(), values, strict=True):
-        if not isinstance(value, bool | np.bool_) and not (value is None and name == "task_in_td"):
+        if not isinstance(plain(value), bool) and not (value is None and name == "task_in_td"):
             raise TypeError(f"{name} is {format_value(value)}, allowed: True, False")
+
+
+def whole(name: str, value: Any) -> int:
+    """A whole number as an int of Python; raises TypeError for anything else."""
+    value = plain(value)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name} is {format_value(value)}, expected an int")
+    return value
 
 
 def check_tensordict(td: Any, num_envs: int) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import Array, Game, keeps_ends, stay
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
-from arcade_torch.envs_jax.validation import format_value
+from arcade_torch.envs_jax.validation import format_value, plain
 
 State = TypeVar("State")
 
@@ -63,7 +63,8 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         >>> bool((env_keys(3, 8)[5:] == env_keys(3, 3, first=5)).all())
         True
     """
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool):
+    seed = plain(seed)
+    if not isinstance(seed, int) or isinstance(seed, bool):
         raise TypeError(f"seed is {format_value(seed)}, expected a whole number from 0 to 4294967295")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")

@@ -3,8 +3,6 @@
 import os
 from typing import Any
 
-import numpy as np
-
 _LONGEST = 200
 
 
@@ -21,14 +19,15 @@ def format_value(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A number or a bool of numpy as one of Python; anything else as it is.
+    """A number or a bool of numpy, torch or JAX as one of Python; anything else as it is.
 
     Example:
         >>> import numpy as np
         >>> plain(np.int64(128)), plain(np.True_), plain("text")
         (128, True, 'text')
     """
-    return value.item() if isinstance(value, np.integer | np.floating | np.bool_) else value
+    is_number = getattr(value, "ndim", None) == 0 and hasattr(value, "item")
+    return value.item() if is_number else value
 
 
 def check_penalty(what: str, value: Any) -> None:
@@ -61,13 +60,14 @@ MOST_ENVS = 2**20
 
 def check_num_envs(num_envs: Any) -> int:
     """The number of envs as an int; raises unless it is a whole number from 1 to ``MOST_ENVS``."""
-    if isinstance(num_envs, bool | np.bool_) or not isinstance(num_envs, int | np.integer):
+    num_envs = plain(num_envs)
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int):
         raise TypeError(f"num_envs is {format_value(num_envs)}, expected an int of 1 or more")
     if num_envs < 1:
         raise ValueError(f"num_envs is {num_envs}, expected 1 or more")
     if num_envs > MOST_ENVS:
         raise ValueError(f"num_envs is above {MOST_ENVS}, the most that a batch may hold")
-    return int(num_envs)
+    return num_envs
 
 
 def check_fits(num_envs: int, obs_size: int) -> None:

@@ -75,13 +75,14 @@ class NumpyBatch:
         self._finals = FinalObservations(compiled, self.num_envs, 1, device)
         self._memory = FrameMemory((self.num_envs, self.game.obs_size, self.game.obs_size, 3), device)
 
-    def saved(self) -> Batch:
-        """Everything that determines what comes, as numpy arrays of the caller's own; see ``load``."""
-        saved: Batch = jax.tree.map(np.array, self._batch)
-        return saved
+    def __getstate__(self) -> dict[str, Any]:
+        """The game and everything that determines what comes, as numpy arrays, for ``copy`` and ``pickle``."""
+        return {"compiled": self._compiled, "batch": jax.tree.map(np.array, self._batch)}
 
-    def load(self, batch: Batch) -> None:
-        """Go on from what ``saved`` gave."""
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on from there; memory for frames is new."""
+        batch: Batch = state["batch"]
+        NumpyBatch.__init__(self, state["compiled"], np.asarray(batch.partial))
         self._batch = jax.tree.map(jnp.array, batch)
 
     @property
@@ -126,7 +127,9 @@ class NumpyBatch:
 
     def step(self, action: npt.NDArray[np.int32]) -> Stepped:
         """Take one action in every env, int32 [N] in 0..4; nothing is drawn."""
-        self._batch, outcome = self._batched.step(self._batch, action)
+        stepped, outcome = self._batched.step(self._batch, action)
+        outcome.done.block_until_ready()
+        self._batch = stepped
         return self._stepped(outcome)
 
     def reset_or_step(self, action: npt.NDArray[np.int32], ended: Bools) -> Stepped:
@@ -134,7 +137,9 @@ class NumpyBatch:
 
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
-        self._batch, outcome = self._compiled.reset_or_step(self._batch, action, ended)
+        stepped, outcome = self._compiled.reset_or_step(self._batch, action, ended)
+        outcome.done.block_until_ready()
+        self._batch = stepped
         return self._stepped(outcome)
 
     def _stepped(self, outcome: Outcome) -> Stepped:
@@ -151,9 +156,9 @@ class NumpyBatch:
             ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
         """
         step = self._compiled.step(self._batch, action, self._memory.spare())
-        self._batch = step.root
         frames = np.array(self._memory.show(step.pixels), copy=copy or None)
         numbers = np.asarray(step.numbers)
+        self._batch = step.root  # now that the step has been computed: one that fails leaves the state as it was
         reward, episode_reward, step_count, terminated, truncated = numbers.T
         info = {
             "episode_reward": episode_reward.view(np.float32).astype(np.float64),

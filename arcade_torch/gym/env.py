@@ -68,8 +68,6 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
 
-    _STATE = ("_frame", "_running")
-
     def __init__(
         self,
         game: str,
@@ -84,7 +82,6 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}, allowed: None, 'human', 'rgb_array'")
         flags = partial_flags(observability, 1, partial_obs)
-        self._made_with(game=game, obs_size=obs_size, rules=rules, render_mode=render_mode, **options)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.action_space = action_space(self._batch.game.num_actions)
         self.observation_space = observation_space(obs_size)

@@ -46,6 +46,7 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         copy: Whether observations are the caller's own. False hands out what JAX wrote, read only: no copy, and each
             step still has its own memory.
         render_mode: ``"rgb_array"``: ``render()`` returns the N frames.
+        max_episode_steps: The game's own limit, as ``spec`` has it, or None; no other.
         **options: Options of the game.
 
     Raises:
@@ -61,8 +62,6 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         (3, 128, 128, 3)
     """
 
-    _STATE = ("_started", "_ended")
-
     def __init__(
         self,
         game: str,
@@ -75,6 +74,7 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
         num_envs = check_num_envs(num_envs)
@@ -86,18 +86,13 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         self.autoreset_mode, self._copy = AutoresetMode(mode), copy
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self.autoreset_mode}
         flags = partial_flags(observability, num_envs, partial_obs)
-        self._made_with(
-            game=game,
-            num_envs=num_envs,
-            obs_size=obs_size,
-            rules=rules,
-            autoreset_mode=mode,
-            copy=copy,
-            render_mode=render_mode,
-            **options,
-        )
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         check_fits(num_envs, obs_size)
+        if max_episode_steps not in (None, self.time_limit):
+            raise ValueError(
+                f"max_episode_steps is {max_episode_steps!r}, but {self._batch.game.id} ends after {self.time_limit} "
+                "steps, and a vector environment has no other limit: leave it out"
+            )
         self.single_action_space = action_space(self._batch.game.num_actions)
         self.single_observation_space = observation_space(obs_size)
         self.action_space = batch_space(self.single_action_space, num_envs)

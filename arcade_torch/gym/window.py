@@ -26,6 +26,10 @@ class Window:
         self._screen: Any = None
         self._clock: Any = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is a window that has not been opened."""
+        return Window, (self._scale,)
+
     def show(self, frame: npt.NDArray[np.uint8], title: str) -> None:
         """Show a frame, uint8 [H, W, 3], under a title."""
         pygame = self.pygame

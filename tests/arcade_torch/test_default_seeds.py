@@ -73,11 +73,26 @@ def test_honest_uses_hear_nothing() -> None:
     assert not warnings_of(play)
 
 
-def test_a_worker_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_process_is_told(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(default_seeds.multiprocessing, "parent_process", lambda: object())
-    said = warnings_of(lambda: make().reset())
-    assert len(said) == 1 and "every worker process" in said[0]
-    assert not warnings_of(lambda: make(seed=0).reset())
+    make(seed=0).reset()
+    assert not caplog.messages
+    make().reset(), make().reset()
+    assert len(caplog.messages) == 1 and "every worker process" in caplog.messages[0]
+
+
+def test_twins_of_one_game_are_no_twins_of_each_other() -> None:
+    mdp, pomdp = make(observability="full"), make(observability="partial")
+    assert not warnings_of(lambda: (mdp.reset(), pomdp.reset()))
+
+
+@pytest.mark.slow
+def test_real_worker_processes_say_so(capfd: pytest.CaptureFixture[str]) -> None:
+    """TorchRL ignores warnings in its workers: it has to be said otherwise."""
+    env = ParallelEnv(2, make, mp_start_method="spawn")
+    env.reset()
+    env.close()
+    assert SAID in capfd.readouterr().err
 
 
 @pytest.mark.slow

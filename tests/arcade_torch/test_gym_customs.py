@@ -8,11 +8,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.wrappers import TimeAwareObservation
 
 import arcade_torch
 from arcade_torch import ArcadeCollector
 from arcade_torch.envs_jax import make as make_game
+from arcade_torch.gym.env import ArcadeGymEnv
 
 ID = "arcade_torch/MineSweeperEasy-v0"
 WAYS: dict[str, Callable[[Any], Any]] = {
@@ -92,8 +94,30 @@ def test_a_shorter_limit_is_kept() -> None:
     env = gymnasium.make("arcade_torch/AutoEncodeEasy-v0", max_episode_steps=5)
     env.reset(seed=0)
     assert [env.step(0)[3] for _ in range(5)] == [False] * 4 + [True]
-    with pytest.raises(TypeError, match="has no option 'max_episode_steps'"):
+    with pytest.raises(ValueError, match="max_episode_steps is 5, but AutoEncodeEasy-v0 ends after"):
         gymnasium.make_vec("arcade_torch/AutoEncodeEasy-v0", num_envs=2, max_episode_steps=5)
+    envs = gymnasium.make_vec("arcade_torch/AutoEncodeEasy-v0", num_envs=2)
+    assert gymnasium.make_vec(envs.spec, num_envs=2).spec.max_episode_steps == envs.spec.max_episode_steps
+
+
+class Mine(ArcadeGymEnv):
+    """Somebody's subclass with a constructor of its own."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__("MineSweeperEasy")
+        self.word = word
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_copy_of_a_subclass_keeps_what_its_user_put_there(way: str) -> None:
+    env = Mine("mine")
+    env.reset(seed=0)
+    env.action_space.seed(3)
+    env.note = [1]
+    twin = WAYS[way](env)
+    assert (twin.word, twin.note) == ("mine", [1]) and twin.note is not env.note
+    assert [twin.action_space.sample() for _ in range(9)] == [env.action_space.sample() for _ in range(9)]
+    np.testing.assert_equal(twin.step(4), env.step(4))
 
 
 def test_a_second_window_is_refused_and_the_first_stays(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,5 +155,26 @@ def test_numbers_and_bools_of_numpy_are_taken(make: Callable[[], Any]) -> None:
 
 def test_a_collector_takes_numbers_of_numpy() -> None:
     env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=1)
-    collector = ArcadeCollector(env, None, np.int64(8), np.int64(16), overlap=np.int32(1))
+    options = {"overlap": np.int32(1), "seed": np.int64(3), "return_same_td": np.True_}
+    collector = ArcadeCollector(env, None, np.int64(8), np.int64(16), **options)
     assert collector.collect()["action"].shape == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"frames_per_batch": "8"}, "frames_per_batch is '8', expected an int"),
+        ({"frames_per_batch": 8, "total_frames": "x"}, "total_frames is 'x', expected an int"),
+        ({"frames_per_batch": 8, "overlap": True}, "overlap is True, expected an int"),
+        ({"frames_per_batch": 8, "return_same_td": "no"}, "return_same_td is 'no', allowed: True, False"),
+        ({"frames_per_batch": 8, "seed": "a"}, "seed is 'a', expected an int"),
+    ],
+)
+def test_a_collector_refuses_other_things_in_one_line(options: dict[str, Any], says: str) -> None:
+    with pytest.raises(TypeError, match=says):
+        ArcadeCollector(arcade_torch.make("CartPoleEasy", num_envs=2, seed=1), None, **options)
+
+
+def test_numbers_without_axes_are_numbers() -> None:
+    env = arcade_torch.make("CartPoleEasy", num_envs=torch.tensor(2), seed=np.array(3), obs_size=np.array(128))
+    assert env.num_envs == 2

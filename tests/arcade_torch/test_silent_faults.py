@@ -52,6 +52,26 @@ def test_an_episode_number_is_given_once(between: str) -> None:
             one.collect()
 
 
+def test_an_older_state_and_a_hook_that_raises_give_new_numbers() -> None:
+    one = collector()
+    windows = one.iterator()
+    next(windows)
+    saved = one.state_dict()
+    seen = ids(next(windows)) | ids(next(windows))
+    one.load_state_dict(saved)
+    again = ids(next(one.iterator()))
+    assert not seen & again
+
+    def refuse(batch: TensorDict) -> None:
+        raise RuntimeError("told to")
+
+    one.post_collect_hook = refuse
+    with pytest.raises(RuntimeError, match="told to"):
+        next(one.iterator())
+    one.post_collect_hook = None
+    assert not ids(next(one.iterator())) & (seen | again)
+
+
 def test_numbers_go_on_where_nothing_came_between() -> None:
     one = collector()
     windows = one.iterator()
