@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import Array, Game, keeps_ends, stay
+from arcade_torch.envs_jax.game import UNSET, Array, Game, keeps_ends, stay
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value
 
@@ -30,8 +30,8 @@ class Batch(NamedTuple):
     last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
     step_count: Array  # int32 [N], steps since the episode began
     episode_reward: Array  # float32 [N], undiscounted return so far
-    terminated: Array | None = None  # bool [N], whether the game has ended; None: nowhere
-    truncated: Array | None = None  # bool [N], whether the time limit was reached; None: nowhere
+    terminated: Array = UNSET  # bool [N], whether the game has ended; None: nowhere
+    truncated: Array = UNSET  # bool [N], whether the time limit was reached; None: nowhere
 
 
 class Outcome(NamedTuple):
@@ -85,9 +85,13 @@ class Steps(abc.ABC):
     """What a batch of one game and a batch of several do alike, put together from stepping, resetting and drawing."""
 
     def __init__(self) -> None:
-        self.init, self.step, self.render = map(compiled, (self._init, self._step, self._render))
-        self.reset_where, self.reset_render = map(compiled, (self._reset_where, self._reset_render))
-        self.step_auto, self.step_render = map(compiled, (self._step_auto, self._step_render))
+        self.init = compiled(self._init)
+        self.step = compiled(self._step)
+        self.render = compiled(self._render)
+        self.reset_where = compiled(self._reset_where)
+        self.reset_render = compiled(self._reset_render)
+        self.step_auto = compiled(self._step_auto)
+        self.step_render = compiled(self._step_render)
 
     @abc.abstractmethod
     def _init(self, keys: Array, partial: Array) -> Batch:

@@ -75,7 +75,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 
     @functools.wraps(function)
     def body(*args: Any, **kwargs: Any) -> Any:
-        if jax.config.jax_disable_jit:  # then JAX calls this itself instead of compiling it
+        is_off = jax.config.jax_disable_jit  # type: ignore[attr-defined]
+        if is_off:  # then JAX calls this itself instead of compiling it
             with jax.disable_jit(False):
                 return jitted(*args, **kwargs)
         return function(*args, **kwargs)
@@ -104,7 +105,7 @@ def raw_key(key: Any, ndim: int = 1) -> jax.Array:
     """
     if not hasattr(key, "dtype"):
         raise TypeError(f"the random key is {format_value(key)}, {_WANTED}")
-    if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         kind = str(jax.random.key_impl(key))
         if kind != KEY_KIND:
             raise ValueError(f"the random key is of the kind {kind!r}, {_WANTED}")

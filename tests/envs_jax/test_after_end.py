@@ -85,9 +85,7 @@ def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     rows = batched.rows(ENVS)[0]
     part = lambda leaf: leaf[:, rows]  # noqa: E731
     counts = (batches.step_count, batches.episode_reward, batches.key, frames)
-    assert_stays(
-        (state, *map(part, counts)), part(outcome.reward), part(outcome.terminated), part(outcome.truncated)
-    )
+    assert_stays((state, *map(part, counts)), part(outcome.reward), part(outcome.terminated), part(outcome.truncated))
     assert np.array_equal(batches.terminated, outcome.terminated)
     assert np.array_equal(batches.truncated, outcome.truncated)
     assert kept.terminated.shape == (ENVS,)
