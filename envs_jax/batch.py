@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import Array, Game, keeps_ends, stay
+from arcade_torch.envs_jax.game import UNSET, Array, Game, keeps_ends, stay
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
@@ -30,8 +30,8 @@ class Batch(NamedTuple):
     last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
     step_count: Array  # int32 [N], steps since the episode began
     episode_reward: Array  # float32 [N], undiscounted return so far
-    terminated: Any = None  # bool [N], whether the game has ended; None: nowhere
-    truncated: Any = None  # bool [N], whether the time limit was reached; None: nowhere
+    terminated: Array = UNSET  # bool [N], whether the game has ended; None: nowhere
+    truncated: Array = UNSET  # bool [N], whether the time limit was reached; None: nowhere
 
 
 class Outcome(NamedTuple):

@@ -18,6 +18,7 @@ Drawn = TypeVar("Drawn", contravariant=True)
 NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
+UNSET: Any = None  # the flags of an end in a state that no wrapped method of ``Game`` has given yet
 
 
 def keeps_ends(state: Any) -> bool:
@@ -101,7 +102,7 @@ class Game(abc.ABC, Generic[State]):
 
     Whatever class is derived from this one, its three methods are wrapped, so that they give the same bits under all
     settings of JAX (:mod:`arcade_torch.envs_jax.settings`), take keys of both styles, and give states whose leaves
-    share no memory. Where the state is a named tuple with fields ``terminated`` and ``truncated``, both None by
+    share no memory. Where the state is a named tuple with fields ``terminated`` and ``truncated``, ``UNSET`` by
     default, the wrapper sets them, and a step after an end changes nothing: state, frame and both flags stay, the
     reward is 0. For states without such fields ``BatchedGame`` does the same.
 

@@ -75,8 +75,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 
     @functools.wraps(function)
     def body(*args: Any, **kwargs: Any) -> Any:
-        config: Any = jax.config
-        if config.jax_disable_jit:  # then JAX calls this itself instead of compiling it
+        is_off = jax.config.jax_disable_jit  # type: ignore[attr-defined]
+        if is_off:  # then JAX calls this itself instead of compiling it
             with jax.disable_jit(False):
                 return jitted(*args, **kwargs)
         return function(*args, **kwargs)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.autoencode.params import SUITS, Params
 from arcade_torch.envs_jax.cards import deal
-from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, Array, Rules
+from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UNSET, Array, Rules
 
 
 class AutoEncodeState(NamedTuple):
@@ -17,8 +17,8 @@ class AutoEncodeState(NamedTuple):
     given: Array  # int32, answers given
     selected: Array  # int32, suit 0..3 that the selector points at
     score: Array  # int32, right answers
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> AutoEncodeState:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, SHIPS, Params
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
-from arcade_torch.envs_jax.game import FIRE, Array, Rules
+from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 
 
 class BattleShipState(NamedTuple):
@@ -22,8 +22,8 @@ class BattleShipState(NamedTuple):
     hits: Array  # int32, ship cells hit; the number on the screen
     repeats: Array  # int32, shots at cells shot at before
     timestep: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def free_places(occupied: Array, length: int) -> Array:

@@ -62,9 +62,8 @@ class FramesOracle:
         if self.belief is None or len(self.action) != len(seen):
             zero = np.zeros(len(seen), np.int32)
             no = zero > 0
-            numbers = [zero] * 6
-            fields: Any = (*numbers, bricks, no, zero, zero, no, no)
-            self.belief = rules.BreakoutState(*fields)
+            entries = [zero] * 6 + [bricks, no, zero, zero, no, no]
+            self.belief = rules.BreakoutState._make(entries)
         else:
             self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
         belief = self.belief

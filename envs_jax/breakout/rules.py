@@ -17,7 +17,7 @@ from arcade_torch.envs_jax.breakout.params import (
     WALL_TOP,
     Params,
 )
-from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
+from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
 
 UP_LEFT, UP_RIGHT, DOWN_RIGHT, DOWN_LEFT = range(4)
 # A direction is turned round by changing these bits of it.
@@ -37,8 +37,8 @@ class BreakoutState(NamedTuple):
     strike: Array  # bool, whether the last step touched a brick
     score: Array  # int32, bricks paid
     time: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def velocity(direction: Array) -> tuple[Array, Array]:

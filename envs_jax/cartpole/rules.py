@@ -21,7 +21,7 @@ from arcade_torch.envs_jax.cartpole.params import (
     X_LIMIT,
     Params,
 )
-from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
+from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
 
 
 class CartPoleState(NamedTuple):
@@ -34,8 +34,8 @@ class CartPoleState(NamedTuple):
     score: Array  # int32, paid steps
     time: Array  # int32, steps taken
     noise: Array  # float32 [4], added to (x, x_dot, theta, theta_dot) in the picture alone
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def is_out(state: CartPoleState) -> Array:

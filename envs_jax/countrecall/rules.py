@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cards import deal
 from arcade_torch.envs_jax.countrecall.params import Params
-from arcade_torch.envs_jax.game import DOWN, FIRE, UP, Array, Rules
+from arcade_torch.envs_jax.game import DOWN, FIRE, UNSET, UP, Array, Rules
 
 
 class CountRecallState(NamedTuple):
@@ -18,8 +18,8 @@ class CountRecallState(NamedTuple):
     answer: Array  # int32, what the counter shows
     score: Array  # int32, right answers
     moves: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> CountRecallState:

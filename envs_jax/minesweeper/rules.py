@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cards import random_ranks
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
-from arcade_torch.envs_jax.game import FIRE, Array, Rules
+from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 from arcade_torch.envs_jax.minesweeper.params import Params
 
 COVERED_SAFE, COVERED_MINE, SWEPT = 0, 1, 2
@@ -23,8 +23,8 @@ class MineSweeperState(NamedTuple):
     score: Array  # int32, safe cells swept
     repeats: Array  # int32, sweeps of swept cells
     timestep: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def count_neighbours(mines: Array) -> Array:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
-from arcade_torch.envs_jax.game import FIRE, Array, Rules
+from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 from arcade_torch.envs_jax.navigator.params import DEATH_REWARD, TNTS, TREASURE_REWARD, Params
 
 FREE, TNT, TREASURE = 0, 1, 2
@@ -19,8 +19,8 @@ class NavigatorState(NamedTuple):
     y: Array  # int32, row of the agent
     board: Array  # int8 [side, side], FREE, TNT or TREASURE
     timestep: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def draw_distinct(key: Array, count: int, cells: int) -> Array:

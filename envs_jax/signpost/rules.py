@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.game import RIGHT, Array
+from arcade_torch.envs_jax.game import RIGHT, UNSET, Array
 from arcade_torch.envs_jax.signpost.params import Params
 
 SIGNS = 4  # up, down, left, right, numbered like the actions
@@ -18,8 +18,8 @@ class SignpostState(NamedTuple):
     x: Array  # int32, cells walked; the gate is the last
     score: Array  # int32, 1 once the gate is open
     timestep: Array  # int32, steps taken
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def reset(key: Array) -> SignpostState:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.game import LEFT, RIGHT, Array, Rules
+from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
 from arcade_torch.envs_jax.skittles.params import CELLS, COLOURS, MAX_STEPS, Params
 
 NO_BLOCK = -1
@@ -20,8 +20,8 @@ class SkittlesState(NamedTuple):
     safe: Array  # bool [width], columns of the lane a survivor can be in when the newest row arrives at the bottom
     flicker_key: Array  # uint32 [2], with the time it decides which cells the POMDP hides
     time: Array  # int32, steps taken, which is the score
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params, rules: Rules) -> SkittlesState:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from arcade_torch.envs_jax.cards import random_ranks
-from arcade_torch.envs_jax.game import DOWN, LEFT, RIGHT, UP, Array, Rules
+from arcade_torch.envs_jax.game import DOWN, LEFT, RIGHT, UNSET, UP, Array, Rules
 from arcade_torch.envs_jax.tetris.params import (
     BOX,
     COLUMNS,
@@ -53,8 +53,8 @@ class TetrisState(NamedTuple):
     just_locked: Array  # bool, the piece lies: the next step clears rows and brings the next piece
     frames_since_spawn: Array  # int32, 0..10
     terminal: Array  # bool, a new piece found no room
-    terminated: Any = None  # bool, whether the game has ended
-    truncated: Any = None  # bool, whether the time limit was reached
+    terminated: Array = UNSET  # bool, whether the game has ended
+    truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
 def shuffled(key: Array) -> Array:

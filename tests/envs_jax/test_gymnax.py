@@ -104,3 +104,19 @@ def test_bad_arguments_are_refused_in_one_line():
         gymnax.make("CartPoleEasy", "half")
     with pytest.raises(TypeError, match="has no option 'arow'"):
         gymnax.make("CartPoleEasy", arow="log")
+
+
+def test_params_are_replaced_as_gymnax_does_and_refuse_what_would_do_nothing():
+    env, params = gymnax.make("MineSweeperEasy")
+    _, state = env.reset(KEY, params)
+    hidden = params.replace(partial=True)
+    assert hidden.partial is True and params.partial is False
+    assert np.array_equal(env.get_obs(state, hidden), env.game.render(state, True))
+    assert params.replace(max_steps_in_episode=32) == params == params.replace()
+    both = jax.vmap(lambda partial: env.get_obs(state, params.replace(partial=partial)))(jnp.array([False, True]))
+    assert np.array_equal(both[1], env.game.render(state, True))
+    with pytest.raises(TypeError, match="params have no 'max_steps', allowed: partial, max_steps_in_episode"):
+        params.replace(max_steps=3)
+    with pytest.raises(ValueError, match="max_steps_in_episode is 10, allowed: 32") as refused:
+        params.replace(max_steps_in_episode=10)
+    assert "\n" not in str(refused.value)
