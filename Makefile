@@ -13,15 +13,23 @@ PAGE    ?= $(if $(filter cuda,$(DEVICE)),results,$(OUT))/gpu.md
 
 VENV := .venv
 OLDEST := .venv-oldest
+NEWEST := .venv-newest
 OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
   models/test_memory_models.py agents/runs/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
+NEWEST_TESTS := $(addprefix tests/,contracts agents/test_identities.py agents/test_torchrl_batches.py \
+  agents/test_runs_of_all_algorithms.py models/test_memory_module.py arcade_torch/test_env.py arcade_torch/test_collector.py \
+  arcade_torch/test_torchrl_pipelines.py arcade_torch/test_torchrl_gym.py arcade_torch/test_torchrl_releases.py \
+  arcade_torch/test_replay_equals_rollout.py)
+# The build of torch for a CPU; any other is several GB. torchrl: the newest release, or torchrl-nightly.
+NEWEST_TORCH ?= torch==2.13.0
+NEWEST_TORCHRL ?= torchrl-nightly
 RUN  := $(VENV)/bin/python
 GPU_PYTHON := $(if $(wildcard $(RUN)),$(RUN),$(PYTHON))
 PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow test-oldest test-triton lint bench gpu parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-oldest test-newest test-triton lint bench gpu parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -30,6 +38,8 @@ help:
 	@echo "make test       the tests (make test-slow: the long ones)"
 	@echo "                (make test-triton: the Triton kernels on the CPU; installs triton, 1 GB, into $(VENV))"
 	@echo "make test-oldest  a part of the tests with the oldest supported versions, in $(OLDEST)"
+	@echo "make test-newest  the contracts, the bridge, the losses and a run with the newest versions there are, in $(NEWEST)"
+	@echo "                (NEWEST_TORCHRL=torchrl: its newest release in the place of its nightly build)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
@@ -84,6 +94,20 @@ $(OLDEST)/.installed: setup.cfg pyproject.toml constraints-oldest.txt
 test-oldest: $(OLDEST)/.installed
 	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(OLDEST)/jax-cache $(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(ARGS)
 
+# TorchRL without its dependencies: its nightly build asks for that of tensordict and would bring another torch.
+$(NEWEST)/.installed: setup.cfg pyproject.toml
+	@$(NEWEST)/bin/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(NEWEST)
+	$(NEWEST)/bin/python -m pip install --quiet --upgrade $(NEWEST_TORCH) setuptools wheel
+	$(NEWEST)/bin/python -m pip install --quiet --upgrade --no-deps $(NEWEST_TORCHRL)
+	$(NEWEST)/bin/python -m pip install --quiet --upgrade $(NEWEST_TORCH) tensordict hoptorch lazy-importer cloudpickle packaging \
+	  jax gymnasium stable-baselines3 numpy safetensors filelock tyro rich matplotlib jinja2 hydra-core hypothesis pytest pytest-timeout
+	$(NEWEST)/bin/python -m pip install --quiet --no-build-isolation --no-deps -e .
+	@touch $@
+
+test-newest: $(NEWEST)/.installed
+	@$(NEWEST)/bin/python -m pip list 2> /dev/null | grep -iE '^(torch|torchrl|tensordict|jax|jaxlib|gymnasium|numpy|stable)'
+	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(NEWEST)/jax-cache $(NEWEST)/bin/python -m pytest $(NEWEST_TESTS) $(ARGS)
+
 lint: install
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check --quiet .
@@ -111,4 +135,4 @@ clean:
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(OLDEST)
+	rm -rf $(VENV) $(OLDEST) $(NEWEST)

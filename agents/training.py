@@ -2,7 +2,6 @@
 
 import dataclasses
 import errno
-import math
 import os
 import signal
 import threading
@@ -19,6 +18,7 @@ from tensordict.nn import CudaGraphModule
 from torchrl.modules import EGreedyModule
 
 import arcade_torch
+from arcade_torch.agents.averaging import check_return_range, move_mean, share_reached
 from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
@@ -139,9 +139,8 @@ class Trainer:
         self.frames += numbers.frames_per_update
         self.updates += 1
         if self.acting is not self.network:
-            window = share_reached(self.stats.smooth, self.return_range) ** 4 * numbers.average_share * self.updates
-            for mean, new in zip(self.acting.parameters(), self.network.parameters(), strict=True):
-                mean.data.lerp_(new.data, 1 / (1 + window))
+            share = share_reached(self.stats.smooth, self.return_range)
+            move_mean(self.acting, self.network, share**4 * numbers.average_share * self.updates)
         took = time.perf_counter() - began
         self.seconds += took
         row = {
@@ -393,24 +392,6 @@ def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
     """How a finished run ended, from its ``eval.json``."""
     evaluation = EvalResult(np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64))
     return TrainResult(path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"])
-
-
-def share_reached(training_return: float | None, return_range: tuple[float, float]) -> float:
-    """A return as a share of what a game can pay: 0 at the lowest return (and before any), 1 at the highest."""
-    if training_return is None:
-        return 0.0
-    low, high = return_range
-    return min(1.0, max(0.0, (training_return - low) / (high - low)))
-
-
-def check_return_range(game: str, return_range: tuple[float, float]) -> None:
-    """Raise ValueError if no share of the range can be told."""
-    low, high = return_range
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(
-            f"average_share goes by how much of a game's return is reached, but {game} has return_range "
-            f"({low}, {high}): give the game two finite numbers, the lowest and the highest return, or set it to 0"
-        )
 
 
 @contextmanager

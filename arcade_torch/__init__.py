@@ -7,6 +7,11 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from arcade_torch import program
+
+if program.is_command_line():  # before the imports that take long: a signal during them is answered in one line
+    program.begin()
+
 import arcade_torch.process
 
 if find_spec("gymnasium") is not None:  # the memory models do without it

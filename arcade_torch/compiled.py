@@ -16,7 +16,8 @@ from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
 from arcade_torch.envs_jax.mixture import Batched
-from arcade_torch.envs_jax.validation import format_value
+from arcade_torch.envs_jax.settings import compiled
+from arcade_torch.envs_jax.validation import format_value, plain
 
 # Columns of ``Step.numbers``.
 REWARD, EPISODE_REWARD, STEP_COUNT, TERMINATED, TRUNCATED = range(5)
@@ -46,16 +47,16 @@ class CompiledGame:
 
     def __init__(self, game: Game[Any] | Batched) -> None:
         self.batched: Batched = game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
-        self.step = jax.jit(self._step, donate_argnums=2, keep_unused=True)
-        self._step_into: Any = jax.jit(self._flat_step_into, donate_argnums=0)
+        self.step = compiled(self._step, donate_argnums=2, keep_unused=True)
+        self._step_into = compiled(self._flat_step_into, donate_argnums=0)
         self._structure: Any = None  # of a step, whose leaves ``_step_into`` gives
         self._calls_back: bool | None = None  # not known yet
         self._known: dict[tuple[int, ...], int] = {}  # canvases by shape: compiled functions when it was last used
-        self.reset_or_step = jax.jit(self._reset_or_step)
-        self.step_only = jax.jit(self._step_only, donate_argnums=2, keep_unused=True)
-        self.draw = jax.jit(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
+        self.reset_or_step = compiled(self._reset_or_step)
+        self.step_only = compiled(self._step_only, donate_argnums=2, keep_unused=True)
+        self.draw = compiled(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
         draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
-        self.draw_rows = tuple(jax.jit(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
+        self.draw_rows = tuple(compiled(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
 
     def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack."""
@@ -303,7 +304,8 @@ def compiled_game(id: str | Sequence[str], obs_size: int, rules: str, options: d
         TypeError: An option that one of the games does not have, or ids that are neither a string nor a list.
     """
     ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))  # what a bare name means may change
-    options = dict(sorted(options.items()))
+    obs_size = plain(obs_size)
+    options = {name: plain(options[name]) for name in sorted(options)}
     try:
         return _compile(ids, obs_size, rules, **options)
     except TypeError as error:

@@ -35,6 +35,7 @@ import jax  # noqa: E402  (after share_gpu)
 
 from arcade_torch.compiled import Canvas, Reused  # noqa: E402
 from arcade_torch.envs_jax.validation import format_value  # noqa: E402
+from arcade_torch.process import missing_platform  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
 _ALIGNMENT_BYTES = {"cpu": 64, "cuda": 16}  # below it JAX copies; on a GPU its programs refuse the argument
@@ -188,8 +189,10 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
         for and JAX has the CPU alone; then every frame is copied, and a warning says so once.
 
     Raises:
-        ValueError: Unknown kind of device, no such GPU, or torch without CUDA.
+        ValueError: Unknown kind of device, no such GPU, torch without CUDA, or JAX without the device of JAX_PLATFORMS.
     """
+    if problem := missing_platform():
+        raise ValueError(problem)
     if device is None:
         on_gpu = jax.default_backend() == "gpu" and torch.cuda.is_available()
         device = "cuda" if on_gpu else "cpu"

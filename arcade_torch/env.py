@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from arcade_torch import validation
+from arcade_torch import default_seeds, validation
 from arcade_torch.compiled import (
     EPISODE_REWARD,
     REWARD,
@@ -119,6 +119,7 @@ class ArcadeEnv(EnvBase):
             observation["state"] = self._snapshots.spec()
             self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=torch_device)
         self.observation_spec = observation
+        self._begun = False
         self._set_seed(seed)
 
     @property
@@ -184,8 +185,8 @@ class ArcadeEnv(EnvBase):
         """Copy everything that determines the future: game states, random keys, observability, counts.
 
         Returns:
-            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. It does
-            not say which episodes have ended: reset those first.
+            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. Episodes
+            that have ended stay so: a step gives their flags again and the reward 0, until they are reset.
         """
         return self._snapshots.export(self._live.batch)
 
@@ -304,6 +305,9 @@ class ArcadeEnv(EnvBase):
     ) -> TensorDictBase:
         if set_state and tensordict is not None and "state" in tensordict:
             return self.set_state(tensordict["state"])
+        if not self._begun:
+            default_seeds.warn_of_twins(self)
+            self._begun = True
         # A mask that is true everywhere is no special case: other random numbers would be drawn than on the fused path.
         rows = np.ones(self.num_envs, np.bool_)
         if tensordict is not None and "_reset" in tensordict:
@@ -377,6 +381,7 @@ class ArcadeEnv(EnvBase):
         """Give every env a new random key and forget the last action; running episodes go on until they are reset."""
         if seed is None:
             seed = int(torch.randint(2**32, ()))
+        default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
         self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]), self._live.ends)

@@ -5,7 +5,9 @@ from typing import Any
 
 import torch
 
+from arcade_torch import default_seeds
 from arcade_torch.compiled import compiled_game
+from arcade_torch.default_seeds import DEFAULT_SEED
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.validation import check_num_envs
 from arcade_torch.observability import Observability, partial_flags
@@ -16,7 +18,7 @@ def make(
     num_envs: int = 16,
     observability: Observability | None = None,
     obs_size: int = 128,
-    seed: int | None = 0,
+    seed: int | None = DEFAULT_SEED,
     device: torch.device | str | None = None,
     rules: str = "default",
     *,
@@ -40,7 +42,8 @@ def make(
         num_envs: Number of envs in the batch.
         observability: ``"full"`` (MDP, the default), ``"partial"`` (POMDP twin), or bool [num_envs], true = partial.
         obs_size: Side of the frames, 128 or 256 pixels.
-        seed: Seed of the batch; None draws one.
+        seed: Seed of the batch; None draws one. Envs that share one play the same episodes: where several workers
+            each make an env, give each a seed of its own.
         device: Device of all tensors; None for the device that JAX computes on.
         rules: ``"default"`` or ``"reference"`` (those of the published numbers).
         partial_obs: Alias: True means ``observability="partial"``.
@@ -66,8 +69,9 @@ def make(
     """
     num_envs = check_num_envs(num_envs)
     flags = partial_flags(observability, num_envs, partial_obs)
-    return ArcadeEnv(
-        compiled_game(id, obs_size, rules, options),
+    compiled = compiled_game(id, obs_size, rules, options)
+    env = ArcadeEnv(
+        compiled,
         num_envs,
         flags,
         seed=seed,
@@ -77,3 +81,6 @@ def make(
         task_in_td=task_in_td,
         debug=debug,
     )
+    if isinstance(seed, default_seeds.DefaultSeed):
+        default_seeds.note(env, (compiled, num_envs))
+    return env

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.validation import format_value
+from arcade_torch.envs_jax.validation import format_value, plain
 
 Observability = Literal["full", "partial"] | npt.ArrayLike  # a tensor is array-like too
 
@@ -29,6 +29,7 @@ def partial_flags(
         ValueError: Both are given, or another word, type or shape.
         TypeError: ``partial_obs`` is no bool.
     """
+    partial_obs = plain(partial_obs)
     if partial_obs is not None:
         if observability is not None:
             raise ValueError("observability and partial_obs are given: keep observability, partial_obs is its alias")

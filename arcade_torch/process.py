@@ -1,4 +1,4 @@
-"""Refuses processes in which JAX would hang. Loads no JAX, and is loaded with the package."""
+"""Refuses processes in which JAX would hang or cannot start. Loads no JAX, and is loaded with the package."""
 
 import os
 import sys
@@ -25,3 +25,17 @@ def check_process() -> None:
             "this process was forked after JAX had started, where JAX hangs: start workers with 'spawn' (Gymnasium: "
             "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it needs no workers"
         )
+
+
+def missing_platform() -> str:
+    """Why JAX cannot start on the platform that the environment asks for; empty if it can, or nothing was asked for."""
+    names = [name for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME") if os.environ.get(name)]
+    if not names or "jax" not in sys.modules:
+        return ""
+    try:
+        sys.modules["jax"].devices()
+    except Exception as error:  # an AssertionError without a word, or a RuntimeError
+        asked = f"{names[0]} is {os.environ[names[0]]!r}"
+        why = " ".join(str(error).split())[:200]
+        return f"{asked}, but JAX has no such device here: unset it, or set it to cpu" + (f" ({why})" if why else "")
+    return ""

@@ -19,6 +19,7 @@ from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched
 from arcade_torch.validation import check_tensor
 
+_ENDS = ("terminated", "truncated")  # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
 _SIGNED = {np.dtype(np.uint32): torch.int32, np.dtype(np.uint16): torch.int16}
 
 
@@ -64,7 +65,8 @@ class Snapshots:
         Returns:
             TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own; in a mixture under the id of
             each game, and zero in the envs that play another), ``partial`` bool [N], ``last_action`` and
-            ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``game`` int64 [N].
+            ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``terminated`` and ``truncated`` bool [N],
+            ``game`` int64 [N].
         """
         game = self._games.to(self._device, copy=True)
         out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
@@ -85,7 +87,9 @@ class Snapshots:
         wait_for_torch(self._device, self._jax_device)
         arrays = []
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
-            name, tensor = ".".join(key), _entry(td, key)
+            name = ".".join(key)
+            is_older = key[-1] in _ENDS and td.get(key, None) is None
+            tensor = torch.zeros(shape, dtype=torch.bool) if is_older else _entry(td, key)
             same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
             if tensor.dtype not in same_bits or tensor.shape != shape:
                 found = str(tensor.dtype).removeprefix("torch.")

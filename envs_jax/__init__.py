@@ -21,6 +21,7 @@ from arcade_torch.envs_jax.registry import (
     registered_ids,
     resolve_id,
 )
+from arcade_torch.envs_jax.xla_flags import guard_sums
 
 if TYPE_CHECKING:
     from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, env_keys
@@ -48,6 +49,7 @@ __all__ = [
     "resolve_id",
 ]
 
+guard_sums()
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names
 

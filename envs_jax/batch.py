@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import Array, Game
+from arcade_torch.envs_jax.game import Array, Game, keeps_ends, stay
+from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value
 
 State = TypeVar("State")
@@ -29,6 +30,8 @@ class Batch(NamedTuple):
     last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
     step_count: Array  # int32 [N], steps since the episode began
     episode_reward: Array  # float32 [N], undiscounted return so far
+    terminated: Array | None = None  # bool [N], whether the game has ended; None: nowhere
+    truncated: Array | None = None  # bool [N], whether the time limit was reached; None: nowhere
 
 
 class Outcome(NamedTuple):
@@ -40,6 +43,7 @@ class Outcome(NamedTuple):
     done: Array  # bool [N], terminated or truncated
 
 
+@fixed
 def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
     """Random keys for a batch of envs.
 
@@ -64,7 +68,8 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.PRNGKey(jnp.uint32(seed)), index)
+    of_seed = jnp.array([0, seed], jnp.uint32)  # threefry's, whatever JAX is told to add to seeds
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(of_seed, index)
 
 
 def choose_rows(mask: Array, yes: Any, no: Any) -> Any:
@@ -80,9 +85,9 @@ class Steps(abc.ABC):
     """What a batch of one game and a batch of several do alike, put together from stepping, resetting and drawing."""
 
     def __init__(self) -> None:
-        self.init, self.step, self.render = jax.jit(self._init), jax.jit(self._step), jax.jit(self._render)
-        self.reset_where, self.reset_render = jax.jit(self._reset_where), jax.jit(self._reset_render)
-        self.step_auto, self.step_render = jax.jit(self._step_auto), jax.jit(self._step_render)
+        self.init, self.step, self.render = map(compiled, (self._init, self._step, self._render))
+        self.reset_where, self.reset_render = map(compiled, (self._reset_where, self._reset_render))
+        self.step_auto, self.step_render = map(compiled, (self._step_auto, self._step_render))
 
     @abc.abstractmethod
     def _init(self, keys: Array, partial: Array) -> Batch:
@@ -90,7 +95,10 @@ class Steps(abc.ABC):
 
     @abc.abstractmethod
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env; ended episodes stay at their final state."""
+        """Take one action in every env.
+
+        An episode that has ended stays as it is: state, counts and both flags, with the reward 0, and its random key.
+        """
 
     @abc.abstractmethod
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
@@ -163,26 +171,57 @@ class BatchedGame(Steps, Generic[State]):
         return batch
 
     def _init(self, keys: Array, partial: Array) -> Batch:
-        key, first = _split(keys)
-        zeros = jnp.zeros(keys.shape[0], jnp.int32)
+        key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
-        return Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
+        last_action = jnp.zeros(keys.shape[0], jnp.int32)
+        return Batch(key, state, jnp.asarray(partial), last_action, *_nothing_yet(last_action))
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
         key, now = _split(batch.key)
+        action = jnp.asarray(action, jnp.int32)
         state, reward, terminated, truncated = jax.vmap(self.game.step)(now, batch.state, action)
-        stepped = Batch(key, state, batch.partial, action, batch.step_count + 1, batch.episode_reward + reward)
+        batch = _with_flags(batch)
+        ended = batch.terminated | batch.truncated
+        if not keeps_ends(batch.state):
+            state = stay(ended, batch.state, state)
+            reward = jnp.where(ended, jnp.float32(0), reward)
+            terminated = jnp.where(ended, batch.terminated, terminated)
+            truncated = jnp.where(ended, batch.truncated, truncated)
+        stepped = Batch(
+            jnp.where(ended[:, None], batch.key, key),
+            state,
+            batch.partial,
+            action,
+            batch.step_count + ~ended,
+            batch.episode_reward + reward,
+            terminated,
+            truncated,
+        )
         return stepped, Outcome(reward, terminated, truncated, terminated | truncated)
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
         key, first = _split(batch.key)
-        zeros = jnp.zeros_like(batch.step_count)
         state = jax.vmap(self.game.reset)(first)
-        fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
-        return Batch(*choose_rows(mask, fresh, batch))
+        counts = _nothing_yet(batch.step_count)
+        fresh = Batch(key, state, batch.partial, batch.last_action, *counts)
+        return Batch(*choose_rows(mask, fresh, _with_flags(batch)))
 
     def _render(self, batch: Batch) -> Array:
         return jax.vmap(self.game.render)(batch.state, batch.partial)
+
+
+def _with_flags(batch: Batch) -> Batch:
+    """The batch with false for flags that are None."""
+    no = jnp.zeros(batch.step_count.shape, bool)
+    terminated = no if batch.terminated is None else batch.terminated
+    truncated = no if batch.truncated is None else batch.truncated
+    return batch._replace(terminated=terminated, truncated=truncated)
+
+
+def _nothing_yet(like: Array) -> tuple[Array, Array, Array, Array]:
+    """Counts and flags of N episodes that begin: ``step_count`` to ``truncated`` of a batch."""
+    zeros = jnp.zeros_like(like)
+    return zeros, zeros.astype(jnp.float32), zeros > 0, zeros > 0
 
 
 @partial(jax.vmap, out_axes=0)

@@ -1,10 +1,14 @@
 """The contract every game obeys: pure functions from state to state and from state to picture."""
 
 import abc
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
+
+from arcade_torch.envs_jax.settings import fixed, raw_key
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
@@ -16,11 +20,90 @@ ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 
 
+def keeps_ends(state: Any) -> bool:
+    """Whether a state is to say by itself that its episode has ended.
+
+    It is if it is a named tuple with fields ``terminated`` and ``truncated`` that are bools, or None before a wrapped
+    ``reset`` or ``step`` of :class:`Game` has set them.
+    """
+    if not {"terminated", "truncated"} <= set(getattr(state, "_fields", ())):
+        return False
+    flags = (state.terminated, state.truncated)
+    return all(flag is None or str(getattr(flag, "dtype", "")) == "bool" for flag in flags)
+
+
+def _with_flags(state: Any) -> Any:
+    """The state, which keeps ends, with false for flags that are None."""
+    missing = [name for name in ("terminated", "truncated") if getattr(state, name) is None]
+    return state._replace(**{name: jnp.bool_(False) for name in missing})
+
+
+def stay(ended: Array, before: Any, after: Any) -> Any:
+    """The tree ``before`` where ``ended`` (a bool, or bools [N] for leaves [N, ...]) is true, elsewhere ``after``."""
+
+    def choose(old: Any, new: Any) -> Array:
+        rest = (1,) * (jnp.ndim(new) - jnp.ndim(ended))
+        return jnp.where(jnp.reshape(ended, jnp.shape(ended) + rest), old, new)
+
+    return jax.tree.map(choose, before, after)
+
+
+def _apart(state: Any) -> Any:
+    """The state with leaves that share no memory, so that it can be donated."""
+    seen: set[int] = set()
+
+    def alone(leaf: Any) -> Array:
+        is_second = id(leaf) in seen
+        seen.add(id(leaf))
+        is_traced = isinstance(leaf, jax.core.Tracer)
+        return leaf if is_traced and not is_second else jnp.array(leaf)
+
+    return jax.tree.map(alone, state)
+
+
+def _wrap_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
+    """A game's ``reset`` under fixed settings; see :class:`Game`."""
+
+    @functools.wraps(reset)
+    def wrapped(self: Any, key: Any) -> Any:
+        state = reset(self, raw_key(key))
+        return _apart(_with_flags(state) if keeps_ends(state) else state)
+
+    return fixed(wrapped)
+
+
+def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
+    """A game's ``step`` under fixed settings, which changes nothing where the state has ended; see :class:`Game`."""
+
+    @functools.wraps(step)
+    def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
+        stepped = step(self, raw_key(key), state, jnp.asarray(action, jnp.int32))
+        if not keeps_ends(state):
+            return stepped
+        state = _with_flags(state)
+        after, reward, terminated, truncated = stepped
+        after = after._replace(terminated=jnp.asarray(terminated), truncated=jnp.asarray(truncated))
+        ended = jnp.logical_or(state.terminated, state.truncated)
+        after = stay(ended, state, after)
+        return after, jnp.where(ended, jnp.float32(0), reward), after.terminated, after.truncated
+
+    return fixed(wrapped)
+
+
+_WRAPPERS = {"reset": _wrap_reset, "step": _wrap_step, "render": fixed}
+
+
 class Game(abc.ABC, Generic[State]):
     """One game at one difficulty, picture size and rule set.
 
     The three methods are pure, can be compiled and vectorised over envs, and hold no state of their own. MDP and POMDP
     twins are the same game: only ``render`` is told which of the two the player sees.
+
+    Whatever class is derived from this one, its three methods are wrapped, so that they give the same bits under all
+    settings of JAX (:mod:`arcade_torch.envs_jax.settings`), take keys of both styles, and give states whose leaves
+    share no memory. Where the state is a named tuple with fields ``terminated`` and ``truncated``, both None by
+    default, the wrapper sets them, and a step after an end changes nothing: state, frame and both flags stay, the
+    reward is 0. For states without such fields ``BatchedGame`` does the same.
 
     Attributes:
         id: Versioned identifier, such as ``"CartPoleEasy-v0"``.
@@ -41,12 +124,19 @@ class Game(abc.ABC, Generic[State]):
     max_steps: int
     return_range: tuple[float, float]
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Wrap the methods of the contract that a class defines."""
+        super().__init_subclass__(**kwargs)
+        for name, wrap in _WRAPPERS.items():
+            if name in vars(cls):
+                setattr(cls, name, wrap(vars(cls)[name]))
+
     @abc.abstractmethod
     def reset(self, key: Array) -> State:
         """Draw the first state of an episode.
 
         Args:
-            key: uint32 [2], a JAX random key.
+            key: uint32 [2], a JAX random key, or one of ``jax.random.key``.
 
         Returns:
             The state, a named tuple of arrays.
@@ -63,7 +153,7 @@ class Game(abc.ABC, Generic[State]):
 
         Returns:
             The new state, the reward (float32 scalar), whether the game itself ended (bool scalar), and whether the
-            time limit was reached (bool scalar). Both flags may be true at once.
+            time limit was reached (bool scalar). Both flags may be true at once. After an end they stay as they were.
         """
 
     @abc.abstractmethod
@@ -78,6 +168,7 @@ class Game(abc.ABC, Generic[State]):
             uint8 [S, S, 3], rows downwards, RGB.
         """
 
+    @fixed
     def step_autoreset(
         self, key: Array, state: State, action: Array
     ) -> tuple[State, State, tuple[Array, Array, Array]]:
@@ -92,10 +183,9 @@ class Game(abc.ABC, Generic[State]):
             The state to go on with; the state that the action led to, which differs at an end alone and whose picture
             is the final observation; and reward, terminated, truncated as ``step`` gives them.
         """
-        now, fresh = jax.random.split(key)
+        now, fresh = jax.random.split(raw_key(key))
         stepped, reward, terminated, truncated = self.step(now, state, action)
-        ended = terminated | truncated
-        following = jax.tree.map(lambda new, old: jax.numpy.where(ended, new, old), self.reset(fresh), stepped)
+        following = stay(terminated | truncated, self.reset(fresh), stepped)
         return following, stepped, (reward, terminated, truncated)
 
     def __repr__(self) -> str:

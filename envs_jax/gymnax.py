@@ -15,7 +15,8 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax import registry
 from arcade_torch.envs_jax.game import Array, Game
-from arcade_torch.envs_jax.validation import check_choice
+from arcade_torch.envs_jax.settings import fixed, raw_key
+from arcade_torch.envs_jax.validation import check_choice, format_value
 
 Stepped = tuple[Array, Any, Array, Array, dict[str, Array]]
 
@@ -26,6 +27,27 @@ class EnvParams(NamedTuple):
     partial: Array | bool  # true shows the POMDP twin; vmap over it to have both twins in one batch
     max_steps_in_episode: int  # for scripts that read it: the game keeps its own time limit
 
+    def replace(self, **changes: Any) -> "EnvParams":
+        """The parameters with some of them changed.
+
+        Args:
+            **changes: ``partial``; ``max_steps_in_episode`` may be named too, but only as it is.
+
+        Raises:
+            TypeError: There is no such parameter.
+            ValueError: Another ``max_steps_in_episode``.
+        """
+        unknown = sorted(set(changes) - set(self._fields))
+        if unknown:
+            raise TypeError(f"params have no {unknown[0]!r}, allowed: {', '.join(self._fields)}")
+        limit = changes.get("max_steps_in_episode", self.max_steps_in_episode)
+        if limit is not self.max_steps_in_episode and limit != self.max_steps_in_episode:
+            raise ValueError(
+                f"max_steps_in_episode is {format_value(limit)}, allowed: {self.max_steps_in_episode}, the game's own "
+                "time limit; end episodes earlier by a wrapper"
+            )
+        return self._replace(**changes)
+
 
 class Discrete(NamedTuple):
     """The integers below ``n``."""
@@ -34,9 +56,10 @@ class Discrete(NamedTuple):
     shape: tuple[int, ...] = ()
     dtype: Any = jnp.int32
 
+    @fixed
     def sample(self, key: Array) -> Array:
         """One of them, each as likely: int32 []."""
-        return jax.random.randint(key, self.shape, 0, self.n, self.dtype)
+        return jax.random.randint(raw_key(key), self.shape, 0, self.n, self.dtype)
 
     def contains(self, x: Any) -> Array:
         """Whether ``x`` is one of them: bool []."""
@@ -51,9 +74,10 @@ class Box(NamedTuple):
     shape: tuple[int, ...]
     dtype: Any
 
+    @fixed
     def sample(self, key: Array) -> Array:
         """One of them, each as likely."""
-        return jax.random.randint(key, self.shape, self.low, self.high + 1).astype(self.dtype)
+        return jax.random.randint(raw_key(key), self.shape, self.low, self.high + 1).astype(self.dtype)
 
     def contains(self, x: Any) -> Array:
         """Whether no element of ``x`` is outside: bool []."""
@@ -88,11 +112,12 @@ class GymnaxEnv:
         """Draw a state: uint8 [S, S, 3]."""
         return self.game.render(state, (params or self.default_params).partial)
 
+    @fixed
     def reset(self, key: Array, params: EnvParams | None = None) -> tuple[Array, Any]:
         """Begin an episode.
 
         Args:
-            key: uint32 [2], a JAX random key.
+            key: uint32 [2], a JAX random key, or one of ``jax.random.key``.
             params: ``default_params`` unless given.
 
         Returns:
@@ -101,6 +126,7 @@ class GymnaxEnv:
         state = self.game.reset(key)
         return self.get_obs(state, params), state
 
+    @fixed
     def step(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
         """Take one action; where that ends the episode, go on with the first observation of a new one.
 
@@ -117,6 +143,7 @@ class GymnaxEnv:
         following, _, outcome = self.game.step_autoreset(key, state, jnp.asarray(action, jnp.int32))
         return self._stepped(following, outcome, params)
 
+    @fixed
     def step_env(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
         """``step`` without the new episode: an end shows the final observation."""
         following, *outcome = self.game.step(key, state, jnp.asarray(action, jnp.int32))

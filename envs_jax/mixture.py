@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Array, Game
+from arcade_torch.envs_jax.settings import compiled, raw_key
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class MixedGames(Steps):
         self.game = Mixture(tuple(games), shares)
         self.groups = tuple(BatchedGame(game) for game in games)
         super().__init__()
-        self.wide = jax.jit(self._wide)
-        self.narrow = jax.jit(self._narrow)
+        self.wide = compiled(self._wide)
+        self.narrow = compiled(self._narrow)
 
     def rows(self, num_envs: int) -> tuple[slice, ...]:
         """The envs of each game: contiguous, as the weights say, what is left over going to the earlier games.
@@ -132,6 +133,7 @@ class MixedGames(Steps):
         return tuple(state[game.id] for game in self.game.games)
 
     def _init(self, keys: Array, partial: Array) -> Batch:
+        keys = raw_key(keys, ndim=2)
         pairs = zip(self.groups, self.rows(len(keys)), strict=True)
         return self._join([group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs])
 

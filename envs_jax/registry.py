@@ -8,7 +8,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from arcade_torch.envs_jax.validation import check_choice, format_value
+from arcade_torch.envs_jax.validation import check_choice, format_value, plain
 
 if TYPE_CHECKING:
     from arcade_torch.envs_jax.game import Game
@@ -166,6 +166,8 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         128
     """
     full_id = resolve_id(id)
+    obs_size = plain(obs_size)
+    options = {name: plain(value) for name, value in options.items()}
     check_choice("obs_size", obs_size, OBS_SIZES)
     check_choice("rules", rules, ("default", "reference"))
     allowed = option_names(full_id)

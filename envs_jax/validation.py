@@ -20,6 +20,17 @@ def format_value(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
+def plain(value: Any) -> Any:
+    """A number or a bool of numpy as one of Python; anything else as it is.
+
+    Example:
+        >>> import numpy as np
+        >>> plain(np.int64(128)), plain(np.True_), plain("text")
+        (128, True, 'text')
+    """
+    return value.item() if isinstance(value, np.integer | np.floating | np.bool_) else value
+
+
 def check_penalty(what: str, value: Any) -> None:
     """Raise TypeError unless the option ``what`` is an int or a float, and ValueError unless it is from -1 to 0."""
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -145,12 +145,7 @@ def make_network(
     chosen = replace(chosen, **options)
     kinds = {int: "a whole number", bool: "True or False"}
     for name in fields:
-        kind = fields[name].type
-        value = getattr(chosen, name)
-        if kind is int and isinstance(value, np.integer):
-            value = int(value)
-        if kind is bool and isinstance(value, np.bool_):
-            value = bool(value)
+        value, kind = _plain(getattr(chosen, name)), fields[name].type
         object.__setattr__(chosen, name, value)
         if kind in kinds and type(value) is not kind:
             raise ValueError(f"{name} must be {kinds[kind]}, got {value!r}")
@@ -184,6 +179,11 @@ def make_network(
         keys["predictor"] = nn.Sequential(nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size))
     zero_action = chosen.zero_action_on_reset and (store != "step" or "zero_action_on_reset" in options)
     return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys)
+
+
+def _plain(value: Any) -> Any:
+    """A number of numpy as one of Python."""
+    return value.item() if isinstance(value, np.integer | np.bool_) else value
 
 
 def _check_sizes(memory_options: dict[str, Any]) -> None:

@@ -26,7 +26,7 @@ LIBRARIES = {
     "envs_jax": {"jax", "jaxlib", "numpy"},
     "bridge": {"torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy", "gymnasium", "pygame"},
     "models": {"torch", "torchrl", "tensordict", "numpy", "triton"},
-    "agents": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", "filelock"},
+    "agents": {"torch", "torchrl", "tensordict", "jax", "numpy", "scipy", "safetensors", "filelock"},
     "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},
 }
 MAX_FILE_LINES = 400

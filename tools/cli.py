@@ -7,19 +7,27 @@ its `run` does the work.
 
 import difflib
 import os
-import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import Any
 
+from arcade_torch import program
 from arcade_torch.tools.bench.registry import BENCHES
-from arcade_torch.tools.errors import WORK_FAILED, MissingPackage, is_told, one_line
+from arcade_torch.tools.errors import (
+    MissingPackage,
+    is_of_the_machine,
+    is_told,
+    one_line,
+    trouble_of_the_machine,
+)
 from arcade_torch.tools.figures import FIGURES
 from arcade_torch.tools.options import imported, load_extensions, take_imports
+from arcade_torch.tools.text import printable, warn
 
-EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, program.EXIT_STOPPED
 
 HELP = ("-h", "--help", "help")
 EVERYWHERE = """\
@@ -92,7 +100,7 @@ def _nearest(word: str, names: Iterable[str]) -> str:
 
 
 def _say(text: str) -> None:
-    print(f"arcade-torch: {text}", file=sys.stderr)
+    warn(f"arcade-torch: {text}")
 
 
 def command_class(name: str) -> Any:
@@ -105,51 +113,129 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``arcade-torch``.
 
     Args:
-        argv: the words after the program's name; those of the process by default.
+        argv: the words after the program's name. Without them the words are those of the process, which then ends here
+            with the exit code.
 
     Returns:
-        The exit code: 0 done, 1 something failed, 2 bad input, 130 interrupted.
+        The exit code: 0 done, 1 something failed, 2 bad input, 130 stopped by a signal.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    debug, command = "--debug" in words, None
-    previous = signal.signal(signal.SIGTERM, signal.default_int_handler) if argv is None else None
-    try:
-        imports, words = take_imports([word for word in words if word != "--debug"])
-        if not words or words[0] in HELP or (words[0] in GROUPS and len(words) == 2 and words[1] in HELP):
-            print(usage())
-        elif words[0] == "--version":
-            from arcade_torch import __version__
+    if argv is not None:
+        return _run(list(argv))
+    program.begin()
+    warnings.formatwarning = _format_warning
+    program.leave(_run(sys.argv[1:]))
 
-            print(f"arcade-torch {__version__}")
-        else:
-            name, options = split_command(words)
-            load_extensions(imports)
-            command = command_class(name).parse(options, f"arcade-torch {name}")
-            command.argv = tuple(options)
-            return int(command.run() or EXIT_OK)
-    except SystemExit as stop:
-        if not stop.code:
-            print(EVERYWHERE)
-        return stop.code if isinstance(stop.code, int) else EXIT_OK if stop.code is None else EXIT_FAILED
+
+def _run(words: list[str]) -> int:
+    """Run a command line, and tell what goes wrong."""
+    debug = "--debug" in words
+    begun: list[Any] = []
+    try:
+        code = _carry_out([word for word in words if word != "--debug"], begun)
+        sys.stdout.flush()
+        return code
     except KeyboardInterrupt:
-        _say("stopped; " + (command.resume_hint() if command else "nothing was left half written"))
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return _tell_stopped(begun)
     except Exception as error:
-        if debug:
+        if program.is_asked_to_stop():  # a library turned the interruption into an error of its own
+            return _tell_stopped(begun)
+        if debug and not isinstance(error, BrokenPipeError):
             raise
-        if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("arcade_torch"):
-            error = MissingPackage(str(error.name))
-        if is_told(error):
-            _say(one_line(error))
-            return EXIT_FAILED if type(error).__name__ in WORK_FAILED else EXIT_BAD_INPUT
-        passed = {(at.f_code.co_filename, at.f_globals["__name__"]) for at, _ in traceback.walk_tb(error.__traceback__)}
-        own = [name for name in imported() if any(name in names for names in passed)]
-        _say(f"{own[0]} failed:" if own else "this is a fault of arcade-torch; please report it with what follows")
-        traceback.print_exc()
+        return _tell(error)
+
+
+def _carry_out(words: Sequence[str], begun: list[Any]) -> int:
+    """Print a page, or run a command, which is added to ``begun`` before; returns the exit code."""
+    try:
+        imports, words = take_imports(words)
+        if _is_page(words):
+            _print_page(words)
+            return EXIT_OK
+        command = _parse(words, imports)
+        begun.append(command)
+        with program.working(command.resume_hint()):
+            code = int(command.run() or EXIT_OK)
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # this is what rich makes of it
+            return EXIT_OK
+        if stop.code:
+            return stop.code if isinstance(stop.code, int) else EXIT_FAILED
+        print(EVERYWHERE)  # below the help of a command
+        return EXIT_OK
+    if program.is_asked_to_stop():  # something swallowed the interruption, and then the work was over
+        raise KeyboardInterrupt
+    return code
+
+
+def _is_page(words: Sequence[str]) -> bool:
+    """Whether these words ask for a page that is printed, and for no command."""
+    if not words or words[0] in HELP or words[0] == "--version":
+        return True
+    return words[0] in GROUPS and len(words) == 2 and words[1] in HELP
+
+
+def _print_page(words: Sequence[str]) -> None:
+    if words[:1] == ["--version"]:
+        from arcade_torch import __version__
+
+        print(f"arcade-torch {__version__}")
+    else:
+        print(usage())
+
+
+def _parse(words: Sequence[str], imports: Sequence[str]) -> Any:
+    """The command that a command line asks for, with its options."""
+    name, options = split_command(words)
+    load_extensions(imports)
+    command = command_class(name).parse(options, f"arcade-torch {name}")
+    command.argv = tuple(options)
+    return command
+
+
+def _tell_stopped(begun: Sequence[Any]) -> int:
+    _say("stopped; " + (begun[0].resume_hint() if begun else "no work was begun"))
+    return EXIT_INTERRUPTED
+
+
+def _tell(error: Exception) -> int:
+    """Say what went wrong, in one line unless it is a fault; returns the exit code."""
+    if isinstance(error, BrokenPipeError):  # the reader of stdout, such as head, has what it wanted
+        _close_stdout()
+        return EXIT_OK
+    if is_of_the_machine(error) and isinstance(error, OSError) and error.filename is None and _is_stdout_full():
+        _say(f"could not write to standard output: {error.strerror}; what was written to files is whole")
         return EXIT_FAILED
-    finally:
-        if previous is not None:
-            signal.signal(signal.SIGTERM, previous)
-    return EXIT_OK
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("arcade_torch"):
+        error = MissingPackage(str(error.name))
+    if is_told(error):
+        _say(one_line(error))
+        return EXIT_FAILED if is_of_the_machine(error) else EXIT_BAD_INPUT
+    if lack := trouble_of_the_machine(error):
+        _say(lack)
+        return EXIT_FAILED
+    passed = {(at.f_code.co_filename, at.f_globals["__name__"]) for at, _ in traceback.walk_tb(error.__traceback__)}
+    own = [name for name in imported() if any(name in names for names in passed)]
+    _say(f"{own[0]} failed:" if own else "this is a fault of arcade-torch; please report it with what follows")
+    for line in "".join(traceback.format_exception(error)).rstrip("\n").split("\n"):
+        warn(line)
+    return EXIT_FAILED
+
+
+def _close_stdout() -> None:
+    """Send to nowhere what would be printed from now on, so that ending does not fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _is_stdout_full() -> bool:
+    """Whether nothing can be printed any more, such as into a file on a full disk."""
+    try:
+        print(flush=True)
+    except OSError:
+        _close_stdout()
+        return True
+    return False
+
+
+def _format_warning(message: Any, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    """A warning in one line, without the line of source that gave it."""
+    return f"{category.__name__}: {printable(message)} ({printable(filename)}:{lineno})\n"

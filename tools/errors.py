@@ -1,8 +1,13 @@
 """Which errors are bad input, told in one line, and which are faults of ours; optional packages, imported when used."""
 
+import errno
 import opcode
+import sys
 from importlib import import_module
 from typing import Any
+
+from arcade_torch.process import missing_platform
+from arcade_torch.tools.text import printable
 
 EXTRA_OF = {
     **dict.fromkeys(("tyro", "rich", "matplotlib", "jinja2", "PIL"), "tools"),
@@ -30,6 +35,23 @@ FILES = (FileNotFoundError, FileExistsError, PermissionError, NotADirectoryError
 WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
 """Own error types that do not mean bad input; told in one line too."""
 
+_FULL = "make room and type the same again; what was finished before is whole"
+_FORBIDDEN = "choose another folder, or let it be written"
+MACHINE = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EFBIG: _FULL,
+    errno.EROFS: _FORBIDDEN,
+    errno.EACCES: "choose another place, or change its permissions",
+    errno.EPERM: "choose another place, or change its permissions",
+    errno.EMFILE: "too many files are open at once: raise the limit with ulimit -n",
+    errno.ENFILE: "too many files are open at once on this machine",
+    errno.EIO: "the disk, or the network it is on, failed",
+    errno.ESTALE: "the folder was replaced on the server: name it again",
+    errno.ENOMEM: "there is not enough memory",
+}
+"""What the machine may refuse, and what helps."""
+
 
 def need(name: str) -> Any:
     """Import and return an optional module.
@@ -46,15 +68,18 @@ def need(name: str) -> Any:
 
 
 def is_told(error: BaseException) -> bool:
-    """Whether an error is told in one line: one of our own types, a file that is not there, or a refusal of ours.
+    """Whether an error is told in one line: one of our own types, something about a file, or a refusal of ours.
 
     A ``ValueError`` or ``TypeError`` is a refusal only if a ``raise`` statement of this package raised it; one that
     comes out of an operation, or out of a library, is a fault.
     """
     if type(error).__module__.startswith("arcade_torch."):
         return True
+    if isinstance(error, OSError) and not isinstance(error, ValueError):
+        named = error.errno is not None and error.filename is not None
+        return isinstance(error, FILES) or named or error.errno in MACHINE
     if not isinstance(error, ValueError | TypeError):
-        return isinstance(error, FILES)
+        return False
     at = error.__traceback__
     while at is not None and at.tb_next is not None:
         at = at.tb_next
@@ -63,13 +88,43 @@ def is_told(error: BaseException) -> bool:
     return at.tb_frame.f_code.co_code[at.tb_lasti] == opcode.opmap["RAISE_VARARGS"]
 
 
+def is_of_the_machine(error: BaseException) -> bool:
+    """Whether work failed because of this machine or of the work itself, and not because of what was asked for."""
+    if type(error).__name__ in WORK_FAILED:
+        return True
+    return isinstance(error, OSError) and error.errno in MACHINE and not isinstance(error, PermissionError)
+
+
 def one_line(error: BaseException) -> str:
-    """The message of an error without line breaks, or its type if it has none."""
+    """The message of an error in one line, or its type if it has none."""
+    if isinstance(error, OSError) and not type(error).__module__.startswith("arcade_torch."):
+        return printable(_of_a_file(error))
+    return printable(" ".join(str(error).split())) or type(error).__name__
+
+
+def _of_a_file(error: OSError) -> str:
+    """What an operating system says of a file: which one, why not, and what helps."""
+    if error.errno is None or error.strerror is None:
+        return " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         return f"{error.filename} does not exist"
-    return " ".join(str(error).split()) or type(error).__name__
+    place = "a file" if error.filename is None else str(error.filename)
+    verb = "write" if MACHINE.get(error.errno) in (_FULL, _FORBIDDEN) else "use"
+    advice = MACHINE.get(error.errno)
+    return f"could not {verb} {place}: {error.strerror}" + (f"; {advice}" if advice else "")
 
 
 def reason(error: BaseException) -> str:
     """Why something failed, in one line."""
     return one_line(error) if is_told(error) else f"{type(error).__name__}: {one_line(error)}"
+
+
+def trouble_of_the_machine(error: BaseException) -> str:
+    """What this machine lacks, if that is why JAX or torch raised an error; empty if it is not."""
+    said = str(error)
+    short = ("RESOURCE_EXHAUSTED", "out of memory", "can't allocate memory", "Unable to allocate", "std::bad_alloc")
+    if isinstance(error, MemoryError) or any(words in said for words in short):
+        return f"there is not enough memory: ask for less at once ({one_line(error)[:200]})"
+    if sys.flags.optimize > 1 and isinstance(error, TypeError | AttributeError) and "NoneType" in said:
+        return "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the place of -OO"
+    return missing_platform()

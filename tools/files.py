@@ -19,6 +19,7 @@ import numpy as np
 from arcade_torch.agents.runs.files import open_regular, read_text, write_atomic
 from arcade_torch.agents.runs.files import read_csv as read_csv
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.text import csv_cell, markdown_cell, printable
 
 NARROWEST = 80
 """Columns of a terminal in which every table can be read."""
@@ -39,7 +40,7 @@ class Table:
 
     def show(self) -> None:
         """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
-        lines = [list(map(str, line)) for line in (self.columns, *self.rows)]
+        lines = [[_lines(cell) for cell in line] for line in (self.columns, *self.rows)]
         widths = [max(map(len, "\n".join(cells).split("\n"))) + 3 for cells in zip(*lines, strict=True)]
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
@@ -50,14 +51,20 @@ class Table:
                 parts.append(list(range(self.left)))
             parts[-1].append(i)
         for part in parts:
-            title, caption = self.title if part is parts[0] else "", self.caption if part is parts[-1] else ""
+            title = _lines(self.title) if part is parts[0] else ""
+            caption = _lines(self.caption) if part is parts[-1] else ""
             table = need("rich.table").Table(title=title or None, caption=caption or None)
             table.title_justify = table.caption_justify = "left"
             for i in part:
                 table.add_column(lines[0][i], justify="left" if i < self.left else "right", overflow="fold")
             for line in lines[1:]:
                 table.add_row(*(line[i] for i in part))
-            console(highlight=False, markup=False, width=width).print(table)
+            console(highlight=False, markup=False, emoji=False, width=width).print(table)
+
+
+def _lines(cell: object) -> str:
+    """A cell as a terminal may show it; its own line breaks stay."""
+    return "\n".join(map(printable, str(cell).split("\n")))
 
 
 def format_value(value: Any) -> str:
@@ -70,7 +77,7 @@ def format_value(value: Any) -> str:
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int | None = None) -> str:
     """A Markdown table; columns after the first ``left`` are aligned right."""
     left = len(columns) if left is None else left
-    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (columns, *rows)]
+    lines = ["| " + " | ".join(map(markdown_cell, line)) + " |" for line in (columns, *rows)]
     return "\n".join([lines[0], "|---" * left + "|---:" * (len(columns) - left) + "|", *lines[1:]])
 
 
@@ -93,9 +100,11 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[s
 def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
     """Rows as CSV, by default with every column that one has; a missing key or None gives an empty cell."""
     buffer, known = io.StringIO(), dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(buffer, columns or list(known), restval="", extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    names = list(columns or known)
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([csv_cell(name) for name in names])
+    for row in rows:
+        writer.writerow([csv_cell(row.get(name, "")) for name in names])
     return buffer.getvalue()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from arcade_torch.agents.config import flatten
 from arcade_torch.envs_jax import resolve_id
+from arcade_torch.tools.text import printable
 
 _SIZE = ("layers", "hidden_size")
 _VERSION = re.compile(r"-v\d+$")
@@ -79,16 +80,6 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
         parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
         found[key] = printable(" ".join([name, *parts]))
     return found
-
-
-def printable(name: str) -> str:
-    """A name in one line, what no printer prints written out: line breaks, control characters, lone surrogates.
-
-    Example:
-        >>> print(printable("a\\nb"))
-        a\\nb
-    """
-    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in name)
 
 
 def memory_free(agent: str, baseline: str) -> re.Match[str] | None:

@@ -19,6 +19,8 @@ from arcade_torch.tools.errors import need, one_line
 FLAG = "--import"
 VARIABLE = "ARCADE_TORCH_IMPORT"
 """Environment variable that hands what was imported on to worker processes; entries separated like those of PATH."""
+LARGEST = 2**53
+"""No option that counts something goes beyond; up to here every whole number is a float as well."""
 _FRAME = re.compile(r"\x1b\[[0-9;]*m|^ *[│╭╰|+] ?| ?[│╮╯|+] *$", re.MULTILINE)
 _RULE = re.compile(r"^ *[─-](?: |[─-]{3}).*$", re.MULTILINE)
 _TITLES = ("Unrecognized options", "Value error", "Required options", "Invalid choice", "Parsing error")
@@ -59,11 +61,25 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
 
 
 def at_least(options: Any, **least: float) -> None:
-    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``; of several, any."""
+    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``; of several, any.
+
+    NaN is refused too, and what is above `LARGEST`.
+    """
     for name, bound in least.items():
         value = getattr(options, name)
-        if not (value and min(value) >= bound if isinstance(value, tuple) else value >= bound):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not numbers or not all(number >= bound for number in numbers):
             raise ValueError(f"--{name.replace('_', '-')} must be at least {bound}, got {value}")
+    at_most(options, **dict.fromkeys(least, LARGEST))
+
+
+def at_most(options: Any, **most: float) -> None:
+    """Refuse options above a number, as `at_least` does those below one."""
+    for name, bound in most.items():
+        value = getattr(options, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not all(number <= bound for number in numbers):
+            raise ValueError(f"--{name.replace('_', '-')} must be at most {bound:,}, got {value}")
 
 
 def whole_number(text: str) -> int:

@@ -7,6 +7,7 @@ from datetime import timedelta
 from typing import Any, Self
 
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.text import printable
 
 WINDOW_S = 30.0
 """Speed is measured over the last so many seconds."""
@@ -54,14 +55,14 @@ class Bars:
     def update(self, name: str, done: int, total: int, text: str = "") -> None:
         """Show how much of a part is done, of 0 where that is not known, and some words about it."""
         if name not in self._tasks:
-            self._tasks[name] = self._bars.add_task(name, total=None, text="")
+            self._tasks[name] = self._bars.add_task(printable(name), total=None, text="")
         self._bars.update(self._tasks[name], completed=done, total=total or None)
         task = next(task for task in self._bars.tasks if task.id == self._tasks[name])
         parts = [text]
         if self.unit and task.speed:
             left = [f"{timedelta(seconds=task.time_remaining)} left"] if task.time_remaining else []
             parts = [f"{task.speed:,.0f} {self.unit}/s", *left, text]
-        task.fields["text"] = said = ", ".join(filter(None, parts))
+        task.fields["text"] = said = printable(", ".join(filter(None, parts)))
         of, share = (f" of {total:,}", f"({task.percentage:.0f} %)") if total else ("", "")
         self._line = " ".join(filter(None, [f"{name}: {done:,}{of}", self.unit, share])) + (f", {said}" if said else "")
         if not self.terminal and time.monotonic() >= self._next_line_s:
@@ -70,7 +71,7 @@ class Bars:
 
     def note(self, text: str) -> None:
         """Print a line, above the bars if there are any."""
-        self._bars.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        self._bars.console.print(printable(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
     def remove(self, name: str) -> None:
         """Forget a part."""

@@ -144,5 +144,15 @@ def wait_until_free(path: Path, limit_s: float) -> None:
 def versions() -> dict[str, str]:
     """Versions of this package, Python and the packages that decide a result."""
     others = ("torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy")
-    found = {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__}
-    return found | {name: importlib.metadata.version(name) for name in others}
+    versions = {"python": platform.python_version(), "arcade_torch": arcade_torch.__version__}
+    for name in others:
+        versions[name] = _version(name)
+    return versions
+
+
+def _version(name: str) -> str:
+    """The version of a package, also where a nightly build of it is installed, which has a name of its own."""
+    for distribution in (name, f"{name}-nightly"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            return importlib.metadata.version(distribution)
+    return "unknown"

@@ -75,6 +75,15 @@ class NumpyBatch:
         self._finals = FinalObservations(compiled, self.num_envs, 1, device)
         self._memory = FrameMemory((self.num_envs, self.game.obs_size, self.game.obs_size, 3), device)
 
+    def saved(self) -> Batch:
+        """Everything that determines what comes, as numpy arrays of the caller's own; see ``load``."""
+        saved: Batch = jax.tree.map(np.array, self._batch)
+        return saved
+
+    def load(self, batch: Batch) -> None:
+        """Go on from what ``saved`` gave."""
+        self._batch = jax.tree.map(jnp.array, batch)
+
     @property
     def game(self) -> Game[Any]:
         """The game that is played."""

@@ -10,6 +10,7 @@ from gymnasium.error import ResetNeeded
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.batch import env_keys
 from arcade_torch.gym.batch import Frames, Info, NumpyBatch
+from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.window import Window
 from arcade_torch.observability import Observability, partial_flags
 
@@ -35,7 +36,7 @@ def check_reset_options(options: dict[str, Any] | None, allowed: tuple[str, ...]
     return options or {}
 
 
-class ArcadeGymEnv(gymnasium.Env[Frames, int]):
+class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
     """One game, one episode at a time. Made by ``gymnasium.make("arcade_torch/<id>", ...)``.
 
     Observations are the true frames, uint8 [S, S, 3]; the last one of an episode shows its end. ``info`` has
@@ -67,6 +68,8 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
 
+    _STATE = ("_frame", "_running")
+
     def __init__(
         self,
         game: str,
@@ -81,6 +84,7 @@ class ArcadeGymEnv(gymnasium.Env[Frames, int]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode is {render_mode!r}, allowed: None, 'human', 'rgb_array'")
         flags = partial_flags(observability, 1, partial_obs)
+        self._made_with(game=game, obs_size=obs_size, rules=rules, render_mode=render_mode, **options)
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         self.action_space = action_space(self._batch.game.num_actions)
         self.observation_space = observation_space(obs_size)

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.validation import check_choice, check_fits, check_num_envs
 from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
+from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
 from arcade_torch.observability import Observability, partial_flags
 
@@ -20,7 +21,7 @@ Rewards = npt.NDArray[np.float64]
 StepResult = tuple[Frames, Rewards, Bools, Bools, Info]
 
 
-class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
+class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
     """N envs of one game. Made by ``gymnasium.make_vec("arcade_torch/<id>", num_envs=N, ...)``.
 
     ``vectorization_mode="async"`` would start a process an env; it needs ``vector_kwargs={"context": "spawn"}``.
@@ -60,6 +61,8 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         (3, 128, 128, 3)
     """
 
+    _STATE = ("_started", "_ended")
+
     def __init__(
         self,
         game: str,
@@ -83,6 +86,16 @@ class ArcadeVectorEnv(VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[Any]]):
         self.autoreset_mode, self._copy = AutoresetMode(mode), copy
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS, "autoreset_mode": self.autoreset_mode}
         flags = partial_flags(observability, num_envs, partial_obs)
+        self._made_with(
+            game=game,
+            num_envs=num_envs,
+            obs_size=obs_size,
+            rules=rules,
+            autoreset_mode=mode,
+            copy=copy,
+            render_mode=render_mode,
+            **options,
+        )
         self._batch = NumpyBatch(compiled_game(game, obs_size, rules, options), flags)
         check_fits(num_envs, obs_size)
         self.single_action_space = action_space(self._batch.game.num_actions)

@@ -1,13 +1,20 @@
 """A window that shows frames, enlarged to whole pixels; needs pygame, which the extra ``play`` brings."""
 
-from typing import Any
+import weakref
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 
 class Window:
-    """One window of pygame, opened by the first frame; ``scale`` is the side of a frame's pixel on the screen."""
+    """One window of pygame, opened by the first frame; ``scale`` is the side of a frame's pixel on the screen.
+
+    pygame has one window a process, so a second one is refused until the first is closed.
+    """
+
+    _shown: ClassVar[Callable[[], "Window | None"]] = lambda: None  # the one that is open
 
     def __init__(self, scale: int = 1) -> None:
         try:
@@ -24,7 +31,10 @@ class Window:
         pygame = self.pygame
         height, width = (side * self._scale for side in frame.shape[:2])
         if self._screen is None:
+            if Window._shown() is not None:
+                raise RuntimeError("pygame shows one window a process: close() the env that has it first")
             pygame.display.init()
+            Window._shown = weakref.ref(self)
             self._screen = pygame.display.set_mode((width, height))
             self._clock = pygame.time.Clock()
         pygame.display.set_caption(title)
@@ -42,6 +52,7 @@ class Window:
         if self._screen is not None:
             self.pygame.display.quit()
             self._screen = None
+            Window._shown = lambda: None
 
 
 def enlarge(frame: npt.NDArray[np.uint8], scale: int) -> npt.NDArray[np.uint8]:

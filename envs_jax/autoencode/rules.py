@@ -17,6 +17,8 @@ class AutoEncodeState(NamedTuple):
     given: Array  # int32, answers given
     selected: Array  # int32, suit 0..3 that the selector points at
     score: Array  # int32, right answers
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> AutoEncodeState:

@@ -22,6 +22,8 @@ class BattleShipState(NamedTuple):
     hits: Array  # int32, ship cells hit; the number on the screen
     repeats: Array  # int32, shots at cells shot at before
     timestep: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def free_places(occupied: Array, length: int) -> Array:

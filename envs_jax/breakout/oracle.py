@@ -11,6 +11,7 @@ from arcade_torch.envs_jax.breakout import rules
 from arcade_torch.envs_jax.breakout.params import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
 from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
+from arcade_torch.envs_jax.settings import compiled, fixed
 
 
 def follow(ball_x: Any, pos: Any, level: Params) -> npt.NDArray[np.int32]:
@@ -45,8 +46,9 @@ class FramesOracle:
         def carry_on(state: rules.BreakoutState, action: jax.Array) -> rules.BreakoutState:
             return rules.step(state, action, game.level, game.rules)[0]
 
-        self._carry_on = jax.jit(jax.vmap(carry_on))
+        self._carry_on = compiled(jax.vmap(carry_on))
 
+    @fixed
     def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         codes = self.board.read(seen, ROWS, COLUMNS)
@@ -59,7 +61,9 @@ class FramesOracle:
 
         if self.belief is None or len(self.action) != len(seen):
             zero = np.zeros(len(seen), np.int32)
-            self.belief = rules.BreakoutState._make([zero, zero, zero, zero, zero, zero, bricks, zero > 0, zero, zero])
+            no = zero > 0
+            numbers = [zero] * 6
+            self.belief = rules.BreakoutState(*numbers, bricks, no, zero, zero, no, no)
         else:
             self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
         belief = self.belief

@@ -37,6 +37,8 @@ class BreakoutState(NamedTuple):
     strike: Array  # bool, whether the last step touched a brick
     score: Array  # int32, bricks paid
     time: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def velocity(direction: Array) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from arcade_torch.envs_jax.cartpole import rules
 from arcade_torch.envs_jax.cartpole.params import START, THETA_LIMIT, X_LIMIT
 from arcade_torch.envs_jax.cartpole.picture import LINEAR_TOP, LOG_CLASSES
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array
+from arcade_torch.envs_jax.settings import compiled, fixed
 
 GAINS = (0.1, 0.2, 1.0, 0.3)  # on x, x_dot, theta, theta_dot; the sign of the sum is the side to push to
 
@@ -57,14 +58,16 @@ class FramesOracle:
         self.game, self.particles = game, particles
         self.belief: Belief | None = None
         self.action = np.zeros(0, np.int32)
-        self._update = jax.jit(jax.vmap(partial(_update, edges=_arrow_edges(game), sigma=game.level.sigma)))
+        update = partial(_update, edges=_arrow_edges(game), sigma=game.level.sigma)
+        self._update = compiled(jax.vmap(update))
 
+    @fixed
     def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         codes = np.stack([slot.read(seen) for slot in self.game.screen.arrows], -1)
         if self.belief is None or len(self.action) != len(seen):
             self.action = np.zeros(len(seen), np.int32)
-            keys = jax.random.split(jax.random.PRNGKey(0), len(seen))
+            keys = jax.random.split(jnp.zeros(2, jnp.uint32), len(seen))
             shape = (len(seen), self.particles)
             self.belief = Belief(jnp.zeros((*shape, 4)), jnp.zeros(shape), keys)
         self.belief, action = self._update(self.belief, self.action, codes, is_init)

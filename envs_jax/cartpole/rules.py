@@ -34,6 +34,8 @@ class CartPoleState(NamedTuple):
     score: Array  # int32, paid steps
     time: Array  # int32, steps taken
     noise: Array  # float32 [4], added to (x, x_dot, theta, theta_dot) in the picture alone
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def is_out(state: CartPoleState) -> Array:

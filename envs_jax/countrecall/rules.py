@@ -18,6 +18,8 @@ class CountRecallState(NamedTuple):
     answer: Array  # int32, what the counter shows
     score: Array  # int32, right answers
     moves: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params) -> CountRecallState:

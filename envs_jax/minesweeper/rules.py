@@ -23,6 +23,8 @@ class MineSweeperState(NamedTuple):
     score: Array  # int32, safe cells swept
     repeats: Array  # int32, sweeps of swept cells
     timestep: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def count_neighbours(mines: Array) -> Array:

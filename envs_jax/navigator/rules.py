@@ -19,6 +19,8 @@ class NavigatorState(NamedTuple):
     y: Array  # int32, row of the agent
     board: Array  # int8 [side, side], FREE, TNT or TREASURE
     timestep: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def draw_distinct(key: Array, count: int, cells: int) -> Array:

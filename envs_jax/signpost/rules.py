@@ -18,6 +18,8 @@ class SignpostState(NamedTuple):
     x: Array  # int32, cells walked; the gate is the last
     score: Array  # int32, 1 once the gate is open
     timestep: Array  # int32, steps taken
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array) -> SignpostState:

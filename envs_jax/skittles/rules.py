@@ -20,6 +20,8 @@ class SkittlesState(NamedTuple):
     safe: Array  # bool [width], columns of the lane a survivor can be in when the newest row arrives at the bottom
     flicker_key: Array  # uint32 [2], with the time it decides which cells the POMDP hides
     time: Array  # int32, steps taken, which is the score
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def reset(key: Array, level: Params, rules: Rules) -> SkittlesState:

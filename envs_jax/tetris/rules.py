@@ -53,6 +53,8 @@ class TetrisState(NamedTuple):
     just_locked: Array  # bool, the piece lies: the next step clears rows and brings the next piece
     frames_since_spawn: Array  # int32, 0..10
     terminal: Array  # bool, a new piece found no room
+    terminated: Array | None = None  # bool, whether the game has ended
+    truncated: Array | None = None  # bool, whether the time limit was reached
 
 
 def shuffled(key: Array) -> Array:

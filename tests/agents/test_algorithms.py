@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, make_actor, preset, training
+from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, averaging, make_actor, preset
 from arcade_torch.agents.config import GROUPS
 from arcade_torch.agents.learner import Training
 from arcade_torch.agents.runs.checkpoint import Checkpoint
@@ -137,7 +137,7 @@ def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(algor
 )
 def test_a_return_counts_as_a_share_of_what_the_game_can_pay(training_return, span, share):
     """Before: the raw return, so no mean at all at 0 and below, and always the full one above 1."""
-    assert training.share_reached(training_return, span) == share
+    assert averaging.share_reached(training_return, span) == share
 
 
 def test_the_mean_goes_by_the_range_of_the_runs_own_game():
@@ -150,7 +150,7 @@ def test_a_mean_of_a_game_without_a_range_is_refused(span, monkeypatch):
     with pytest.raises(
         ValueError, match=r"average_share goes by .* but MineEasy-v0 has return_range .* or set it to 0"
     ):
-        training.check_return_range("MineEasy-v0", span)
+        averaging.check_return_range("MineEasy-v0", span)
 
 
 def test_without_a_mean_the_same_weights_act_and_learn():

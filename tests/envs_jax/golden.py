@@ -5,7 +5,7 @@
 
 A walk is 32 steps in 4 envs, two of each twin, with ends and resets as they come. Integers, and frames of games whose
 state has no floats, are hashed: they are equal on every machine. Floats, and the frames that depend on them, differ in
-the last bits between processors: their means are kept instead.
+the last bits between processors: their means are kept instead. The flags of an end count once, as outcomes.
 """
 
 import argparse
@@ -67,6 +67,8 @@ def record(id: str, rules: str) -> dict[str, Any]:
     """What is kept of a walk."""
     tree, frames = walk(id, rules)
     leaves = {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]}
+    for name in [name for name in leaves if name.startswith("[0]") and name.endswith((".terminated", ".truncated"))]:
+        del leaves[name]  # states and batches keep the outcomes of their last step
     floats = {name: leaf for name, leaf in leaves.items() if leaf.dtype == np.float32}
     out: dict[str, Any] = {"integers": digest([leaf for name, leaf in leaves.items() if name not in floats])}
     out["floats"] = {name: round(float(leaf.astype(np.float64).mean()), 5) for name, leaf in floats.items()}

@@ -109,9 +109,11 @@ def test_any_state_steps_as_the_plain_program_has_it(id, rules):
     )
     seen = set()
     for env in range(1500):
-        plain = SimpleNamespace(**{name: leaf[env] for name, leaf in states._asdict().items()})
+        running = {name: leaf[env] for name, leaf in states._asdict().items() if leaf is not None}
+        plain = SimpleNamespace(**running)
         plain.bricks = plain.bricks.copy()
         pay, ended, late = plain_step(plain, int(actions[env]), WIDTHS[id], rules)
+        plain.terminated, plain.truncated = ended, late
         for name, leaf in new._asdict().items():
             assert np.array_equal(leaf[env], getattr(plain, name)), (env, name)
         assert reward[env] == pytest.approx(pay, abs=1e-6)

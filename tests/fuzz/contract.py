@@ -30,6 +30,9 @@ LONGEST_LINE = 15_000
 SCALE = float(os.environ.get("FUZZ_SCALE", "1"))
 """``FUZZ_SCALE=0.01`` for a quick look, 10 for a night."""
 
+few = False
+"""Whether only a few inputs are generated, with the fast tests."""
+
 counts: dict[str, Counter[str]] = {}
 
 
@@ -42,9 +45,10 @@ class Hang(BaseException):
 
 
 def fuzz(inputs: int) -> settings:
-    """Settings of hypothesis for so many generated inputs, times `SCALE`."""
+    """Settings of hypothesis for so many generated inputs, times `SCALE`; with the fast tests for a few."""
+    examples = (5 if inputs >= 1_000 else 1) if few else max(1, round(inputs * SCALE))
     return settings(
-        max_examples=max(1, round(inputs * SCALE)),
+        max_examples=examples,
         deadline=None,
         derandomize=True,
         database=None,
@@ -69,7 +73,7 @@ def attempt(entry: str, call: Callable[[], object]) -> bool:
     row = counts.setdefault(entry, Counter())
     row["inputs"] += 1
     try:
-        with _time_limit(), warnings.catch_warnings():
+        with time_limit(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             call()
     except Hang:
@@ -112,12 +116,14 @@ def _raises(filename: str) -> list[range]:
 
 
 @contextmanager
-def _time_limit() -> Iterator[None]:
+def time_limit(seconds: float = LIMIT_S) -> Iterator[None]:
+    """Raise `Hang` inside after so many seconds."""
+
     def late(number: int, frame: object) -> None:
         raise Hang
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:

@@ -5,15 +5,17 @@ import random
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given
 
 from arcade_torch.tools.bench.registry import compare, page, read_results
-from arcade_torch.tools.figures import ScoreOptions, make_figure
+from arcade_torch.tools.figures import Part, ScoreOptions, make_figure
 from arcade_torch.tools.reports import report
 from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.folder import StudyFolder
+from arcade_torch.tools.studies.grid import Study
 from tests.fuzz.contract import attempt, content, fuzz
 from tests.fuzz.hostile import NAMES, json_bytes, mutated, mutated_value, seeds
 from tests.fuzz.test_runs import _repair, _rewrite_json
@@ -36,6 +38,10 @@ EVIL = (
     "<svg onload=alert(1)>",
     "\u2028<iframe srcdoc=alert(1)>",
 )
+
+
+PARTS = get_args(Part)
+"""All that a report would compute: made-up runs have no agents."""
 
 
 class Reader(HTMLParser):
@@ -100,11 +106,10 @@ def _poison(study: StudyFolder, rng: random.Random) -> None:
 @given(seed=seeds)
 def test_no_word_of_a_study_becomes_an_element_of_its_report(study: StudyFolder, seed: int) -> None:
     before = content(study.root)
-    off = {"saliency": False, "recall": False, "contamination": False, "references": False}
     try:
         _poison(study, random.Random(seed))
         made: list[Path] = []
-        if attempt("report: hostile words", lambda: made.append(report(study.root, **off))):
+        if attempt("report: hostile words", lambda: made.append(report(study.root, skip=PARTS))):
             tags = read(made[0])
             assert tags["img"] == 0 and tags["iframe"] == 0 and tags["script"] <= 1, tags
             assert "alert(1)" in made[0].read_text(encoding="utf-8")
@@ -112,19 +117,55 @@ def test_no_word_of_a_study_becomes_an_element_of_its_report(study: StudyFolder,
         _repair(study.root, before)
 
 
+@pytest.mark.parametrize("evil", [*EVIL[:4], *(pytest.param(word, marks=pytest.mark.slow) for word in EVIL[4:])])
+def test_a_hostile_word_in_every_place_stays_a_word(tmp_path: Path, evil: str) -> None:
+    """Path, TOML, config, versions, command, reasons for failing and cells of metrics, all at once."""
+    root = tmp_path / evil.replace("/", "\u2215")
+    toml = tmp_path / "study.toml"
+    toml.write_text(
+        f"games = ['MineSweeperEasy']\nmemories = ['mingru', 'mlp']\nseeds = 2\nquestion = {json.dumps(evil)}"
+    )
+    grid = Study.load(toml)
+    study = write_study(root, small_study(question=grid.question))
+    record = json.loads((root / "study.json").read_text())
+    record |= {"command": evil, "versions": {evil: evil}, "also": [{evil: evil}], "runs": {evil: evil}}
+    record["runs"] |= {run.name: evil for run in small_study().runs()}
+    (root / "study.json").write_text(json.dumps(record))
+    for run in small_study().runs():
+        config = study.run(run).path / "config.json"
+        values = json.loads(config.read_text())
+        if run.memory != "mlp":
+            values["config"]["memory"] = evil
+        values["config"] |= {evil: evil, "network_options": {evil: evil}, "device": evil}
+        values["versions"] = {evil: evil}
+        config.write_text(json.dumps(values))
+        metrics = config.with_name("metrics.csv")
+        head, *lines = metrics.read_text().splitlines()
+        quoted = '"' + evil.replace('"', '""') + '"'
+        metrics.write_text("\n".join([f"{head},{quoted}", *(f"{line},{quoted}" for line in lines)]) + "\n")
+    last = small_study().runs()[-1]
+    (study.run(last).path / "eval.json").unlink()
+    study.note_failure(last, evil)
+    page = report(root, skip=PARTS)
+    tags = read(page)
+    assert tags["img"] == 0 and tags["iframe"] == 0 and tags["script"] <= 1, tags
+    assert page.read_text(encoding="utf-8").count("alert(1)") > 8
+    table = (root / "results.csv").read_text()
+    assert table.count("\n") == 1 + len(small_study().runs())
+
+
 @fuzz(60)
 @given(seed=seeds)
 def test_a_damaged_study_gives_a_page_or_one_line(study: StudyFolder, seed: int) -> None:
     rng = random.Random(seed)
     before = content(study.root)
-    off = {"saliency": False, "recall": False, "contamination": False, "references": False}
     try:
         file = rng.choice(sorted(path for path in study.root.rglob("*") if path.is_file()))
         if file.suffix == ".json" and rng.random() < 0.7:
             _rewrite_json(file, rng)
         else:
             file.write_bytes(mutated(file.read_bytes(), rng.randrange(2**32)))
-        attempt("report: damaged study", lambda: read(report(study.root, **off)))
+        attempt("report: damaged study", lambda: read(report(study.root, skip=PARTS)))
     finally:
         _repair(study.root, before)
 

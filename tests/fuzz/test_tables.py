@@ -103,8 +103,8 @@ def test_benchmarks_are_drawn_from_a_table_or_it_is_refused(files: Path, seed: i
     file = _written(files / "bench.csv", _cells(BENCH, random.Random(seed)))
 
     def read() -> None:
-        rows = logs.read_rows(file)
-        games = list(dict.fromkeys(row["game"] for row in rows))
+        rows = read_rows(file, logs.Rate)
+        games = list(dict.fromkeys(row.game for row in rows))
         for game in games:
             series(rows, game, "step+draw")
         mean_series(rows, games, "step+draw")

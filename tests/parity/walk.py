@@ -125,7 +125,7 @@ class SideBySide:
         ours, reward, terminated, truncated = self.game.step(for_us, before, action)
         done = terminated | truncated
         flags = say.reported(self.game, ours, terminated, truncated)
-        ours = say.adopt(self.game, ours, then)
+        ours = say.adopt(self.game, ours, then)._replace(terminated=None, truncated=None)  # theirs say nothing of it
         back = cast(then, say.to_theirs(self.game, ours))
         either = done | their_done
         seen = Seen(

@@ -376,6 +376,11 @@ def test_a_terminal_plays_and_is_left_as_it_was(tmp_path: Path) -> None:
     assert (row["actions"], row["seed"], row["player"], row["end"]) == ("43", "3", "ann", "abandoned")
 
 
+def test_a_terminal_of_twenty_columns_shows_a_picture() -> None:
+    code, out, unread = talk(["play", GAME, "--obs-size", "128", "--terminal"], [b" ", b"\x1b"], size=(3, 20))
+    assert (code, unread) == (0, b""), out
+
+
 # -- command ------------------------------------------------------------------------------------------------------
 
 

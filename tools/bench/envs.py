@@ -20,9 +20,10 @@ from arcade_torch.envs_jax import make, registered_ids
 from arcade_torch.envs_jax.batch import BatchedGame, env_keys
 from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.options import at_least
+from arcade_torch.tools.options import at_least, at_most
 
 WINDOW_BYTES = 2**27
+LARGEST_BATCH = 2**20
 """Pixels in a collector's window, at most, unless 4 steps need more."""
 
 
@@ -48,7 +49,8 @@ class Options(BenchOptions):
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``envs``."""
     games = options.games or tuple(name for name in registered_ids() if "Easy" in name)
-    at_least(options, batches=1, repeats=1)
+    at_most(options, batches=LARGEST_BATCH)
+    at_least(options, batches=1, repeats=1, seconds=0)
     for game, size in product(games, options.sizes):
         make(game, obs_size=size)  # refuse what does not exist before anything is measured
     for game, size, count in product(games, options.sizes, options.batches):

@@ -18,4 +18,4 @@ class Command:
 
     def resume_hint(self) -> str:
         """What an interruption left, and how to go on."""
-        return "nothing was left half written"
+        return "no file is half written; the same command starts again"

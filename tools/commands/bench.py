@@ -1,6 +1,5 @@
 """``arcade-torch bench NAME``, ``bench all`` and ``bench compare``."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from arcade_torch.tools.bench import registry
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table, format_value, write_csv
 from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.text import say, warn
 
 
 @dataclass
@@ -43,10 +43,10 @@ class Bench(Command):
             columns, cells = list(table["rows"][0]), [list(map(format_value, row.values())) for row in table["rows"]]
             names = next(place for place, column in enumerate(columns) if column not in key)
             Table(title, columns, cells, left=names).show()
-        print(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
+        say(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
         if out is not None and not self.options.resumable:
             for path in _save(out, results):
-                print(path)
+                say(path)
         return 0
 
     def resume_hint(self) -> str:
@@ -80,8 +80,8 @@ class BenchAll(Command):
             name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches
         }
         results = registry.measure(options, self.size, _log)
-        print(write_json(self.out, results))
-        print(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))
+        say(write_json(self.out, results))
+        say(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))
         return 0
 
 
@@ -104,17 +104,17 @@ class BenchCompare(Command):
         about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
         differs = [f"{name} {was.get(name)} and {now.get(name)}" for name in about if was.get(name) != now.get(name)]
         if differs:
-            print(f"not the same machine: {', '.join(differs)}")
+            say(f"not the same machine: {', '.join(differs)}")
         changes = registry.compare(old, new, self.tolerance)
         for verdict in ("worse", "missing", "better", "new"):
             for line in changes[verdict]:
-                print(f"{verdict}: {line}")
+                say(f"{verdict}: {line}")
         print(", ".join(f"{len(lines)} {verdict}" for verdict, lines in changes.items()))
         return 1 if changes["worse"] else 0
 
 
 def _log(text: str) -> None:
-    print(f"measuring {text}", file=sys.stderr, flush=True)
+    warn(f"measuring {text}")
 
 
 def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:

@@ -19,6 +19,7 @@ from arcade_torch.tools.files import csv_text
 from arcade_torch.tools.machine import keep_freed_memory
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.progress import Bars
+from arcade_torch.tools.text import say
 
 
 @dataclass
@@ -61,5 +62,5 @@ class Figure(Command):
         for table in made.tables:
             table.show()
         for line in [*made.notes, *map(str, made.files)]:
-            print(line)
+            say(line)
         return 0

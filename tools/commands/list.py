@@ -13,6 +13,7 @@ from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table, write_between
 from arcade_torch.tools.options import at_least
 from arcade_torch.tools.progress import Bars
+from arcade_torch.tools.text import say
 
 PAPER_SIZE = 512
 BASELINES = Path("baselines.csv")
@@ -53,7 +54,7 @@ class List(Command):
         return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
 
     def _baselines(self) -> None:
-        at_least(self, episodes=1)
+        at_least(self, episodes=1, seconds=0)
         ids = [resolve_id(name) for name in self.games] or registered_ids()
         rows, total = [], len(ids) * len(players.PLAYERS)
         with Bars() as bars:
@@ -63,7 +64,8 @@ class List(Command):
         table = players.markdown(rows)
         print(table)
         if self.page is not None:
-            print(f"\nwritten into {write_between(self.page, players.BEGIN, players.END, table)}")
+            print()
+            say(f"written into {write_between(self.page, players.BEGIN, players.END, table)}")
 
     def _sheet(self) -> None:
         from arcade_torch.tools.play.recording import sheet, strip, write_png
@@ -73,7 +75,7 @@ class List(Command):
             raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
         ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
         picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
-        print(write_png(self.out or Path("games.png"), picture).resolve())
+        say(write_png(self.out or Path("games.png"), picture).resolve())
 
     def _envs(self) -> None:
         games = [make(env_id) for env_id in registered_ids()]

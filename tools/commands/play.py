@@ -9,7 +9,10 @@ import tyro
 
 from arcade_torch.agents.config import require
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import at_least, name_and_value
+from arcade_torch.tools.options import at_least, at_most, name_and_value
+from arcade_torch.tools.text import say
+
+LARGEST_SCALE = 32
 
 
 @dataclass(kw_only=True)
@@ -22,6 +25,11 @@ class Shown(Command):
     scale: int = 2  # Width of a frame's pixel in the picture.
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
+
+    def check_scale(self) -> None:
+        """Refuse pictures without a pixel, and those that no screen and no memory holds."""
+        at_most(self, scale=LARGEST_SCALE)
+        at_least(self, scale=1)
 
 
 @dataclass(kw_only=True)
@@ -51,7 +59,8 @@ class Play(Shown):
         from arcade_torch.tools.play import scores, screens
         from arcade_torch.tools.play.session import LEGEND, Session
 
-        at_least(self, scale=1, key_repeat=0)
+        at_least(self, key_repeat=0)
+        self.check_scale()
         fits = self.scores is None or self.scores.suffix == ".csv"
         require(fits, "--scores", str(self.scores), "a file that ends in .csv")
         options = dict(map(name_and_value, self.env_option))
@@ -71,13 +80,16 @@ class Play(Shown):
         session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
         reason = None if self.terminal else screens.why_no_window()
         if reason is not None:
-            print(f"playing in the terminal: {reason}")
+            if (blocked := screens.why_no_terminal()) is not None:
+                raise ValueError(f"playing needs a window or a terminal: {reason}, and {blocked}")
+            say(f"playing in the terminal: {reason}")
         if self.terminal or reason is not None:
             screens.play_in_terminal(session)
         else:
             print(LEGEND)
             screens.play_in_window(session, self.scale, self.key_repeat)
-        print("\n".join(said) or "no episode was played")
+        for line in said or ["no episode was played"]:
+            say(line)
         return 0
 
 
@@ -111,7 +123,8 @@ class Record(Shown):
         from arcade_torch.tools.progress import Bars
 
         write = recording.writer_for(self.out)
-        at_least(self, episodes=1, max_steps=1, scale=1)
+        at_least(self, episodes=1, max_steps=1)
+        self.check_scale()
         fastest = recording.FASTEST_FPS[self.out.suffix]
         require(
             0.01 <= self.fps <= fastest, "--fps", self.fps, f"at least 0.01 and at most {fastest} for {self.out.suffix}"
@@ -132,15 +145,15 @@ class Record(Shown):
             if resolve_id(config.env) == game_id:
                 options = {**config.env_options, **options}
             else:
-                print(f"note: this agent was trained on {config.env}")
+                say(f"note: this agent was trained on {config.env}")
         if self.observability is not None:
             partial = self.observability == "partial"
 
-        def say(attempt: Any) -> None:
-            print(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
+        def tell(attempt: Any) -> None:
+            say(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
 
         game, views = compiled_game(game_id, obs_size, rules, options), {"partial": partial, "both": self.both}
-        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=say, **views)
+        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=tell, **views)
         player = (
             recording.trained(agent, partial) if agent else recording.scripted(self.player, session.game, self.seed)
         )
@@ -153,5 +166,5 @@ class Record(Shown):
                     yield frame
 
             write(self.out, counted(), self.fps)
-        print(f"recording: {self.out}")
+        say(f"recording: {self.out}")
         return 0

@@ -13,6 +13,7 @@ from arcade_torch.tools.options import command_line
 from arcade_torch.tools.studies.engines import Engine, RayOptions
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
+from arcade_torch.tools.text import say
 
 
 class Resumable(Command):
@@ -32,11 +33,11 @@ class Resumable(Command):
         try:
             result = study(what, out, engine, command=command_line([self.word, *argv]), shard=shard)
         except DiskFullError as error:
-            print(f"stopped: {error}; {self.resume_hint()}")
+            say(f"stopped: {error}; {self.resume_hint()}")
             return 1
-        print(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
+        say(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
         for name, reason in result.errors.items():
-            print(f"failed: {name}: {reason}")
+            say(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
             try:
                 write_page(result.root)
@@ -82,7 +83,7 @@ class StudyCommand(Resumable):
             for run, config in plan.items():
                 frames = config.num_updates * config.learner.frames_per_update
                 total += frames
-                print(f"{run.name}  {frames:,} frames")
+                say(f"{run.name}  {frames:,} frames")
             print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
             return 0
         engine = make_engine(self.engine, self.workers, self.ray)
@@ -138,4 +139,4 @@ def write_page(study: Path, out: Path | None = None, **how: Any) -> None:
     from arcade_torch.tools.reports import report
 
     with Bars() as bars:
-        print(f"report: {report(study, out, progress=bars.update, **how).resolve()}")
+        say(f"report: {report(study, out, progress=bars.update, **how).resolve()}")

@@ -11,8 +11,9 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import command_line, name_and_value
+from arcade_torch.tools.options import at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.text import say
 
 
 @dataclass
@@ -68,6 +69,7 @@ class Train(Command):
         from arcade_torch.tools.studies.engines import watch_parent
         from arcade_torch.tools.studies.grid import RunSpec
 
+        at_least(self, wait=0)
         watch_parent()
         keep_freed_memory()
         run, film = self.settings, None
@@ -86,8 +88,8 @@ class Train(Command):
             result = train(run, folder, self.resume, show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
-        print(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
-        print(f"finished: {result.run_dir}")
+        say(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
+        say(f"finished: {result.run_dir}")
         return 0
 
     def resume_hint(self) -> str:
@@ -118,7 +120,7 @@ class Evaluate(Command):
         result = evaluate(agent, self.observability, self.episodes)
         config, twin = agent.config, self.observability or agent.config.observability
         which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
-        print(f"{which}, {agent.frames:,} frames of training: {result.text}")
+        say(f"{which}, {agent.frames:,} frames of training: {result.text}")
         if self.json is not None:
             found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
             write_json(self.json, found | {"mean": result.mean, "half_width_95": result.half_width})

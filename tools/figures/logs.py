@@ -12,8 +12,9 @@ from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.figures import CurveOptions, Made, Options, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
-from arcade_torch.tools.names import plain_number, printable
+from arcade_torch.tools.names import plain_number
 from arcade_torch.tools.runs import Run, find_runs
+from arcade_torch.tools.text import printable
 
 POINTS = 120  # of a curve of training returns
 AXIS = {"eval": "greedy return", "train": "training return, running mean"}
@@ -197,7 +198,7 @@ def series(rows: Sequence[Rate], game: str, measure: str) -> dict[int, float]:
 def mean_series(rows: Sequence[Rate], games: Sequence[str], measure: str) -> dict[int, float]:
     """Mean rate over games, at the numbers of envs that all of them were measured with."""
     every = [series(rows, game, measure) for game in games]
-    shared = sorted(set.intersection(*map(set, every)))
+    shared = sorted(set.intersection(*map(set, every))) if every else []
     return {count: float(np.mean([one[count] for one in every])) for count in shared}
 
 

@@ -19,7 +19,7 @@ from arcade_torch.tools.analysis.bootstrap import Array, measured_coverage
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
-from arcade_torch.tools.names import printable
+from arcade_torch.tools.text import printable
 
 AGENT_COLOURS = {
     "mlp": "#6b6b6b",

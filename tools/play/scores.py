@@ -18,6 +18,7 @@ from arcade_torch.tools.analysis.gap_bias import game_of
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.session import QUIT, Attempt, Session
+from arcade_torch.tools.text import csv_cell
 
 COLUMNS = (
     *("model", "env", "difficulty", "observability", "return", "steps", "end", "attempt"),
@@ -61,7 +62,8 @@ def append_score(path: Path, row: Mapping[str, Any]) -> None:
 
 def next_seed(rows: list[dict[str, str]], game_id: str, player: str) -> int:
     """The first seed above all that a player has met in a game; 0 for the first."""
-    met = [int(row["seed"]) for row in rows if (row["game"], row["player"]) == (game_id, player)]
+    written = csv_cell(player)
+    met = [int(row["seed"]) for row in rows if (row["game"], row["player"]) == (game_id, written)]
     return max(met, default=-1) + 1
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from arcade_torch.gym.window import Window
 from arcade_torch.tools.errors import MissingPackage, need
 from arcade_torch.tools.play.session import LEGEND, NEXT, QUIT, RESTART, TOGGLE, Frame, Session
+from arcade_torch.tools.text import printable
 
 FPS = 30
 _DELAY_MS = 300  # how long a key is held before it repeats
@@ -73,9 +74,14 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
 
 
 def play_in_terminal(session: Session) -> None:
-    """Show a session in this process's terminal and hand it the keys, until it is closed."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise ValueError("playing needs a window or a terminal, and this is neither: standard input is redirected")
+    """Show a session in this process's terminal and hand it the keys, until it is closed.
+
+    Raises:
+        ValueError: standard input or output is no terminal, or the terminal cannot move its cursor.
+    """
+    if (reason := why_no_terminal()) is not None:
+        raise ValueError(f"playing needs a window or a terminal, and this is neither: {reason}")
+    need("PIL.Image")  # before the terminal is changed: an interruption of imports ends the process at once
     with _raw_terminal() as source:
         while not session.closed:
             size = shutil.get_terminal_size()
@@ -85,6 +91,17 @@ def play_in_terminal(session: Session) -> None:
                 data += os.read(source, 64)
             for key in decode_keys(data or b"\x04"):  # a closed terminal quits
                 session.press(key)
+
+
+def why_no_terminal() -> str | None:
+    """Why nobody can play in this process's terminal, in a few words; None if one can."""
+    streams = {"standard input": sys.stdin, "standard output": sys.stdout}
+    redirected = [name for name, stream in streams.items() if stream is None or not stream.isatty()]
+    if redirected:
+        return f"{' and '.join(redirected)} {'are' if len(redirected) > 1 else 'is'} redirected"
+    if os.environ.get("TERM", "") in ("dumb", "unknown"):
+        return f"TERM is {os.environ['TERM']}, a terminal that shows no pictures"
+    return None
 
 
 @contextmanager
@@ -117,7 +134,7 @@ def decode_keys(data: bytes) -> list[str]:
 def screen(session: Session, columns: int, rows: int) -> str:
     """What to write to the terminal to show a session."""
     picture = half_blocks(session.frame, 2 * max(1, rows - _TEXT_ROWS), columns)
-    text = [words[:columns] for words in (session.caption, LEGEND)]
+    text = [words[:columns] for words in (printable(session.caption), LEGEND)]
     return "\x1b[H" + "\r\n".join(f"{line}\x1b[K" for line in [*picture, *text]) + "\x1b[J"
 
 

@@ -120,9 +120,10 @@ class Processes:
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
         cores = available_cores()
-        # Fewer workers go where there is room: another study, or shard, may be at work on the same machine.
-        free = [{core} for core in cores] if self.workers in (0, len(cores)) else [set(cores)] * self.workers
         waiting, active = list(jobs), dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
+        # Fewer workers go where there is room: another study, or shard, may be at work on the same machine.
+        shared = [set(cores)] * min(self.workers, len(waiting))
+        free = [{core} for core in cores] if self.workers in (0, len(cores)) else shared
         try:
             while waiting or active:
                 while waiting and free:

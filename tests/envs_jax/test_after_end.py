@@ -1,0 +1,150 @@
+"""After an end nothing changes: state, frame and flags stay, the reward is 0, in every game and on every way."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from arcade_torch.envs_jax import BatchedGame, MixedGames, env_keys, gymnax, make
+
+from ..arcade_torch.stub import CoinGame, StubGame
+from .conftest import ALL_IDS
+
+ENVS, STEPS = 8, 320  # in so many random steps every Easy game ends somewhere
+EASY = [*(id for id in ALL_IDS if "Easy" in id), "SignpostEasy-v0"]
+
+
+def play(begin, advance):
+    """Random steps in one compiled call: all states, and what each step gave."""
+
+    @jax.jit
+    def run():
+        first = begin(env_keys(0, ENVS))
+        keys = jax.random.split(jax.random.PRNGKey(1), STEPS)
+
+        def step(state, key):
+            action = jax.random.randint(key, (ENVS,), 0, 5)
+            keys = jax.random.split(key, ENVS)
+            state, outcome = advance(keys, state, action)
+            return state, (state, outcome)
+
+        return jax.lax.scan(step, first, keys)[1]
+
+    return jax.tree.map(np.asarray, run())
+
+
+def assert_stays(states, reward, terminated, truncated):
+    """Leaves [STEPS, ENVS, ...]: from the first end of each env on, all is as at that end, and nothing is paid."""
+    done = terminated | truncated
+    assert done.any()
+    late = 0
+    for env in np.flatnonzero(done.any(0)):
+        end = int(done[:, env].argmax())
+        late += STEPS - 1 - end
+        for leaf in [*jax.tree.leaves(states), terminated, truncated]:
+            assert (leaf[end:, env] == leaf[end, env]).all()
+        assert not reward[end + 1 :, env].any()
+    assert late > 20, "hardly any step was taken after an end"
+
+
+@pytest.mark.parametrize("rules", ["default", "reference"])
+@pytest.mark.parametrize("id", EASY)
+def test_a_state_stays_in_pure_jax(id, rules):
+    game = make(id, rules=rules)
+
+    def advance(keys, state, action):
+        state, *outcome = jax.vmap(game.step)(keys, state, action)
+        return state, outcome
+
+    states, (reward, terminated, truncated) = play(jax.vmap(game.reset), advance)
+    assert_stays(states, reward, terminated, truncated)
+    assert np.array_equal(states.terminated, terminated) and np.array_equal(states.truncated, truncated)
+
+
+BATCHES = {
+    "a game": lambda: BatchedGame(make("SkittlesEasy")),
+    "one's own": lambda: BatchedGame(StubGame()),
+    "games": lambda: MixedGames([StubGame(), CoinGame()]),
+}
+
+
+@pytest.mark.parametrize("which", BATCHES)
+def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
+    batched = BATCHES[which]()
+    no = jnp.zeros(ENVS, bool)
+
+    def advance(keys, batch, action):
+        batch, outcome, frames = batched.step_render(batch, action)
+        return batch, (outcome, frames.sum((1, 2, 3), dtype=jnp.int32))
+
+    batches, (outcome, frames) = play(functools.partial(batched.init, partial=no), advance)
+    kept = batched.wide(jax.tree.map(lambda leaf: leaf[-1], batches))
+    state = batched.states(batches.state)[0]
+    rows = batched.rows(ENVS)[0]
+    part = lambda leaf: leaf[:, rows]  # noqa: E731
+    counts = (batches.step_count, batches.episode_reward, batches.key, frames)
+    assert_stays((state, *map(part, counts)), part(outcome.reward), part(outcome.terminated), part(outcome.truncated))
+    assert np.array_equal(batches.terminated, outcome.terminated)
+    assert np.array_equal(batches.truncated, outcome.truncated)
+    assert kept.terminated.shape == (ENVS,)
+
+    last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), batches)
+    mask = np.arange(ENVS) % 2 == 0
+    fresh = batched.reset_where(last, mask)
+    assert not np.asarray(fresh.terminated | fresh.truncated)[mask].any()
+    assert not np.asarray(fresh.step_count)[mask].any()
+    assert np.array_equal(np.asarray(fresh.terminated)[~mask], np.asarray(last.terminated)[~mask])
+    following, outcome = batched.step(fresh, jnp.zeros(ENVS, jnp.int32))
+    assert (np.asarray(following.step_count)[mask] == 1).all()
+
+
+def test_step_env_of_the_adapter_stays_and_step_begins_anew():
+    env, params = gymnax.make("MineSweeperEasy")
+    obs, state = env.reset(jax.random.PRNGKey(0), params)
+    step_env, step = jax.jit(env.step_env), jax.jit(env.step)
+    for number in range(40):
+        obs, state, reward, done, info = step_env(jax.random.PRNGKey(number), state, jnp.int32(number % 4), params)
+    assert bool(done) and bool(info["truncated"])
+    again, same, reward, done, _ = step_env(jax.random.PRNGKey(99), state, jnp.int32(4), params)
+    assert np.array_equal(again, obs) and reward == 0 and bool(done)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(state), strict=True))
+    _, fresh, _, done, _ = step(jax.random.PRNGKey(99), state, jnp.int32(4), params)
+    assert bool(done) and not bool(fresh.truncated) and fresh.timestep == 0
+
+
+def test_a_batch_without_flags_has_not_ended():
+    """Batches and states that were put together by hand may leave them out."""
+    batched = BatchedGame(make("SkittlesEasy"))
+    whole = batched.init(env_keys(0, 2), jnp.zeros(2, bool))
+    state = whole.state._replace(terminated=None, truncated=None)
+    bare = whole._replace(terminated=None, truncated=None, state=state)
+    one, two = (batched.step(batch, jnp.zeros(2, jnp.int32))[0] for batch in (whole, bare))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
+
+
+@pytest.mark.parametrize("id", EASY)
+def test_an_eager_state_can_be_donated(id):
+    game = make(id)
+    state = game.reset(jax.random.PRNGKey(0))
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(state)]
+    assert len(set(pointers)) == len(pointers)
+    stepped = game.step(jax.random.PRNGKey(1), state, 1)[0]
+    pointers += [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(stepped)]
+    assert len(set(pointers)) == len(pointers)
+    many = jax.vmap(game.reset)(env_keys(0, 3))
+    pointers = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(many)]
+    assert len(set(pointers)) == len(pointers)
+    jax.jit(game.step, donate_argnums=1)(jax.random.PRNGKey(1), state, jnp.int32(1))
+
+
+@pytest.mark.parametrize("which", BATCHES)
+def test_a_batch_can_be_donated(which):
+    batched = BATCHES[which]()
+    step = jax.jit(lambda batch: batched.step(batch, batch.last_action)[0], donate_argnums=0)
+    partial = jnp.zeros(ENVS, bool)
+    batch = step(batched.init(env_keys(0, ENVS), partial))
+    batch = step(batched.reset_where(batch, np.arange(ENVS) < 2))
+    assert not partial.any(), "what the caller gave is still there"
+    assert np.asarray(batch.step_count).tolist()[:2] == [1, 1]
