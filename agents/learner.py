@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from arcade_torch.agents.config import LearnerConfig, QConfig
+from arcade_torch.agents.runs.states import check_optimizer
 
 
 class NonFiniteError(RuntimeError):
@@ -121,10 +122,13 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment; the weights are loaded elsewhere."""
-        rate = self.optimizer.param_groups[0]["lr"]  # on CUDA a tensor, which a checkpoint would put on the CPU
+        check_optimizer(state["optimizer"], self.parameters)
+        group = self.optimizer.param_groups[0]
+        options = {name: value for name, value in group.items() if name != "params"}
         self.optimizer.load_state_dict(state["optimizer"])
         self.norm.load_state_dict(state.get("norm", {}))  # older checkpoints have none
-        self.optimizer.param_groups[0]["lr"] = rate  # its value is set before every step
+        # The config decides these; the step size is set before every step, and on CUDA a tensor there.
+        self.optimizer.param_groups[0].update(options)
         self.grad_steps = state["grad_steps"]
 
 

@@ -32,6 +32,11 @@ class _Segment:
     checksum: str | None = None
 
 
+def _layout(window: Any) -> dict[str, tuple[torch.dtype, torch.Size]]:
+    """Types and sizes of what the sequences of a window hold."""
+    return {key: (value.dtype, value.shape[1:]) for key, value in window.items()}
+
+
 class SequenceReplay:
     """Draws sequences uniformly, in the form in which they were added.
 
@@ -80,6 +85,8 @@ class SequenceReplay:
 
     def _open(self, file: Path, digest: str | None = None) -> None:
         tensors = load_file(file)
+        if self._segments and _layout(tensors) != _layout(self._segments[-1].data):
+            raise CheckpointError(f"{file} holds other frames than the windows before it")
         self._segments.append(_Segment(file, TensorDict(tensors, [len(tensors["pixels"])]), digest))
 
     def sample(self, count: int, generator: torch.Generator, device: torch.device | str = "cpu") -> TensorDict:

@@ -1,6 +1,7 @@
 """Training: collect, update, then log, evaluate, save; the same for every algorithm and memory, and for none."""
 
 import dataclasses
+import errno
 import os
 import signal
 import threading
@@ -21,7 +22,7 @@ from arcade_torch.agents.averaging import check_return_range, move_mean, share_r
 from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
-from arcade_torch.agents.learner import NonFiniteError, Training, epsilon_at
+from arcade_torch.agents.learner import Learner, NonFiniteError, Training, epsilon_at
 from arcade_torch.agents.metrics import EpisodeStats, paper_score
 from arcade_torch.agents.policy import Agent, build_network, compile_network, make_policy
 from arcade_torch.agents.ppo import PPO
@@ -30,6 +31,7 @@ from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, lo
 from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
+from arcade_torch.agents.runs.states import check_state
 from arcade_torch.dlpack import pick_devices
 from arcade_torch.envs_jax import resolve_id
 
@@ -174,8 +176,9 @@ class Trainer:
 
     def load(self, checkpoint: Checkpoint) -> None:
         """Go back to where a checkpoint was made; a ``CheckpointError`` if its state is not one of this trainer."""
-        state = checkpoint.trainer or {}
+        state: Any = {} if checkpoint.trainer is None else checkpoint.trainer
         try:
+            check_state(state, self._expected_state())
             self.learner.load_state_dict(state)
             self.acting.load_state_dict(checkpoint.weights)
             self.network.load_state_dict(state.get("network") or checkpoint.weights)
@@ -185,11 +188,30 @@ class Trainer:
             self.stats.load_state_dict(state["stats"])
             self.frames, self.updates, self.seconds = state["frames"], state["updates"], state["seconds"]
             require(self.frames == checkpoint.frames, "frames", self.frames, f"{checkpoint.frames}, as in its name")
+            made = self.updates * self.config.learner.frames_per_update
+            require(self.frames == made, "updates", self.updates, f"as many as make {self.frames} frames")
         except CheckpointError:
             raise
         except Exception as error:  # whatever a damaged state leads to, it is not to be used
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             raise CheckpointError(f"the state in {checkpoint.path} does not fit this run: {reason}") from error
+
+    def _expected_state(self) -> dict[str, Any]:
+        """What a saved state of this trainer looks like; the replay, which looks at its files itself, is left out."""
+        collector = self.collector.state_dict()
+        collector.pop("policy_state_dict", None)
+        learner = Learner.state_dict(self.learner)
+        learner.pop("optimizer")  # looks at its averages itself, and keeps its own options
+        counters = dict.fromkeys(("learner_updates", "frames", "updates"), 0)
+        return {
+            **learner,
+            **counters,
+            "explore": self.random.get_state(),
+            "shuffle": self.shuffle.get_state(),
+            "collector": collector,
+            "stats": self.stats.state_dict(),
+            "seconds": 0.0,
+        }
 
     def close(self) -> None:
         """Let go of the environments."""
@@ -289,7 +311,9 @@ class _Run:
         where = error.filename or self.folder.path
         newest = list_checkpoints(self.folder.checkpoints)[:1]
         safe = f"{newest[0].name} is whole" if newest else "there is no checkpoint yet"
-        return f"could not write {where}: {error.strerror or error}; {safe}: make room, then go on with --resume"
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        cure = "make room" if full else "put that right"
+        return f"could not write {where}: {error.strerror or error}; {safe}: {cure}, then go on with --resume"
 
     def _loop(self) -> TrainResult:
         trainer, config = self.trainer, self.config

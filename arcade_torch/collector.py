@@ -363,16 +363,24 @@ class ArcadeCollector(BaseCollector):
         if "recurrent_state" not in state_dict:
             return
         self._acted = int(state_dict["acted"])
-        self._runner.initial_state()
-        self._state = self._as_state(state_dict["recurrent_state"])
-        self._window_starts.extend(self._as_state(state) for state in state_dict["window_starts"])
+        initial = self._runner.initial_state()
+        self._state = self._as_state(state_dict["recurrent_state"], initial)
+        starts = [self._as_state(state, initial) for state in state_dict["window_starts"]]
+        if self._acted and len(starts) != -(-self._overlap // self._steps):
+            raise ValueError(f"the saved collector has {len(starts)} states before its coming windows")
+        self._window_starts.extend(starts)
         self._obs, self._buffer = {}, None  # somebody may still hold batches of the old storage
         if not state_dict.get("moved", self._acted == 0):  # where others had moved the env, _look begins anew
             self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
 
-    def _as_state(self, state: dict[str, Any]) -> TensorDict:
-        return TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
+    def _as_state(self, state: dict[str, Any], like: TensorDict) -> TensorDict:
+        """A saved recurrent state; a ValueError if its entries are not those of the policy."""
+        saved = TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
+        layouts = [{key: (value.dtype, value.shape) for key, value in td.items(True, True)} for td in (saved, like)]
+        if layouts[0] != layouts[1]:
+            raise ValueError("the saved recurrent state is not one of this policy")
+        return saved
 
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
         """Give the storage back. The arguments are ignored: no process has to end, the env has nothing to close."""

@@ -302,4 +302,7 @@ class RolloutBuffer:
             if shapes[0] != shapes[1]:
                 raise ValueError(f"saved overlap {name!r} is {shapes[0]}, this collector's {shapes[1]}")
             here[name].copy_(there[name])
-        self._wanted = state["wanted"].cpu().numpy().copy()
+        wanted = state["wanted"].cpu().numpy().copy()
+        if (wanted.dtype, wanted.shape) != (self._wanted.dtype, self._wanted.shape):
+            raise ValueError(f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}")
+        self._wanted = wanted
