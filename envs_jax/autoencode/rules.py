@@ -1,6 +1,6 @@
 """The rules of AutoEncode: watch a row of cards, then name their suits from the last to the first."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 

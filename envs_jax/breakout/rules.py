@@ -1,6 +1,6 @@
 """The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed [row, column]."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

@@ -4,7 +4,7 @@ Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole
 (ICML 2026).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """The rules of CountRecall: in every turn say how often a suit has been dealt before."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 

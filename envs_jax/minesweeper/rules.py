@@ -1,6 +1,6 @@
 """The rules of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y]."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

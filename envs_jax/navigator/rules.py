@@ -1,6 +1,6 @@
 """The rules of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y]."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

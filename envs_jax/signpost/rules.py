@@ -1,6 +1,6 @@
 """The rules of Signpost: read the sign, walk to the gate, press what the sign said."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

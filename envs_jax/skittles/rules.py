@@ -1,6 +1,6 @@
 """The rules of Skittles: at every step a new row with one block falls in at the top; the agent dodges at the bottom."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

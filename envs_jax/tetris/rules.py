@@ -3,7 +3,7 @@
 Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits beyond the board
 are set, so that walls and floor are blocks like any other."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
