@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import UNSET, Array, Game, keeps_ends, stay
+from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, keeps_ends, stay
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
@@ -30,8 +30,8 @@ class Batch(NamedTuple):
     last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
     step_count: Array  # int32 [N], steps since the episode began
     episode_reward: Array  # float32 [N], undiscounted return so far
-    terminated: Array = UNSET  # bool [N], whether the game has ended; None: nowhere
-    truncated: Array = UNSET  # bool [N], whether the time limit was reached; None: nowhere
+    terminated: Array = UNSET  # bool [N], whether the game has ended, where the state does not say it
+    truncated: Array = UNSET  # bool [N], whether the time limit was reached, where the state does not say it
 
 
 class Outcome(NamedTuple):
@@ -178,55 +178,55 @@ class BatchedGame(Steps, Generic[State]):
     def _init(self, keys: Array, partial: Array) -> Batch:
         key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
-        last_action = jnp.zeros(keys.shape[0], jnp.int32)
-        return Batch(key, state, jnp.asarray(partial), last_action, *_nothing_yet(last_action))
+        zeros = jnp.zeros(keys.shape[0], jnp.int32)
+        return with_flags(Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32)))
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
+        batch = with_flags(batch)
         key, now = _split(batch.key)
         action = jnp.asarray(action, jnp.int32)
         state, reward, terminated, truncated = jax.vmap(self.game.step)(now, batch.state, action)
-        batch = _with_flags(batch)
-        ended = batch.terminated | batch.truncated
+        ended = _ended(batch)
         if not keeps_ends(batch.state):
             state = stay(ended, batch.state, state)
             reward = jnp.where(ended, jnp.float32(0), reward)
             terminated = jnp.where(ended, batch.terminated, terminated)
             truncated = jnp.where(ended, batch.truncated, truncated)
-        stepped = Batch(
-            jnp.where(ended[:, None], batch.key, key),
-            state,
-            batch.partial,
-            action,
-            batch.step_count + ~ended,
-            batch.episode_reward + reward,
-            terminated,
-            truncated,
+            batch = batch._replace(terminated=terminated, truncated=truncated)
+        stepped = batch._replace(
+            key=jnp.where(ended[:, None], batch.key, key),
+            state=state,
+            last_action=action,
+            step_count=batch.step_count + ~ended,
+            episode_reward=batch.episode_reward + reward,
         )
         return stepped, Outcome(reward, terminated, truncated, terminated | truncated)
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
         key, first = _split(batch.key)
         state = jax.vmap(self.game.reset)(first)
-        counts = _nothing_yet(batch.step_count)
-        fresh = Batch(key, state, batch.partial, batch.last_action, *counts)
-        return Batch(*choose_rows(mask, fresh, _with_flags(batch)))
+        zeros = jnp.zeros_like(batch.step_count)
+        fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
+        return Batch(*choose_rows(mask, with_flags(fresh), with_flags(batch)))
 
     def _render(self, batch: Batch) -> Array:
         return jax.vmap(self.game.render)(batch.state, batch.partial)
 
 
-def _with_flags(batch: Batch) -> Batch:
-    """The batch with false for flags that are None."""
+def with_flags(batch: Batch) -> Batch:
+    """The batch with the flags of an end where they belong: in the state if that keeps them, else in the batch."""
     no = jnp.zeros(batch.step_count.shape, bool)
-    terminated = no if batch.terminated is None else batch.terminated
-    truncated = no if batch.truncated is None else batch.truncated
-    return batch._replace(terminated=terminated, truncated=truncated)
+    keeper = batch.state if keeps_ends(batch.state) else batch
+    flags = {name: no for name in ENDS if getattr(keeper, name) is UNSET}
+    if keeper is batch:
+        return batch._replace(**flags)
+    return batch._replace(state=batch.state._replace(**flags), terminated=UNSET, truncated=UNSET)
 
 
-def _nothing_yet(like: Array) -> tuple[Array, Array, Array, Array]:
-    """Counts and flags of N episodes that begin: ``step_count`` to ``truncated`` of a batch."""
-    zeros = jnp.zeros_like(like)
-    return zeros, zeros.astype(jnp.float32), zeros > 0, zeros > 0
+def _ended(batch: Batch) -> Array:
+    """Which episodes of a batch with flags have ended: bool [N]."""
+    keeper = batch.state if keeps_ends(batch.state) else batch
+    return jnp.logical_or(keeper.terminated, keeper.truncated)
 
 
 @partial(jax.vmap, out_axes=0)

@@ -18,7 +18,8 @@ Drawn = TypeVar("Drawn", contravariant=True)
 NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
-UNSET: Any = None  # the flags of an end in a state that no wrapped method of ``Game`` has given yet
+ENDS = ("terminated", "truncated")  # the flags of an end
+UNSET: Any = None  # such a flag in a state that no wrapped method of ``Game`` has given yet
 
 
 def keeps_ends(state: Any) -> bool:
@@ -27,7 +28,7 @@ def keeps_ends(state: Any) -> bool:
     It is if it is a named tuple with fields ``terminated`` and ``truncated`` that are bools, or None before a wrapped
     ``reset`` or ``step`` of :class:`Game` has set them.
     """
-    if not {"terminated", "truncated"} <= set(getattr(state, "_fields", ())):
+    if not set(ENDS) <= set(getattr(state, "_fields", ())):
         return False
     flags = (state.terminated, state.truncated)
     return all(flag is None or str(getattr(flag, "dtype", "")) == "bool" for flag in flags)
@@ -35,7 +36,7 @@ def keeps_ends(state: Any) -> bool:
 
 def _with_flags(state: Any) -> Any:
     """The state, which keeps ends, with false for flags that are None."""
-    missing = [name for name in ("terminated", "truncated") if getattr(state, name) is None]
+    missing = [name for name in ENDS if getattr(state, name) is UNSET]
     return state._replace(**{name: jnp.bool_(False) for name in missing})
 
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps
-from arcade_torch.envs_jax.game import NUM_ACTIONS, Array, Game
+from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps, with_flags
+from arcade_torch.envs_jax.game import NUM_ACTIONS, UNSET, Array, Game
 from arcade_torch.envs_jax.settings import compiled, raw_key
 
 
@@ -175,12 +175,19 @@ class MixedGames(Steps):
 
     def _join(self, batches: Sequence[Batch]) -> Batch:
         """The batch of all games from that of each."""
-        shared: Batch = _concatenate([batch._replace(state=None) for batch in batches])
+        shared: Batch = _concatenate(_without_states(batches))
         states = {game.id: batch.state for game, batch in zip(self.game.games, batches, strict=True)}
         return shared._replace(state=states)
 
 
 Batched = BatchedGame[Any] | MixedGames
+
+
+def _without_states(batches: Sequence[Batch]) -> list[Batch]:
+    """Batches without their states, all with flags of an end or none of them: one a game needs them, no other reads."""
+    if all(batch.terminated is UNSET for batch in batches):
+        return [batch._replace(state=None) for batch in batches]
+    return [with_flags(batch._replace(state=None)) for batch in batches]
 
 
 def _rows_of(tree: Any, rows: slice) -> Any:

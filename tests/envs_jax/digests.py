@@ -33,7 +33,6 @@ SETTINGS = {
     "keys": {"JAX_LEGACY_PRNG_KEY": "error", "JAX_ENABLE_CUSTOM_PRNG": "1", "JAX_DEBUG_KEY_REUSE": "1"},
     "debug": {"JAX_DEBUG_NANS": "1", "JAX_DEBUG_INFS": "1", "JAX_DEFAULT_MATMUL_PRECISION": "highest"},
 }
-EAGER = {"JAX_DISABLE_JIT": "1", "JAX_ENABLE_X64": "1"}  # takes minutes a game where it is not compiled all the same
 TWINS = {"full": False, "partial": True}
 
 
