@@ -125,6 +125,8 @@ class SequenceReplay:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go back to a saved moment; a ``CheckpointError`` if a file is missing or damaged."""
+        if not isinstance(state, Mapping) or not isinstance(state.get("files"), Mapping):
+            raise CheckpointError("the checkpoint does not name the windows of a replay")
         require(type(state["added"]) is int and 0 <= state["added"] < 10**12, "added", state["added"], "a count")
         self._added = state["added"]
         self._segments.clear()

@@ -192,7 +192,7 @@ def cached_arrays(
     if kept is not None:
         return kept
     arrays = {**compute(), "options": np.array(text)}
-    if (run / "config.json").is_file() and os.access(run, os.W_OK):
+    if (run / "config.json").is_file() and os.access(run, os.W_OK) and not file.parent.is_symlink():
         write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
     return arrays
 

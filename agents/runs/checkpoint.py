@@ -14,6 +14,8 @@ Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights
 import io
 import os
 import pickle
+import pickletools
+import re
 import shutil
 import warnings
 import zipfile
@@ -28,6 +30,7 @@ from torch import Tensor
 
 from arcade_torch.agents.config import TrainConfig, differing_fields, require
 from arcade_torch.agents.runs.files import (
+    MOST_JSON,
     MOST_TENSORS,
     CheckpointError,
     checksum,
@@ -43,7 +46,16 @@ from arcade_torch.agents.runs.files import (
 FORMAT = 2
 """Format of checkpoints and run folders; 1 is that of arcade-torch 0.1, which is refused."""
 KEEP = 2
+MOST_WEIGHTS = 2 * 2**30
+"""Bytes of the largest weights that are read."""
+_PLAIN = re.compile(
+    r"torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage|collections OrderedDict"
+    r"|torch (Size|device|u?int\d+|b?float\d+|bool)"
+)
+"""What ``torch.save`` names in tables of tensors, numbers and text."""
 _WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.json", "latest"
+
+_MOST_BYTES = {_WEIGHTS: MOST_WEIGHTS, _TRAINER: MOST_TENSORS}
 
 
 class _OtherRunError(CheckpointError):
@@ -96,7 +108,10 @@ def _write_parts(
     """Write the files of a checkpoint into a folder that is made."""
     draft.mkdir(parents=True)
     tensors = {key: value.detach().cpu().contiguous().clone() for key, value in weights.items()}
-    write_atomic(draft / _WEIGHTS, save(tensors))
+    packed = save(tensors)
+    if len(packed) > MOST_WEIGHTS:
+        raise CheckpointError(f"the weights take {len(packed):,} bytes, at most {MOST_WEIGHTS:,}: use a smaller network")
+    write_atomic(draft / _WEIGHTS, packed)
     state = io.BytesIO()
     torch.save(trainer, state)
     write_atomic(draft / _TRAINER, state.getvalue())
@@ -202,21 +217,34 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 
 def _load_weights(file: Path) -> dict[str, Tensor]:
-    return load(read_bytes(file, MOST_TENSORS))
+    return load(read_bytes(file, MOST_WEIGHTS))
 
 
 def _load_tensors(file: Path) -> dict[str, Any]:
-    """What ``torch.save`` wrote, unless it is packed: a small file could hold more than memory does."""
+    """What ``torch.save`` wrote, if it takes no more memory than the file has bytes."""
     with open_regular(file, MOST_TENSORS) as stream:
         with zipfile.ZipFile(stream) as archive:
-            packed = [entry.filename for entry in archive.infolist() if entry.compress_type != zipfile.ZIP_STORED]
-        if packed:
-            raise ValueError(f"{packed[0]} is compressed, which torch.save does not do")
+            _check_archive(archive)
         stream.seek(0)
         state: Any = torch.load(stream, map_location="cpu", weights_only=True)
         if not isinstance(state, dict):
             raise ValueError("it holds no table of names and values")
         return state
+
+
+def _check_archive(archive: zipfile.ZipFile) -> None:
+    """Refuse parts that are packed, and tables that call for anything but tensors: both may grow without bound."""
+    for entry in archive.infolist():
+        if entry.compress_type != zipfile.ZIP_STORED:
+            raise ValueError(f"{entry.filename} is compressed, which torch.save does not do")
+        if not entry.filename.endswith(".pkl"):
+            continue
+        if entry.file_size > MOST_JSON:
+            raise ValueError(f"{entry.filename} has {entry.file_size:,} bytes, at most {MOST_JSON:,} are read")
+        for operation, argument, _ in pickletools.genops(archive.read(entry)):
+            called = operation.name in ("GLOBAL", "INST", "STACK_GLOBAL")
+            if called and not _PLAIN.fullmatch(str(argument)):
+                raise ValueError(f"it names {argument}, which is no part of a trainer's state")
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -238,7 +266,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 def _read_part(file: Path, sums: dict[str, str], read: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
     """What a part of a checkpoint holds, if it is the one that was saved."""
     try:
-        if checksum(file) == sums.get(file.name):
+        if checksum(file, _MOST_BYTES[file.name]) == sums.get(file.name):
             return read(file)
         damage = f"does not have the checksum in {_META}"
     except FileNotFoundError:

@@ -55,6 +55,15 @@ def is_ours(path: Path, kind: str) -> bool:
     return path.is_dir() if kind.startswith("checkpoint") else path.is_file()
 
 
+def is_inside(folder: Path, name: str) -> bool:
+    """Whether a relative name leads to a place for a file below a folder, through no link and nothing upwards."""
+    parts = name.split("/")
+    if "\0" in name or any(part in ("", ".", "..") for part in parts):
+        return False
+    places = [folder.joinpath(*parts[:length]) for length in range(1, len(parts))]
+    return not any(place.is_symlink() for place in places)
+
+
 def open_regular(path: Path, most_bytes: int | None = MOST_TEXT) -> BinaryIO:
     """Open a file for reading, if it is a regular one of a size that can be meant.
 
@@ -166,10 +175,10 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"{path} does not hold JSON: {error}") from error
 
 
-def checksum(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal."""
+def checksum(path: Path, most_bytes: int = MOST_TENSORS) -> str:
+    """SHA-256 of a regular file, hexadecimal; raises as :func:`open_regular`."""
     digest = hashlib.sha256()
-    with open_regular(path, MOST_TENSORS) as stream:
+    with open_regular(path, most_bytes) as stream:
         while block := stream.read(2**20):
             digest.update(block)
     return digest.hexdigest()

@@ -75,12 +75,16 @@ def _is_finite(value: Any) -> bool:
 
 
 def _described(value: Any) -> str:
-    """A value in a few words."""
+    """A value in a few words; a file may hold one that is too long to print."""
     if isinstance(value, Tensor):
         return f"a tensor {str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
     if isinstance(value, Mapping | list | tuple):
         return f"a {type(value).__name__} of {len(value)}"
-    return repr(value)[:60]
+    if isinstance(value, str):
+        return repr(value[:40])
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < LARGEST):
+        return repr(value)
+    return f"a {type(value).__name__}"
 
 
 def _require(fits: bool, name: str, saved: Any, allowed: str) -> None:

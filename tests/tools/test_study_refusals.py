@@ -110,7 +110,7 @@ def test_what_is_no_regular_file_is_no_study(tmp_path: Path, capsys: pytest.Capt
     for path in (tmp_path / "pipe.toml", tmp_path, large, Path("/dev/zero")):
         assert cli.main(["study", str(path), "--dry-run"]) == 2
         said = capsys.readouterr().err
-        assert ("no regular file" in said or "bytes" in said) and said.count("\n") == 1
+        assert ("not a regular file" in said or "bytes" in said) and said.count("\n") == 1
 
 
 @pytest.mark.parametrize(("error", "code"), [(ValueError("out of paper"), 1), (OSError(5, "Input/output error"), 1)])

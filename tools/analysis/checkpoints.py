@@ -12,6 +12,7 @@ import numpy as np
 
 import arcade_torch
 from arcade_torch.agents import load
+from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
@@ -56,8 +57,7 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Run folders and checkpoints as they are, and the finished runs below other folders; notes on the rest."""
     found, notes = list[Path](), list[str]()
     for path in paths:
-        has_checkpoint = next((path / "checkpoints").glob("frames-*"), None) is not None
-        if has_checkpoint or any((path / name).exists() for name in SETTINGS_FILES):
+        if list_checkpoints(path / "checkpoints") or any((path / name).exists() for name in SETTINGS_FILES):
             found.append(path)
         else:
             runs = find_runs([path])

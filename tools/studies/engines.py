@@ -23,7 +23,16 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.runs.files import read_json, write_atomic
+from arcade_torch.agents.runs.files import (
+    MOST_JSON,
+    MOST_TENSORS,
+    is_inside,
+    open_append,
+    read_bytes,
+    read_end,
+    read_json,
+    write_atomic,
+)
 from arcade_torch.tools.errors import need, one_line, reason
 from arcade_torch.tools.machine import available_cores, keep_freed_memory
 from arcade_torch.tools.options import VARIABLE, load_extensions
@@ -77,8 +86,8 @@ class Job(NamedTuple):
     def add_to_log(self, text: str) -> None:
         """Add text to the log; its folder is made."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("a", encoding="utf-8") as stream:
-            stream.write(text)
+        with open_append(self.log) as stream:
+            stream.write(text.encode())
 
 
 class JobResult(NamedTuple):
@@ -148,7 +157,7 @@ class Processes:
     def _start(self, job: Job, cores: set[int]) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-        with job.log.open("ab") as log:
+        with open_append(job.log) as log:
             process = subprocess.Popen(
                 [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
                 stdin=subprocess.DEVNULL,
@@ -180,7 +189,10 @@ def _error(code: int, log: Path) -> str:
     """Why a worker failed: its last words, and the signal that ended it; empty for success."""
     if code == 0:
         return ""
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    try:
+        lines = read_end(log).strip().splitlines()
+    except (OSError, ValueError):  # somebody removed it, or put something else in its place
+        lines = []
     last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
     if code < 0:
         return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")
@@ -241,7 +253,7 @@ class Ray(RayOptions):
                     while waiting and len(flying) < (self.workers or len(waiting) + len(flying)):
                         job = waiting.pop(0)
                         there = job._replace(config=job.config.absolute(), folder=job.folder.absolute())
-                        flying[task.remote(there, job.config.read_bytes())] = job
+                        flying[task.remote(there, read_bytes(job.config, MOST_JSON))] = job
                     ready, _ = ray.wait(list(flying), num_returns=1, timeout=1.0)
                     if not self.address and not ray.cluster_resources().get("CPU"):  # it began with all cores
                         raise ClusterLostError(
@@ -295,8 +307,8 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     traceback (empty for success), and where the disk is not shared its small files: of a failed run no checkpoints.
     """
     shared, files = False, dict[str, bytes]()
-    with contextlib.suppress(OSError):
-        shared = job.config.read_bytes() == config
+    with contextlib.suppress(OSError, ValueError):
+        shared = read_bytes(job.config, MOST_JSON) == config
     if not shared:
         key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]  # another attempt finds it again
         here = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
@@ -304,8 +316,10 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     error, trace = job.attempt()
     if not shared:
         kept = _NOT_SENT | ({"checkpoints"} if error else set())
-        found = {path.relative_to(job.folder): path for path in job.folder.rglob("*") if path.is_file()}
-        files = {name.as_posix(): path.read_bytes() for name, path in found.items() if not kept & set(name.parts)}
+        for path in job.folder.rglob("*"):
+            name = path.relative_to(job.folder)
+            if path.is_file() and not path.is_symlink() and not kept & set(name.parts):
+                files[name.as_posix()] = read_bytes(path, MOST_TENSORS)
         if not error:
             shutil.rmtree(job.config.parent)
     return error, trace, files
@@ -317,6 +331,9 @@ def _result(ray: Any, reference: Any, job: Job) -> JobResult:
         error, trace, files = ray.get(reference)
     except ray.exceptions.RayError as lost:
         return JobResult(job.name, f"its worker was lost: {type(lost).__name__}: {one_line(lost)[:200]}")
+    for name in files:
+        if not is_inside(job.folder, name):
+            return JobResult(job.name, f"its worker sent {name!r}, which is no file of a run")
     for name in sorted(files, key=lambda name: name == "eval.json"):
         write_atomic(job.folder / name, files[name])
     job.add_to_log(trace)

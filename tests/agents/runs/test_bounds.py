@@ -161,3 +161,58 @@ def test_a_finished_run_that_may_not_be_read_is_not_evaluated_again(
     monkeypatch.setattr("arcade_torch.agents.runs.folder.read_json", refuse)
     with pytest.raises(RunFolderError, match=r"eval.json may not be read: Permission denied"):
         RunFolder(tmp_path).finished()
+
+
+# -- tensors -----------------------------------------------------------------------------------------------------------
+
+
+class Claim:
+    """A few bytes that become something large when they are read."""
+
+    def __init__(self, call: object, *arguments: object) -> None:
+        self.reduced = (call, arguments)
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self.reduced
+
+
+def forged(folder: Path, part: str, data: bytes | None) -> Path:
+    """A checkpoint with another part, and its checksum; without data a sparse file of 3 GiB."""
+    path = checkpoints.save_checkpoint(folder, CONFIG, 64, {"w": torch.zeros(2)}, {"frames": 64})
+    with (path / part).open("wb") as stream:
+        stream.truncate(3 * 2**30) if data is None else stream.write(data)
+    meta = read_json(path / "meta.json")
+    meta["sha256"][part] = files.checksum(path / part) if data is not None else ""
+    write_json(path / "meta.json", meta)
+    return path
+
+
+def test_weights_have_a_bound_of_their_own(tmp_path: Path) -> None:
+    path = forged(tmp_path, "weights.safetensors", None)
+    with pytest.raises(CheckpointError, match="bytes, at most 2,147,483,648 are read"):
+        checkpoints.load_checkpoint(path)
+
+
+@pytest.mark.parametrize("size", [10**12, 10**9])
+def test_a_state_makes_nothing_but_tensors_and_tables(tmp_path: Path, size: int) -> None:
+    """Before: torch's reader without pickle made bytes of any number that a file names."""
+    packed = io.BytesIO()
+    torch.save({"frames": 64, "a": Claim(bytearray, size)}, packed)
+    path = forged(tmp_path, "trainer.pt", packed.getvalue())
+    tracemalloc.start()
+    try:
+        with pytest.raises(CheckpointError, match="names .*bytearray, which is no part of a trainer's state"):
+            checkpoints.load_checkpoint(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**24
+
+
+def test_every_kind_of_tensor_is_a_part_of_a_state(tmp_path: Path) -> None:
+    kinds = (torch.float32, torch.bfloat16, torch.float16, torch.int8, torch.uint8, torch.int64, torch.bool)
+    state = {str(kind): torch.ones(2, dtype=kind) for kind in kinds} | {"p": torch.nn.Parameter(torch.ones(2))}
+    state |= {"kind": torch.float32, "size": torch.ones(2, 3).size(), "device": torch.device("cpu")}
+    path = checkpoints.save_checkpoint(tmp_path, CONFIG, 64, {"w": torch.zeros(2)}, state)
+    loaded = checkpoints.load_checkpoint(path).trainer
+    assert loaded is not None and set(loaded) == set(state)

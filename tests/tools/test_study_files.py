@@ -1,0 +1,122 @@
+"""Files of a study and of an analysis that somebody else made: nothing is waited for, nothing outside is written."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arcade_torch.tools.files import cached_arrays
+from arcade_torch.tools.studies import engines
+from arcade_torch.tools.studies.engines import Job, carry_out
+from arcade_torch.tools.studies.grid import MOST_BYTES, Study
+
+
+def job(folder: Path) -> Job:
+    return Job("run", folder / "configs" / "run.json", folder / "runs" / "run", folder / "logs" / "run.log")
+
+
+@pytest.mark.timeout(20)
+def test_a_log_that_is_a_pipe_or_a_link_is_refused(tmp_path: Path) -> None:
+    """Before: a pipe was waited for, for ever, and a link was followed."""
+    outside = tmp_path / "outside"
+    outside.write_text("mine")
+    log = job(tmp_path).log
+    log.parent.mkdir()
+    log.symlink_to(outside)
+    with pytest.raises(ValueError, match=r"run.log is not a regular file"):
+        job(tmp_path).add_to_log("text")
+    assert outside.read_text() == "mine"
+    log.unlink()
+    os.mkfifo(log)
+    with pytest.raises(ValueError, match=r"run.log is not a regular file"):
+        job(tmp_path).add_to_log("text")
+    assert engines._error(1, log) == "exit code 1"
+    log.unlink()
+    assert engines._error(1, log) == "exit code 1"
+    job(tmp_path).add_to_log("one\narcade-torch: last\n")
+    assert engines._error(1, log) == "last"
+
+
+class Returned:
+    """A Ray whose task gives back some files."""
+
+    class exceptions:
+        RayError = ConnectionError
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = files
+
+    def get(self, reference: object) -> tuple[str, str, dict[str, bytes]]:
+        return "", "", self.files
+
+
+@pytest.mark.parametrize("name", ["../evil", "../../evil", "a/../../evil", "{outside}/evil", "", ".", "a\0b"])
+def test_files_that_travel_back_stay_in_the_folder_of_their_run(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "study"
+    returned: Any = Returned({"eval.json": b"{}", name.format(outside=tmp_path): b"x"})
+    result = engines._result(returned, None, job(folder))
+    assert "which is no file of a run" in result.error
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_files_do_not_travel_back_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    run = job(tmp_path).folder
+    run.mkdir(parents=True)
+    (run / "tensorboard").symlink_to(tmp_path / "outside")
+    returned: Any = Returned({"tensorboard/events": b"x"})
+    assert "which is no file of a run" in engines._result(returned, None, job(tmp_path)).error
+    assert list((tmp_path / "outside").iterdir()) == []
+
+
+@pytest.mark.timeout(30)
+def test_only_regular_files_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipe in the folder of a run, and a link to a file of the machine, are left where they are."""
+    monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path))
+    secret = tmp_path / "secret"
+    secret.write_text("mine")
+
+    def attempt(self: Job) -> tuple[str, str]:
+        self.folder.mkdir(parents=True)
+        os.mkfifo(self.folder / "pipe")
+        (self.folder / "link").symlink_to(secret)
+        (self.folder / "eval.json").write_text("{}")
+        return "", ""
+
+    monkeypatch.setattr(Job, "attempt", attempt)
+    _, _, files = carry_out(job(tmp_path / "absent"), b"{}")
+    assert files == {"eval.json": b"{}"}
+
+
+@pytest.mark.timeout(20)
+def test_a_study_is_a_regular_file_of_a_sensible_size(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match="not a regular file"):
+        Study.load(path)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match="not a regular file"):
+        Study.load(path)
+    path.unlink()
+    path.write_bytes(b"#" * (MOST_BYTES + 1))
+    with pytest.raises(ValueError, match="bytes, at most 131,072 are read"):
+        Study.load(path)
+    path.write_text("a = " + "[" * 100_000)
+    with pytest.raises(ValueError, match="is not TOML"):
+        Study.load(path)
+    path.write_text(".".join(["a"] * 60_000) + " = 1")
+    with pytest.raises(ValueError, match="more than 1,000 dots"):
+        Study.load(path)
+
+
+def test_an_analysis_writes_behind_no_link(tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    (run / "analysis").symlink_to(tmp_path / "outside")
+    arrays = cached_arrays(run, "measure", {"a": 1}, lambda: {"x": np.zeros(2)})
+    assert arrays["x"].sum() == 0 and list((tmp_path / "outside").iterdir()) == []
