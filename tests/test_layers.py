@@ -29,7 +29,7 @@ LIBRARIES = {
     "agents": {"torch", "torchrl", "tensordict", "jax", "numpy", "scipy", "safetensors", "filelock"},
     "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},
 }
-MAX_FILE_LINES = 400
+MAX_FILE_LINES = 450
 MAX_FUNCTION_LINES = 60
 
 

@@ -185,5 +185,5 @@ def test_an_option_that_is_true_or_false_takes_no_text(algorithm, name):
 
 @pytest.mark.parametrize("name", ["hidden_size", "layers"])
 def test_a_network_without_any_size_is_refused_in_one_line(name):
-    with pytest.raises(ValueError, match=rf"^{name} must be at least 1, got -4$"):
+    with pytest.raises(ValueError, match=rf"^{name} must be at least 1 and at most \d+, got -4$"):
         build_network(preset("smoke", memory="gru", network_options={name: -4}))

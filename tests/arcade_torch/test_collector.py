@@ -573,9 +573,9 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
     [
         ({"frames_per_batch": 7}, ValueError, "frames_per_batch is 7, expected an int multiple of num_envs (6)"),
         ({"frames_per_batch": 0}, ValueError, "frames_per_batch is 0, expected an int multiple"),
-        ({"frames_per_batch": 48.0}, ValueError, "frames_per_batch is 48.0, expected an int multiple"),
+        ({"frames_per_batch": 48.0}, TypeError, "frames_per_batch is 48.0, expected an int"),
         ({"overlap": -1}, ValueError, "overlap is -1, expected an int of 0 or more"),
-        ({"overlap": 2.0}, ValueError, "overlap is 2.0, expected an int of 0 or more"),
+        ({"overlap": 2.0}, TypeError, "overlap is 2.0, expected an int"),
         ({"final_frames": "some"}, ValueError, "final_frames is 'some', allowed: 'all', 'truncated', 'none'"),
         ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
     ],

@@ -17,8 +17,14 @@ def batched(id, **options):
     return BatchedGame(make(id, **options))
 
 
+def going_on(batch):
+    """The batch with no episode ended: what the rules do beyond an end, where an episode stays."""
+    no = jnp.zeros(len(batch.step_count), bool)
+    return batch._replace(state=batch.state._replace(terminated=no, truncated=no))
+
+
 class Walk:
-    """A rollout without resets: states, outcomes and frames of N envs over T steps, as numpy arrays [T, N, ...]."""
+    """A rollout without resets, and beyond ends: states and outcomes of N envs over T steps, numpy [T, N, ...]."""
 
     def __init__(self, game, actions, seed=0):
         envs = actions.shape[1]
@@ -26,7 +32,7 @@ class Walk:
         batch = compiled.init(env_keys(seed, envs), jnp.zeros(envs, bool))
         states, outcomes = [batch.state], []
         for action in actions:
-            batch, outcome = compiled.step(batch, action.astype(np.int32))
+            batch, outcome = compiled.step(going_on(batch), action.astype(np.int32))
             states.append(batch.state)
             outcomes.append(outcome)
         self.states = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *states)
@@ -56,4 +62,4 @@ def draw(game, state, partial):
     return np.asarray(_compiled[key](state, partial))
 
 
-__all__ = ["ALL_IDS", "Walk", "batched", "draw", "make", "one", "random_actions"]
+__all__ = ["ALL_IDS", "Walk", "batched", "draw", "going_on", "make", "one", "random_actions"]

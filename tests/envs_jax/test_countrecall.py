@@ -15,7 +15,7 @@ from arcade_torch.envs_jax.countrecall.oracle import SKIP, best_plan, right_answ
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render import Slot
 
-from .conftest import batched, draw, one, random_actions
+from .conftest import batched, draw, going_on, one, random_actions
 from .test_autoencode import read_history
 
 LEVELS = {"CountRecallEasy": (26, 2, 13), "CountRecallMedium": (52, 2, 26), "CountRecallHard": (78, 4, 20)}
@@ -139,7 +139,7 @@ def test_whatever_is_played_the_score_equals_a_recount(seed, up):
     answer, turn, score = np.zeros((3, 16), int)
     running = np.ones(16, bool)
     for action in actions:
-        batch, outcome = compiled.step(batch, action)
+        batch, outcome = compiled.step(going_on(batch), action)
         answer = np.clip(answer + (action == UP) - (action == DOWN), 0, 13)
         for env in np.flatnonzero((action == FIRE) & running):
             dealt = np.sum(cards[env, : turn[env]] == queries[env, turn[env]])

@@ -18,7 +18,7 @@ from arcade_torch.envs_jax.navigator.rules import FREE, TNT, TREASURE, draw_dist
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import MAUVE, RED, SKY, YELLOW
 
-from .conftest import batched, draw, one
+from .conftest import batched, draw, going_on, one
 
 SIDES = {"NavigatorEasy": 8, "NavigatorMedium": 10, "NavigatorHard": 12}
 KEY = jax.random.PRNGKey(0)
@@ -204,7 +204,7 @@ def test_any_play_ends_as_its_path_says(seed, actions):
     board, envs = np.asarray(batch.state.board), np.arange(16)
     alive, expected, total = np.ones(16, bool), np.zeros(16), np.zeros(16)
     for action in actions:
-        batch, outcome = game.step(batch, action)
+        batch, outcome = game.step(going_on(batch), action)
         cell = board[envs, np.asarray(batch.state.x), np.asarray(batch.state.y)]
         dead, won = (action != FIRE) & (cell == TNT), (action == FIRE) & (cell == TREASURE)
         assert np.array_equal(outcome.terminated, dead | won)

@@ -14,7 +14,7 @@ from arcade_torch.envs_jax.skittles.oracle import UNSEEN, Planner, outlook
 from arcade_torch.envs_jax.skittles.picture import AGENT
 from arcade_torch.envs_jax.skittles.rules import NO_BLOCK, shown
 
-from .conftest import Walk, batched, draw, one, random_actions
+from .conftest import Walk, batched, draw, going_on, one, random_actions
 
 LANES = {"SkittlesEasy": range(1, 9), "SkittlesMedium": range(2, 9), "SkittlesHard": range(2, 8)}
 HARD = "SkittlesHard"
@@ -221,7 +221,7 @@ def test_blocks_colours_and_agent_can_be_read_back_from_both_twins(size):
                 codes[np.arange(16), 9, state.x] = AGENT
                 frames = compiled.render(batch._replace(partial=jnp.full(16, partial)))
                 assert np.array_equal(game.screen.board.read(np.asarray(frames), 10, 10), codes)
-        batch, _ = compiled.step(batch, action)
+        batch, _ = compiled.step(going_on(batch), action)
 
 
 def test_twins_are_equal_in_the_first_frame_and_differ_by_hidden_blocks_later():

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.envs_jax import make
 from arcade_torch.tools import cli, players
-from arcade_torch.tools.analysis.bootstrap import student_half_width
 from arcade_torch.tools.play.recording import scene, sheet
 
 
