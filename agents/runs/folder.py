@@ -130,6 +130,8 @@ class RunFolder:
         if status == "running" and now - self._reported < 1.0:
             return
         self._reported = now
+        if not self._config.is_file():  # somebody removed the folder: it is not made again for this
+            return
         progress = {"frames": frames, "total_frames": total_frames, "status": status, **more}
         write_json(self.path / "progress.json", progress)
 
