@@ -26,12 +26,13 @@ NUM_NUMBERS = 5
 # One compiled shape draws final observations: an eighth of the batch, at least 4 frames, of at most 8 different steps.
 _SHARE, _MIN_FRAMES, _MAX_STEPS = 8, 4, 8
 Spare = jax.Array | None
+Ended = tuple[jax.Array, jax.Array]  # bool [N] each: where the game has ended, and where the time limit was reached
 
 
 class Step(NamedTuple):
     """What the fused step computes."""
 
-    root: Batch  # after the resets: the live state, so copy what is exported of it
+    root: Batch  # after the resets, so without flags of an end: the live state, so copy what is exported of it
     final_state: Any  # the games' state before the resets
     pixels: jax.Array | None  # uint8 [N, S, S, 3] of the root; None where they were drawn into a canvas
     # int32 [N, 5]: the outcome and the counts before the resets, in one array for one export. Of the reward and of the
@@ -63,7 +64,7 @@ class CompiledGame:
         self._calls_back: bool | None = None  # not known yet
         self._known: dict[tuple[int, ...], int] = {}  # canvases by shape: compiled functions when it was last used
         self.reset_or_step = compiled(self._reset_or_step)
-        self.step_only = compiled(self._step_only, donate_argnums=2, keep_unused=True)
+        self.step_only = compiled(self._step_only, donate_argnums=3, keep_unused=True)
         self.draw = compiled(lambda batch, spare: self.batched.render(batch), donate_argnums=1, keep_unused=True)
         draw_rows = (partial(_draw_rows, group) for group in self.batched.groups)
         self.draw_rows = tuple(compiled(draw, donate_argnums=4, keep_unused=True) for draw in draw_rows)
@@ -71,7 +72,7 @@ class CompiledGame:
     def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack."""
         root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
-        return Step(root, stepped.state, pixels, _pack(stepped, outcome))
+        return Step(self.batched.without_ends(root), stepped.state, pixels, _pack(stepped, outcome))
 
     def step_into(self, canvas: "Canvas", at: int, batch: Batch, action: Any) -> Step:
         """Step as ``step`` does and draw into ``canvas[:, at]``; whatever interrupts, the canvas keeps its memory.
@@ -114,14 +115,18 @@ class CompiledGame:
             self._calls_back = "callback" in text or "ffi_call" in text
         return self._calls_back
 
-    def _step_only(self, batch: Batch, action: jax.Array, spare: Spare = None) -> tuple[Batch, jax.Array, jax.Array]:
-        """Step and draw, without any reset; returns the batch, the frames and the numbers."""
-        stepped, outcome, pixels = self.batched.step_render(batch, action)
-        return stepped, pixels, _pack(stepped, outcome)
+    def _step_only(
+        self, batch: Batch, ended: Ended, action: jax.Array, spare: Spare = None
+    ) -> tuple[Batch, Ended, jax.Array, jax.Array]:
+        """Step and draw, without any reset; returns the batch, where it has ended, the frames and the numbers."""
+        stepped, outcome, pixels = self.batched.step_render(self.batched.with_ends(batch, *ended), action)
+        flags = (outcome.terminated, outcome.truncated)
+        return self.batched.without_ends(stepped), flags, pixels, _pack(stepped, outcome)
 
     def _reset_or_step(self, batch: Batch, action: jax.Array, ended: jax.Array) -> tuple[Batch, Outcome]:
-        """Begin anew where ``ended`` (bool [N]) is true, and step elsewhere; nothing is drawn."""
+        """Begin anew where ``ended`` (bool [N]) is true, and step elsewhere; nothing is drawn, no batch has flags."""
         stepped, outcome = self.batched.step(batch, action)
+        stepped = self.batched.without_ends(stepped)
         # A row that begins anew has not stepped: it goes on from the random key it had, and gets nothing.
         root = self.batched.reset_where(choose_rows(ended, batch, stepped), ended)
         return root, choose_rows(ended, jax.tree.map(jnp.zeros_like, outcome), outcome)

@@ -1,7 +1,7 @@
 """``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import jax
@@ -18,6 +18,7 @@ from arcade_torch.compiled import (
     TERMINATED,
     Canvas,
     CompiledGame,
+    Ended,
     FinalObservations,
     FrameMemory,
 )
@@ -33,7 +34,19 @@ from arcade_torch.specs import RawStep, make_specs
 _INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
 _INTEGERS[torch.uint8] = np.uint8
 Place = tuple[Canvas, int, torch.Tensor]
-Live = tuple[Batch, torch.Tensor]  # the batch, and bool [N, 2]: where its last step terminated or truncated
+
+
+@dataclass
+class Live:
+    """Where the episodes are. Beside the env, for ``nn.Module`` sets attributes slowly."""
+
+    batch: Batch  # without flags of an end
+    ended: Ended
+    ends: torch.Tensor  # bool [N, 2], what a root says: where its last step terminated or truncated
+    generation: int = 0  # changes of the state
+    view: int = 0  # changes of the observability
+
+
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
 
 
@@ -108,10 +121,13 @@ class ArcadeEnv(EnvBase):
         wait_for_torch(torch_device, jax_device)
         first = self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device))
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
-        self._live = SimpleNamespace(batch=first, ends=self._no_ends, generation=0, view=0)  # nn.Module sets slowly
+        no = jax.device_put(np.zeros(num_envs, np.bool_), jax_device)
+        self._none_ended: Ended = (no, no)
+        running = self._batched.without_ends(first)
+        self._live = Live(running, self._none_ended, self._no_ends)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
         self._memory, self._ends = FrameMemory(shape, jax_device), FrameMemory(shape, jax_device)
-        self._snapshots = Snapshots(self._batched, self._live.batch, torch_device, jax_device)
+        self._snapshots = Snapshots(self._batched, first, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
         made = make_specs(num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device)
         self.action_spec, observation, self.reward_spec, self.done_spec = made
@@ -188,7 +204,7 @@ class ArcadeEnv(EnvBase):
             TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. Episodes
             that have ended stay so: a step gives their flags again and the reward 0, until they are reset.
         """
-        return self._snapshots.export(self._live.batch)
+        return self._snapshots.export(self._with_ends())
 
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Go on from a snapshot.
@@ -202,7 +218,7 @@ class ArcadeEnv(EnvBase):
         Raises:
             ValueError: The state of another game or batch size, or a broken one.
         """
-        self._go_on(self._snapshots.load(state))
+        self._go_on_from(state)
         return self.observe()
 
     def observe(self) -> TensorDict:
@@ -212,7 +228,8 @@ class ArcadeEnv(EnvBase):
             The root tensordict: what a policy acts on next; ``done`` where an episode has ended and waits for a reset.
         """
         wait_for_torch(self.device, self._jax_device)
-        return self._root(self._live.batch, to_torch(self._batched.render(self._live.batch), self.device))
+        frames = to_torch(self._batched.render(self._with_ends()), self.device)
+        return self._root(self._live.batch, self._live.ended, frames)
 
     @property
     def generation(self) -> tuple[int, int]:
@@ -226,7 +243,7 @@ class ArcadeEnv(EnvBase):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
         saved = TensorDict(state, batch_size=self.batch_size, device=self.device).clone()
-        self._go_on(self._snapshots.load(saved), saved.get("ends", None))
+        self._go_on_from(saved, saved.get("ends", None))
 
     def step_raw(
         self, action: torch.Tensor, while_computing: Callable[[], object] | None = None, into: Place | None = None
@@ -246,11 +263,12 @@ class ArcadeEnv(EnvBase):
             ValueError: Actions of a wrong shape or out of range.
         """
         argument = int32_argument(self._check_action(action), self._jax_device)
+        batch = self._live.batch if self._live.ended is self._none_ended else self._with_ends()
         if into is None:
-            step = self._compiled.step(self._live.batch, argument, self._memory.spare())
+            step = self._compiled.step(batch, argument, self._memory.spare())
         else:
             canvas, index, frames = into
-            step = self._compiled.step_into(canvas, index, self._live.batch, argument)
+            step = self._compiled.step_into(canvas, index, batch, argument)
         if while_computing is not None:
             while_computing()
         if into is None:
@@ -268,13 +286,36 @@ class ArcadeEnv(EnvBase):
         """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
-    def _go_on(self, batch: Batch, ends: torch.Tensor | None = None) -> None:
-        """Put another state in place. ``ends`` bool [N, 2] says where a step terminated or truncated it.
+    def _go_on(self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None) -> None:
+        """Put another state in place, all at once: an interrupt leaves the old state or the new one.
 
-        All at once, so that an interrupt leaves the old state or the new one.
+        Args:
+            batch: Without flags of an end.
+            ended: Where it has ended; None: nowhere.
+            ends: bool [N, 2], what a root says of that: where its last step terminated or truncated; None: nowhere.
         """
+        ended = self._none_ended if ended is None else ended
         ends = self._no_ends if ends is None else ends
-        vars(self._live).update(batch=batch, ends=ends, generation=self._live.generation + 1)
+        vars(self._live).update(batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1)
+
+    def _go_on_from(self, state: TensorDictBase | None, ends: torch.Tensor | None = None) -> None:
+        """Put a snapshot in place."""
+        batch = self._snapshots.load(state)
+        terminated, truncated = self._batched.ends(batch)
+        some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
+        self._go_on(self._batched.without_ends(batch), (terminated, truncated) if some_ended else None, ends)
+
+    def _still_ended(self, rows: np.ndarray) -> Ended:
+        """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
+        terminated, truncated = (flags & rows for flags in self._live.ended)
+        # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
+        if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
+            return self._none_ended
+        return terminated, truncated
+
+    def _with_ends(self) -> Batch:
+        """The live batch with the flags of an end."""
+        return self._batched.with_ends(self._live.batch, *self._live.ended)
 
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
@@ -314,36 +355,46 @@ class ArcadeEnv(EnvBase):
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         wait_for_torch(self.device, self._jax_device)
         batch, pixels = self._batched.reset_render(self._live.batch, rows)
-        root = self._root(batch, to_torch(pixels, self.device))
+        ended = self._none_ended if rows.all() else self._still_ended(~rows)
+        root = self._root(batch, ended, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
             validation.check_merge(tensordict, root)
-        self._go_on(batch, self._live.ends)  # which counts in the rows that stay
+        self._go_on(batch, ended, self._live.ends)  # which counts in the rows that stay
         return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self._state_in_td:  # go on from the state the caller handed over, and show the twin that was set last
-            handed = self._snapshots.load(tensordict.get("state", None))
-            self._go_on(handed._replace(partial=self._live.batch.partial))
+            twin = self._live.batch.partial
+            self._go_on_from(tensordict.get("state", None))
+            self._live.batch = self._live.batch._replace(partial=twin)
         action = self._check_action(validation.tensor(tensordict, "action"))
-        argument, before = int32_argument(action, self._jax_device), (self._live.batch, self._live.ends)
-        stepped, pixels, packed = self._compiled.step_only(before[0], argument, self._memory.spare())
-        frames, numbers = to_torch(self._memory.show(pixels), self.device), to_torch(packed, self.device)
-        self._go_on(stepped, numbers[:, TERMINATED:] > 0)  # not the flags that are handed out: those may be written to
+        argument = int32_argument(action, self._jax_device)
+        before = Live(self._live.batch, self._live.ended, self._live.ends)
+        batch, ended, pixels, packed = self._compiled.step_only(
+            before.batch, before.ended, argument, self._memory.spare()
+        )
+        frames = to_torch(self._memory.show(pixels), self.device)
+        numbers = to_torch(packed, self.device)
+        ends = numbers[:, TERMINATED:] > 0  # not the flags that are handed out: those may be written to
+        self._go_on(batch, ended, ends)
         following = self._next(frames, action, numbers)
         if self._state_in_td:
-            following["state"] = self._snapshots.export(stepped)
+            following["state"] = self._snapshots.export(self._with_ends())
         if "_step" in tensordict:
             return self._only_marked(tensordict, before, following)
         return following
 
-    def _only_marked(self, tensordict: TensorDictBase, before: Live, following: TensorDict) -> TensorDictBase:
+    def _only_marked(self, tensordict: TensorDictBase, before: "Live", following: TensorDict) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
         marked = validation.mask(tensordict, "_step", self.num_envs)
-        stepped, ends = self._live.batch, self._live.ends
-        self._go_on(*before)  # where it stays if the next line refuses
+        stepped = Live(self._live.batch, self._live.ended, self._live.ends)
+        self._go_on(before.batch, before.ended, before.ends)  # where it stays if the next line refuses
         validation.check_merge(tensordict, following)
-        rows = choose_rows(jax.numpy.asarray(marked.cpu().numpy()), *map(self._batched.wide, (stepped, before[0])))
-        self._go_on(self._batched.narrow(rows), ends.where(marked.unsqueeze(-1), before[1]))
+        mask = jax.numpy.asarray(marked.cpu().numpy())
+        batch = choose_rows(mask, self._batched.wide(stepped.batch), self._batched.wide(before.batch))
+        ended = choose_rows(mask, stepped.ended, before.ended)
+        ends = stepped.ends.where(marked.unsqueeze(-1), before.ends)
+        self._go_on(self._batched.narrow(batch), ended, ends)
         left_alone = following.apply(torch.zeros_like)
         kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
         left_alone.update(tensordict.select(*kept, strict=False))
@@ -384,17 +435,21 @@ class ArcadeEnv(EnvBase):
         default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
         new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
-        self._go_on(self._live.batch._replace(key=new[0], last_action=new[1]), self._live.ends)
+        seeded = self._live.batch._replace(key=new[0], last_action=new[1])
+        self._go_on(seeded, self._live.ended, self._live.ends)
 
-    def _root(self, batch: Batch, frames: torch.Tensor) -> TensorDict:
-        """Root tensordict of a live batch. Everything but the frames is copied: torch must not write to live memory."""
+    def _root(self, batch: Batch, ended: Ended, frames: torch.Tensor) -> TensorDict:
+        """Root tensordict of a live batch and of where it has ended.
+
+        Everything but the frames is copied: torch must not write to live memory.
+        """
         step_count = to_torch(batch.step_count, self.device).to(torch.int64).unsqueeze(-1)
         episode_reward = to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1)
         counts = {"is_init": step_count == 0, "step_count": step_count, "episode_reward": episode_reward}
         ends = self._live.ends & (step_count > 0)
         root = self._entries(frames, to_torch(batch.last_action, self.device), counts, ends)
         if self._state_in_td:
-            root["state"] = self._snapshots.export(batch)
+            root["state"] = self._snapshots.export(self._batched.with_ends(batch, *ended))
         return TensorDict(root, batch_size=self.batch_size, device=self.device)
 
     def _next(self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor) -> TensorDict:

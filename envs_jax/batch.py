@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, keeps_ends, stay
+from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, keeps_ends
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
@@ -95,12 +95,27 @@ class Steps(abc.ABC):
         self.step_render = compiled(self._step_render)
 
     @abc.abstractmethod
+    def without_ends(self, batch: Batch) -> Batch:
+        """The batch without the flags of an end: it says by its structure that every episode runs.
+
+        A step of such a batch has nothing to hold, so it is faster. Resetting gives one again.
+        """
+
+    @abc.abstractmethod
+    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
+        """The batch with the flags of an end, bool [N] each."""
+
+    @abc.abstractmethod
+    def ends(self, batch: Batch) -> tuple[Array, Array]:
+        """``terminated`` and ``truncated`` of a batch that has flags, bool [N] each."""
+
+    @abc.abstractmethod
     def _init(self, keys: Array, partial: Array) -> Batch:
         """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""
 
     @abc.abstractmethod
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env.
+        """Take one action in every env. What comes has the flags of an end, whether the batch has them or not.
 
         An episode that has ended stays as it is: state, counts and both flags, with the reward 0, and its random key.
         """
@@ -175,6 +190,23 @@ class BatchedGame(Steps, Generic[State]):
         """The inverse of ``wide``."""
         return batch
 
+    def without_ends(self, batch: Batch) -> Batch:
+        """See :meth:`Steps.without_ends`."""
+        if keeps_ends(batch.state):
+            batch = batch._replace(state=batch.state._replace(terminated=UNSET, truncated=UNSET))
+        return batch._replace(terminated=UNSET, truncated=UNSET)
+
+    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
+        """See :meth:`Steps.with_ends`."""
+        if keeps_ends(batch.state):
+            return batch._replace(state=batch.state._replace(terminated=terminated, truncated=truncated))
+        return batch._replace(terminated=terminated, truncated=truncated)
+
+    def ends(self, batch: Batch) -> tuple[Array, Array]:
+        """See :meth:`Steps.ends`."""
+        keeper = _keeper(batch)
+        return keeper.terminated, keeper.truncated
+
     def _init(self, keys: Array, partial: Array) -> Batch:
         key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
@@ -182,32 +214,38 @@ class BatchedGame(Steps, Generic[State]):
         return with_flags(Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32)))
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        batch = with_flags(batch)
-        key, now = _split(batch.key)
         action = jnp.asarray(action, jnp.int32)
+        stepped, outcome = self._step_running(self.without_ends(batch), action)
+        if not has_ends(batch):
+            return stepped, outcome
+        batch = with_flags(batch)._replace(last_action=action)
+        terminated, truncated = self.ends(batch)
+        ended = jnp.logical_or(terminated, truncated)
+        held = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated, ended)
+        return choose_rows(ended, batch, stepped), choose_rows(ended, held, outcome)
+
+    def _step_running(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
+        """Take one action in every env of a batch without flags."""
+        key, now = _split(batch.key)
         state, reward, terminated, truncated = jax.vmap(self.game.step)(now, batch.state, action)
-        ended = _ended(batch)
-        if not keeps_ends(batch.state):
-            state = stay(ended, batch.state, state)
-            reward = jnp.where(ended, jnp.float32(0), reward)
-            terminated = jnp.where(ended, batch.terminated, terminated)
-            truncated = jnp.where(ended, batch.truncated, truncated)
-            batch = batch._replace(terminated=terminated, truncated=truncated)
         stepped = batch._replace(
-            key=jnp.where(ended[:, None], batch.key, key),
+            key=key,
             state=state,
             last_action=action,
-            step_count=batch.step_count + ~ended,
+            step_count=batch.step_count + 1,
             episode_reward=batch.episode_reward + reward,
         )
-        return stepped, Outcome(reward, terminated, truncated, terminated | truncated)
+        outcome = Outcome(reward, terminated, truncated, terminated | truncated)
+        return self.with_ends(stepped, terminated, truncated), outcome
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
         key, first = _split(batch.key)
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros_like(batch.step_count)
         fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
-        return Batch(*choose_rows(mask, with_flags(fresh), with_flags(batch)))
+        if has_ends(batch):
+            return Batch(*choose_rows(mask, with_flags(fresh), with_flags(batch)))
+        return Batch(*choose_rows(mask, self.without_ends(fresh), self.without_ends(batch)))
 
     def _render(self, batch: Batch) -> Array:
         return jax.vmap(self.game.render)(batch.state, batch.partial)
@@ -216,17 +254,21 @@ class BatchedGame(Steps, Generic[State]):
 def with_flags(batch: Batch) -> Batch:
     """The batch with the flags of an end where they belong: in the state if that keeps them, else in the batch."""
     no = jnp.zeros(batch.step_count.shape, bool)
-    keeper = batch.state if keeps_ends(batch.state) else batch
+    keeper = _keeper(batch)
     flags = {name: no for name in ENDS if getattr(keeper, name) is UNSET}
     if keeper is batch:
         return batch._replace(**flags)
     return batch._replace(state=batch.state._replace(**flags), terminated=UNSET, truncated=UNSET)
 
 
-def _ended(batch: Batch) -> Array:
-    """Which episodes of a batch with flags have ended: bool [N]."""
-    keeper = batch.state if keeps_ends(batch.state) else batch
-    return jnp.logical_or(keeper.terminated, keeper.truncated)
+def has_ends(batch: Batch) -> bool:
+    """Whether a batch of one game has a flag of an end; if not, every episode runs."""
+    return any(getattr(_keeper(batch), name) is not UNSET for name in ENDS)
+
+
+def _keeper(batch: Batch) -> Any:
+    """What of a batch of one game has the flags of an end: its state, or itself."""
+    return batch.state if keeps_ends(batch.state) else batch
 
 
 @partial(jax.vmap, out_axes=0)

@@ -19,7 +19,7 @@ NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 ENDS = ("terminated", "truncated")  # the flags of an end
-UNSET: Any = None  # such a flag in a state that no wrapped method of ``Game`` has given yet
+UNSET: Any = None  # such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
 
 
 def keeps_ends(state: Any) -> bool:
@@ -79,12 +79,15 @@ def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(step)
     def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
-        stepped = step(self, raw_key(key), state, jnp.asarray(action, jnp.int32))
+        action = jnp.asarray(action, jnp.int32)
         if not keeps_ends(state):
-            return stepped
+            return step(self, raw_key(key), state, action)
+        runs = state.terminated is UNSET and state.truncated is UNSET
         state = _with_flags(state)
-        after, reward, terminated, truncated = stepped
+        after, reward, terminated, truncated = step(self, raw_key(key), state, action)
         after = after._replace(terminated=jnp.asarray(terminated), truncated=jnp.asarray(truncated))
+        if runs:
+            return after, reward, after.terminated, after.truncated
         ended = jnp.logical_or(state.terminated, state.truncated)
         after = stay(ended, state, after)
         return after, jnp.where(ended, jnp.float32(0), reward), after.terminated, after.truncated
@@ -92,7 +95,17 @@ def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
     return fixed(wrapped)
 
 
-_WRAPPERS = {"reset": _wrap_reset, "step": _wrap_step, "render": fixed}
+def _wrap_render(render: Callable[..., Any]) -> Callable[..., Any]:
+    """A game's ``render`` under fixed settings, which sees both flags; see :class:`Game`."""
+
+    @functools.wraps(render)
+    def wrapped(self: Any, state: Any, partial: Any) -> Any:
+        return render(self, _with_flags(state) if keeps_ends(state) else state, partial)
+
+    return fixed(wrapped)
+
+
+_WRAPPERS = {"reset": _wrap_reset, "step": _wrap_step, "render": _wrap_render}
 
 
 class Game(abc.ABC, Generic[State]):

@@ -132,6 +132,24 @@ class MixedGames(Steps):
         """The states of each game's own envs, in the order of the games."""
         return tuple(state[game.id] for game in self.game.games)
 
+    def without_ends(self, batch: Batch) -> Batch:
+        """See :meth:`Steps.without_ends`."""
+        return self._join(
+            [group.without_ends(part) for group, part in zip(self.groups, self._parts(batch), strict=True)]
+        )
+
+    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
+        """See :meth:`Steps.with_ends`."""
+        flags = [(terminated[rows], truncated[rows]) for rows in self.rows(len(batch.step_count))]
+        parts = zip(self.groups, self._parts(batch), flags, strict=True)
+        return self._join([group.with_ends(part, *part_flags) for group, part, part_flags in parts])
+
+    def ends(self, batch: Batch) -> tuple[Array, Array]:
+        """See :meth:`Steps.ends`."""
+        pairs = zip(self.groups, self._parts(batch), strict=True)
+        terminated, truncated = zip(*(group.ends(part) for group, part in pairs), strict=True)
+        return jnp.concatenate(terminated), jnp.concatenate(truncated)
+
     def _init(self, keys: Array, partial: Array) -> Batch:
         keys = raw_key(keys, ndim=2)
         pairs = zip(self.groups, self.rows(len(keys)), strict=True)
@@ -169,9 +187,14 @@ class MixedGames(Steps):
 
     def _split(self, batch: Batch, other: Array) -> list[tuple[Batch, Array]]:
         """The batch of each game, with its part of another array [N]."""
+        rows = self.rows(len(batch.step_count))
+        return [(part, other[own]) for part, own in zip(self._parts(batch), rows, strict=True)]
+
+    def _parts(self, batch: Batch) -> list[Batch]:
+        """The batch of each game."""
         shared = batch._replace(state=None)
         pairs = zip(self.rows(len(batch.step_count)), self.states(batch.state), strict=True)
-        return [(_rows_of(shared, rows)._replace(state=state), other[rows]) for rows, state in pairs]
+        return [_rows_of(shared, rows)._replace(state=state) for rows, state in pairs]
 
     def _join(self, batches: Sequence[Batch]) -> Batch:
         """The batch of all games from that of each."""

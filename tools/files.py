@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -193,7 +194,10 @@ def cached_arrays(
         return kept
     arrays = {**compute(), "options": np.array(text)}
     if (run / "config.json").is_file() and os.access(run, os.W_OK) and not file.parent.is_symlink():
-        write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
+        try:
+            write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
+        except OSError as error:  # a full disk, for one: what took minutes to compute is still of use
+            warnings.warn(f"the numbers could not be kept for another time: {error}", stacklevel=2)
     return arrays
 
 

@@ -136,6 +136,8 @@ def read_end(path: Path) -> str:
 def write_atomic(path: Path, data: str | bytes) -> Path:
     """Replace a file in one step: readers see the old content or the new, never a part; missing folders are made.
 
+    What of a text has no UTF-8 (names of files may be any bytes) is written with backslashes.
+
     Raises:
         OSError: it cannot be written; ``filename`` is ``path``, and the old content is still there.
     """
@@ -143,10 +145,11 @@ def write_atomic(path: Path, data: str | bytes) -> Path:
     draft = path.with_name(f".{path.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}.draft")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft.write_bytes(data.encode() if isinstance(data, str) else data)
+        draft.write_bytes(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         os.replace(draft, path)
     except OSError as error:  # a full disk, for one
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # nor is there a draft on a disk that takes no files
+            draft.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         draft.unlink(missing_ok=True)

@@ -71,6 +71,7 @@ class NumpyBatch:
         shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
         batch: Batch = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
         self._batch = batch._replace(partial=jnp.asarray(flags))
+        self._no_ends = (jnp.zeros(self.num_envs, bool), jnp.zeros(self.num_envs, bool))
         (device,) = self._batch.partial.devices()
         self._finals = FinalObservations(compiled, self.num_envs, 1, device)
         self._memory = FrameMemory((self.num_envs, self.game.obs_size, self.game.obs_size, 3), device)
@@ -137,9 +138,10 @@ class NumpyBatch:
 
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
-        stepped, outcome = self._compiled.reset_or_step(self._batch, action, ended)
+        running = self._batched.without_ends(self._batch)
+        stepped, outcome = self._compiled.reset_or_step(running, action, ended)
         outcome.done.block_until_ready()
-        self._batch = stepped
+        self._batch = self._batched.with_ends(stepped, outcome.terminated, outcome.truncated)
         return self._stepped(outcome)
 
     def _stepped(self, outcome: Outcome) -> Stepped:
@@ -155,10 +157,11 @@ class NumpyBatch:
             What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that; the n envs that
             ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
         """
-        step = self._compiled.step(self._batch, action, self._memory.spare())
+        step = self._compiled.step(self._batched.without_ends(self._batch), action, self._memory.spare())
         frames = np.array(self._memory.show(step.pixels), copy=copy or None)
         numbers = np.asarray(step.numbers)
-        self._batch = step.root  # now that the step has been computed: one that fails leaves the state as it was
+        # Now that the step has been computed: one that fails leaves the state as it was.
+        self._batch = self._batched.with_ends(step.root, *self._no_ends)
         reward, episode_reward, step_count, terminated, truncated = numbers.T
         info = {
             "episode_reward": episode_reward.view(np.float32).astype(np.float64),

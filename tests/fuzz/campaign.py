@@ -217,6 +217,9 @@ def main() -> int:
     parser.add_argument("--every", type=int, default=1, help="of the cases only each such one")
     parser.add_argument("--page", type=Path, help="Markdown file that gets the table between its marks")
     options = parser.parse_args()
+    if options.page is not None and BEGIN not in options.page.read_text():
+        parser.error(f"{options.page} has no line {BEGIN}")
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background of a shell it is ignored
     chosen = [case for case in cases(options.seed, options.moments) if case.name.startswith(options.only)]
     chosen = chosen[:: options.every]
     results = []

@@ -207,6 +207,13 @@ def test_files_have_the_mode_of_the_umask(tmp_path: Path) -> None:
     assert {stat.S_IMODE(file.stat().st_mode) for file in written} == {0o640}
 
 
+def test_a_text_may_name_files_whose_names_are_no_utf_8(tmp_path: Path) -> None:
+    """Before: a report of a folder with such a name ended in a UnicodeEncodeError."""
+    name = os.fsdecode(b"run-\xff")
+    page = write_atomic(tmp_path / "page.html", f"<p>{name}</p>")
+    assert page.read_bytes() == rb"<p>run-\udcff</p>"
+
+
 @pytest.mark.parametrize("where", ["write_bytes", "replace"])
 def test_a_full_disk_names_the_file_and_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
