@@ -46,10 +46,11 @@ if TYPE_CHECKING:
     from arcade_torch.agents.training import Trainer, TrainResult, train
 
 __all__ = [
-    "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult", "NonFiniteError",
-    "PPOConfig", "PPOLoss", "PQNConfig", "PQNLoss", "QLambdaEstimator", "RunFolderError", "SequenceGAE",
-    "SequenceReplay", "TrainConfig", "TrainResult", "Trainer", "build_network", "evaluate", "gae", "held_out_seed",
-    "load", "make_actor", "make_policy", "paper_score", "preset", "preset_names", "q_lambda_return", "train",
+    "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult",
+    "NonFiniteError", "PPOConfig", "PPOLoss", "PQNConfig", "PQNLoss", "QLambdaEstimator",
+    "RunFolderError", "SequenceGAE", "SequenceReplay", "TrainConfig", "TrainResult", "Trainer",
+    "build_network", "evaluate", "gae", "held_out_seed", "load", "make_actor", "make_policy",
+    "paper_score", "preset", "preset_names", "q_lambda_return", "train",
 ]  # fmt: skip
 
 
@@ -58,7 +59,9 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}"
+            )
         return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
 
 

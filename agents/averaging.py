@@ -6,7 +6,9 @@ from torch import nn
 
 
 def share_reached(training_return: float | None, return_range: tuple[float, float]) -> float:
-    """A return as a share of what a game can pay: 0 at the lowest return (and before any), 1 at the highest."""
+    """A return as a share of what a game can pay: 0 at the lowest return (and before any), 1 at the
+    highest.
+    """
     if training_return is None:
         return 0.0
     low, high = return_range
@@ -18,8 +20,10 @@ def check_return_range(game: str, return_range: tuple[float, float]) -> None:
     low, high = return_range
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(
-            f"average_share goes by how much of a game's return is reached, but {game} has return_range "
-            f"({low}, {high}): give the game two finite numbers, the lowest and the highest return, or set it to 0"
+            f"average_share goes by how much of a game's return is reached, but {game} has "
+            "return_range "
+            f"({low}, {high}): give the game two finite numbers, the lowest and the highest "
+            "return, or set it to 0"
         )
 
 

@@ -1,19 +1,50 @@
-"""What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here imports torch."""
+"""What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here
+imports torch.
+"""
 
 import dataclasses
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from arcade_torch.agents.differences import differences
 from arcade_torch.agents.differences import flatten as flatten
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
-RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")  # fields that do not belong to a run's identity
+# fields that do not belong to a run's identity
+RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")
 # Names that are no options, because other fields decide them and learners rely on them.
-OF_ENV = ("id", "num_envs", "observability", "obs_size", "seed", "device", "rules", "categorical_actions")
-OF_NETWORK = ("preset", "memory", "obs_size", "num_outputs", "num_actions", "out_key", "state_key", "store", "encoder")
+OF_ENV = (
+    "id",
+    "num_envs",
+    "observability",
+    "obs_size",
+    "seed",
+    "device",
+    "rules",
+    "categorical_actions",
+)
+OF_NETWORK = (
+    "preset",
+    "memory",
+    "obs_size",
+    "num_outputs",
+    "num_actions",
+    "out_key",
+    "state_key",
+    "store",
+    "encoder",
+)
 
 
 class Range(NamedTuple):
@@ -25,7 +56,9 @@ class Range(NamedTuple):
 
 Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
 DEVICES = ("cpu", "cpu:0", "cuda", *(f"cuda:{index}" for index in range(128)))
-Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", lambda x: x in DEVICES)]
+Device = Annotated[
+    str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", lambda x: x in DEVICES)
+]
 # Bounded, so that no slip and no file of somebody else asks for all memory there is.
 Count = Annotated[int, Range("a whole number >= 1 (and at most 10**6)", lambda x: 1 <= x <= 10**6)]
 CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: 0 <= x <= 10**15)]
@@ -39,14 +72,18 @@ Bootstrap = Literal["next", "last"]
 
 
 def require(condition: bool, name: str, value: Any, allowed: str) -> None:
-    """Unless a condition holds, refuse a value (ValueError) in one line that names it and says what is allowed."""
+    """Unless a condition holds, refuse a value (ValueError) in one line that names it and says what
+    is allowed.
+    """
     if not condition:
         found = " ".join(line.strip() for line in repr(value).splitlines())
         raise ValueError(f"{name} must be {allowed}; got {found}")
 
 
 def coerce(name: str, value: Any, kind: Any) -> Any:
-    """The value of a field, whole floats as ints; refused where its annotation, type or :class:`Range`, forbids it."""
+    """The value of a field, whole floats as ints; refused where its annotation, type or
+    :class:`Range`, forbids it.
+    """
     if get_origin(kind) is Annotated:
         kind, (allowed, holds) = get_args(kind)
         value = coerce(name, value, kind)
@@ -67,7 +104,12 @@ def coerce(name: str, value: Any, kind: Any) -> Any:
     if kind == Options:
         require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
         for option, given in value.items():
-            require(survives_json({option: given}), f"{name}.{option}", given, "a value that JSON gives back as it was")
+            require(
+                survives_json({option: given}),
+                f"{name}.{option}",
+                given,
+                "a value that JSON gives back as it was",
+            )
         return dict(value)
     words = {str: "a string", bool: "true or false"}
     require(isinstance(value, kind), name, value, words.get(kind, f"a {kind.__name__}"))
@@ -84,7 +126,9 @@ def survives_json(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Checked:
-    """A frozen dataclass whose fields are checked by their annotations, with one clear line for what does not fit."""
+    """A frozen dataclass whose fields are checked by their annotations, with one clear line for
+    what does not fit.
+    """
 
     GROUP: ClassVar[str] = ""
 
@@ -100,12 +144,14 @@ class Checked:
 
 @dataclass(frozen=True)
 class LearnerConfig(Checked):
-    """What PQN, PPO and DQN share; the defaults are the paper's, schedules in fractions of the run's frames.
+    """What PQN, PPO and DQN share; the defaults are the paper's, schedules in fractions of the
+    run's frames.
 
     A schedule over a fraction of the run keeps its shape when the run is shortened.
     """
 
-    SPLIT: ClassVar[str] = "num_envs"  # the field with the number of sequences that an update goes over
+    # the field with the number of sequences that an update goes over
+    SPLIT: ClassVar[str] = "num_envs"
 
     num_envs: Count = 16
     """Environments stepped together."""
@@ -124,24 +170,33 @@ class LearnerConfig(Checked):
     learning_rate_end: PositiveOrZero = 5e-7
     """Step size after the decay."""
     lr_decay_fraction: Fraction = 0.1
-    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
+    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end
+    value.
+    """
     max_grad_norm: Positive = 0.5
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
-    """The weights that act and are saved are a mean of those that learn, over about this share of the updates so far
-    (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of the training return, which counts
-    from 0 at the lowest that the game can pay to 1 at the highest; 0: no mean."""
+    """The weights that act and are saved are a mean of those that learn, over about this share of
+    the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of
+    the training return, which counts from 0 at the lowest that the game can pay to 1 at the
+    highest; 0: no mean."""
     warmup_steps: CountOrZero = 0
-    """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
+    """Random steps of each environment before training, not counted as frames; they calibrate the
+    input scaling.
+    """
     time_limit: TimeLimit = "bootstrap"
-    """``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as a termination."""
+    """``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it ends as
+    a termination.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         rows = getattr(self, self.SPLIT)
         allowed = f"a divisor of {self.SPLIT}={rows}: whole sequences go into a minibatch"
         self._require(rows % self.minibatches == 0, "minibatches", allowed)
-        self._require(self.steps_before <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}")
+        self._require(
+            self.steps_before <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}"
+        )
 
     @property
     def steps_before(self) -> int:
@@ -161,14 +216,18 @@ class LearnerConfig(Checked):
 
 @dataclass(frozen=True)
 class QConfig(LearnerConfig):
-    """What the learners of Q-values share; at the paper's 20 M frames, the fractions 0.1 and 0.4 are its 2 M frames of
-    learning-rate decay and 8 M frames of exploration decay.
+    """What the learners of Q-values share; at the paper's 20 M frames, the fractions 0.1 and 0.4
+    are its 2 M frames of learning-rate decay and 8 M frames of exploration decay.
     """
 
     warmup_steps: CountOrZero = 132
-    """Random steps of each environment before training, not counted as frames; they calibrate the input scaling."""
+    """Random steps of each environment before training, not counted as frames; they calibrate the
+    input scaling.
+    """
     overlap: CountOrZero = 4
-    """Steps of the previous window repeated in front of the new ones; they take part in the loss again."""
+    """Steps of the previous window repeated in front of the new ones; they take part in the loss
+    again.
+    """
     epsilon_start: Fraction = 1.0
     """Probability of a uniformly random action at the start."""
     epsilon_end: Fraction = 0.05
@@ -181,16 +240,21 @@ class QConfig(LearnerConfig):
 class PQNConfig(QConfig):
     """Numbers of PQN; the defaults are the paper's, schedules in fractions of the run's frames.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv 2407.04811.
+    Source: POPGym Arcade (ICML 2026), hyperparameter table of PQN; Gallici et al., arXiv
+    2407.04811.
     """
 
     bootstrap: Bootstrap = "next"
-    """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the published form): the
-    last step of a window only lends its value, and is trained in the next window's overlap (needs overlap >= 1)."""
+    """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the
+    published form): the last step of a window only lends its value, and is trained in the next
+    window's overlap (needs overlap >= 1)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        allowed = ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap of the next"
+        allowed = (
+            ">= 1 with bootstrap='last': the last step of a window is only trained in the overlap "
+            "of the next"
+        )
         self._require(self.bootstrap == "next" or self.overlap >= 1, "overlap", allowed)
 
 
@@ -198,7 +262,8 @@ class PQNConfig(QConfig):
 class PPOConfig(LearnerConfig):
     """Numbers of PPO; the defaults are the paper's, the step size falls over the whole run.
 
-    Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv 1707.06347.
+    Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv
+    1707.06347.
     """
 
     learning_rate: Positive = 1e-4
@@ -206,32 +271,42 @@ class PPOConfig(LearnerConfig):
     learning_rate_end: PositiveOrZero = 1e-10
     """Step size after the decay."""
     lr_decay_fraction: Fraction = 1.0
-    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end value."""
+    """Fraction of the run's frames over which the step size falls linearly; 0 starts at the end
+    value.
+    """
     clip: Positive = 0.2
-    """How far the probability ratio, and the value, may move in an update before the gradient stops."""
+    """How far the probability ratio, and the value, may move in an update before the gradient
+    stops.
+    """
     entropy_coeff: PositiveOrZero = 0.01
     """Weight of the entropy bonus at the start."""
     entropy_end: Annotated[float, Range("a number in (0, 1]", lambda x: 0.0 < x <= 1.0)] = 1.0
-    """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps it, and no factor
-    leads to 0 (for no bonus: ``entropy_coeff`` 0)."""
+    """Share of that weight which is left at the end of the run, reached by equal factors; 1 keeps
+    it, and no factor leads to 0 (for no bonus: ``entropy_coeff`` 0)."""
     advantage_decay: Annotated[float, Range("a number in [0, 1)", lambda x: 0.0 <= x < 1.0)] = 0.0
-    """Share kept, at each update, of the running deviation that divides advantages; 0: each minibatch has its own."""
+    """Share kept, at each update, of the running deviation that divides advantages; 0: each
+    minibatch has its own.
+    """
     critic_coeff: PositiveOrZero = 0.5
     """Weight of the value loss (half the mean squared error)."""
     prediction_coeff: PositiveOrZero = 0.0
-    """Weight of an auxiliary loss: the memory learns to expect the next frame's features (arXiv 2401.08898)."""
+    """Weight of an auxiliary loss: the memory learns to expect the next frame's features (arXiv
+    2401.08898).
+    """
 
 
 @dataclass(frozen=True)
 class DQNConfig(QConfig):
     """Numbers of DQN, schedules in fractions of the run's frames.
 
-    The paper gives none; these are those of its published code, except for ``targets`` and ``time_limit``. An item of
-    the replay is one environment's window: ``overlap + num_steps`` frames with their actions, rewards and flags, the
-    recurrent state before the first of them, and the final frames that targets need.
+    The paper gives none; these are those of its published code, except for ``targets`` and
+    ``time_limit``. An item of the replay is one environment's window: ``overlap + num_steps``
+    frames with their actions, rewards and flags, the recurrent state before the first of them, and
+    the final frames that targets need.
 
-    Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski et al., "Recurrent
-    experience replay in distributed reinforcement learning" (ICLR 2019), for stored states and burn-in.
+    Source: reference implementation of POPGym Arcade; Mnih et al., Nature 518 (2015); Kapturowski
+    et al., "Recurrent experience replay in distributed reinforcement learning" (ICLR 2019), for
+    stored states and burn-in.
     """
 
     SPLIT: ClassVar[str] = "batch_sequences"
@@ -239,31 +314,50 @@ class DQNConfig(QConfig):
     lam: Fraction = 0.0
     """Lambda of the return, in [0, 1]; 0 is the one-step target."""
     replay_frames: int = 132_000
-    """Capacity in frames (43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down to whole windows."""
+    """Capacity in frames (43,200 bytes at 128 pixels, 3,072 with the small encoder), rounded down
+    to whole windows.
+    """
     batch_sequences: Count = 32
     """Sequences drawn in an update, without repetition; all epochs go over the same."""
     learning_starts: Count = 32
     """Sequences that must be stored before learning starts."""
     burn_in: CountOrZero = 0
-    """First steps of a sequence that only bring the memory up to date: read without gradient, no part of the loss."""
+    """First steps of a sequence that only bring the memory up to date: read without gradient, no
+    part of the loss.
+    """
     targets: Literal["recompute", "stored"] = "recompute"
-    """``"recompute"``: from present Q-values, at every use; ``"stored"`` (the published form): once, when collected."""
+    """``"recompute"``: from present Q-values, at every use; ``"stored"`` (the published form):
+    once, when collected.
+    """
     target_every: CountOrZero = 0
-    """Updates between copies of the network to a target network, which then gives the next values; 0 for none."""
+    """Updates between copies of the network to a target network, which then gives the next values;
+    0 for none.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         length = self.overlap + self.num_steps
         self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
-        self._require(self.targets != "stored" or not self.target_every, "target_every", "0 with targets='stored'")
-        held, needed = self.replay_sequences, max(self.batch_sequences, self.learning_starts, self.num_envs)
+        self._require(
+            self.targets != "stored" or not self.target_every,
+            "target_every",
+            "0 with targets='stored'",
+        )
+        held = self.replay_sequences
+        needed = max(self.batch_sequences, self.learning_starts, self.num_envs)
         frames = -(-needed // self.num_envs) * self.num_envs * length
-        self._require(held >= needed, "replay_frames", f">= {frames}, room for {needed} sequences of {length} frames")
+        self._require(
+            held >= needed,
+            "replay_frames",
+            f">= {frames}, room for {needed} sequences of {length} frames",
+        )
 
     @property
     def replay_sequences(self) -> int:
         """Capacity in sequences: whole windows of all environments."""
-        return self.replay_frames // (self.num_envs * (self.overlap + self.num_steps)) * self.num_envs
+        return (
+            self.replay_frames // (self.num_envs * (self.overlap + self.num_steps)) * self.num_envs
+        )
 
 
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
@@ -276,13 +370,18 @@ for _name, _kind in GROUPS.items():
 class TrainConfig(Checked):
     """Everything that decides a training run.
 
-    Counts of frames are environment steps summed over the environments: one environment, one action, one frame.
+    Counts of frames are environment steps summed over the environments: one environment, one
+    action, one frame.
     """
 
     env: Text = "CartPoleEasy"
-    """Game id, see ``arcade_torch.registered_ids()``; a run pins the version that a bare name means."""
+    """Game id, see ``arcade_torch.registered_ids()``; a run pins the version that a bare name
+    means.
+    """
     observability: Literal["full", "partial", "mixed"] = "full"
-    """Which twin: ``"full"`` is the MDP, ``"partial"`` the POMDP, ``"mixed"`` half the environments each."""
+    """Which twin: ``"full"`` is the MDP, ``"partial"`` the POMDP, ``"mixed"`` half the environments
+    each.
+    """
     obs_size: Count = 128
     """Height and width of the frames, pixels."""
     rules: Literal["default", "reference"] = "default"
@@ -290,7 +389,9 @@ class TrainConfig(Checked):
     env_options: Options = field(default_factory=dict)
     """Further options of the game."""
     memory: Text = "lru"
-    """Memory model, see ``arcade_torch.models.memory_names()``; ``"feedforward"``: the paper's network without any."""
+    """Memory model, see ``arcade_torch.models.memory_names()``; ``"feedforward"``: the paper's
+    network without any.
+    """
     network: Text = "paper"
     """Network preset around the memory model: ``"paper"`` or ``"small"``."""
     network_options: Options = field(default_factory=dict)
@@ -304,16 +405,19 @@ class TrainConfig(Checked):
     device: Device = "cpu"
     """Torch device of the network and the learner."""
     amp: bool = False
-    """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the rest stays float32.
-    Agents act as they were trained."""
+    """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the
+    rest stays float32. Agents act as they were trained."""
     compile: bool = False
-    """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and rounding of its own.
-    Meant for GPUs: two cores are no faster with it. What is saved is the same; a loaded agent is not compiled."""
+    """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and
+    rounding of its own. Meant for GPUs: two cores are no faster with it. What is saved is the same;
+    a loaded agent is not compiled."""
     cuda_graphs: bool = False
-    """Replay acting, and every whole gradient step (loss, backward pass, clipping, optimiser), as one CUDA graph each,
-    which saves launches; needs a CUDA device."""
+    """Replay acting, and every whole gradient step (loss, backward pass, clipping, optimiser), as
+    one CUDA graph each, which saves launches; needs a CUDA device."""
     threads: CountOrZero = 0
-    """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in total."""
+    """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in
+    total.
+    """
     eval_every: CountOrZero = 1_000_000
     """Frames between greedy evaluations; 0 evaluates only at the end."""
     eval_episodes: Annotated[int, Range("from 1 to 65536", lambda x: 1 <= x <= 2**16)] = 128
@@ -321,8 +425,9 @@ class TrainConfig(Checked):
     checkpoint_every: CountOrZero = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""
     logger: Literal["none", "tensorboard", "wandb"] = "none"
-    """Where the rows of ``metrics.csv`` and ``eval.csv`` go beside the files; needs the extra ``loggers``.
-    ``"wandb"`` works offline (``wandb sync`` uploads) unless the environment says ``WANDB_MODE=online``."""
+    """Where the rows of ``metrics.csv`` and ``eval.csv`` go beside the files; needs the extra
+    ``loggers``. ``"wandb"`` works offline (``wandb sync`` uploads) unless the environment says
+    ``WANDB_MODE=online``."""
     pqn: PQNConfig = field(default_factory=PQNConfig)
     """Numbers of the PQN learner."""
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -336,10 +441,19 @@ class TrainConfig(Checked):
             found = ", ".join(option for option in getattr(self, name) if option in names)
             self._require(not found, name, f"without {found}, which other fields decide")
         cells = self.network_options.get("memory_options") or {}
-        require(isinstance(cells, Mapping), "network_options.memory_options", cells, "a table of options of the memory")
+        require(
+            isinstance(cells, Mapping),
+            "network_options.memory_options",
+            cells,
+            "a table of options of the memory",
+        )
         graphs = self.device.startswith("cuda") or not self.cuda_graphs
-        self._require(graphs, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device")
-        envs, steps, frames = self.learner.num_envs, self.learner.num_steps, self.learner.frames_per_update
+        self._require(
+            graphs, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device"
+        )
+        envs = self.learner.num_envs
+        steps = self.learner.num_steps
+        frames = self.learner.frames_per_update
         allowed = f"at least one update of {envs} envs x {steps} steps = {frames} frames"
         self._require(self.total_frames >= frames, "total_frames", allowed)
         even = envs % 2 == 0 or self.observability != "mixed"
@@ -364,18 +478,26 @@ class TrainConfig(Checked):
         """The inverse of :meth:`to_dict`.
 
         Raises:
-            ValueError: a field is unknown, has the wrong type, or holds a value that is not allowed.
+            ValueError: a field is unknown, has the wrong type, or holds a value that is not
+                allowed.
         """
         values = _fields_of(cls, plain, "")
-        groups = {name: kind(**_fields_of(kind, values.get(name, {}), f"{name}.")) for name, kind in GROUPS.items()}
+        groups = {
+            name: kind(**_fields_of(kind, values.get(name, {}), f"{name}."))
+            for name, kind in GROUPS.items()
+        }
         return cls(**values | groups)
 
 
 Settings = TrainConfig | Mapping[str, Any]  # a config, or what a ``config.json`` holds
 
 
-def differing_fields(one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE) -> list[str]:
-    """Names of the fields that make two configs different runs, as ``name (this != that)``; see `differing_values`."""
+def differing_fields(
+    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
+) -> list[str]:
+    """Names of the fields that make two configs different runs, as ``name (this != that)``; see
+    `differing_values`.
+    """
     pairs = differing_values(one, other, free).items()
     return [f"{name} ({this!r} != {that!r})" for name, (this, that) in pairs]
 
@@ -383,8 +505,12 @@ def differing_fields(one: Settings, other: Settings, free: Iterable[str] = RESUM
 def differing_values(
     one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
 ) -> dict[str, tuple[Any, Any]]:
-    """The same with both values; plain settings that lack a field have its default. See `differences`."""
-    plain = [config.to_dict() if isinstance(config, TrainConfig) else config for config in (one, other)]
+    """The same with both values; plain settings that lack a field have its default. See
+    `differences`.
+    """
+    plain = [
+        config.to_dict() if isinstance(config, TrainConfig) else config for config in (one, other)
+    ]
     return differences(plain[0], plain[1], TrainConfig().to_dict(), GROUPS, free)
 
 
@@ -393,5 +519,7 @@ def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     require(isinstance(values, Mapping), prefix[:-1] or "a config", values, "a table of fields")
     known = [item.name for item in dataclasses.fields(cls)]
     if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}")
+        raise ValueError(
+            f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}"
+        )
     return dict(values)

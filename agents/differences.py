@@ -5,8 +5,13 @@ from typing import Any
 
 
 def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has ``pqn.gamma``."""
-    parts = [flatten(x, f"{prefix}{n}.") if isinstance(x, Mapping) else {prefix + n: x} for n, x in plain.items()]
+    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has
+    ``pqn.gamma``.
+    """
+    parts = [
+        flatten(x, f"{prefix}{n}.") if isinstance(x, Mapping) else {prefix + n: x}
+        for n, x in plain.items()
+    ]
     return {name: value for part in parts for name, value in part.items()}
 
 
@@ -22,9 +27,10 @@ def differences(
     Args:
         one: nested settings of a run, as its ``config.json`` holds them.
         other: those of another.
-        default: value of every setting. A run that lacks one has it: it may be from before there was that setting.
-            One that is not known here is None where it is missing.
-        algorithms: names of groups with the numbers of learners; those that neither run uses make no difference.
+        default: value of every setting. A run that lacks one has it: it may be from before there
+            was that setting. One that is not known here is None where it is missing.
+        algorithms: names of groups with the numbers of learners; those that neither run uses make
+            no difference.
         free: settings, and groups of settings, that may differ.
     """
     mine = flatten(default) | flatten(_stated(one))

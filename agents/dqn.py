@@ -16,11 +16,13 @@ from arcade_torch.agents.replay import SequenceReplay
 
 
 class DQNLoss(PQNLoss):
-    """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without a target network.
+    """The loss of DQN: one-step targets (or lambda-returns) of replayed sequences, with or without
+    a target network.
 
-    Keys and arguments as in :class:`PQNLoss`, but ``lmbda`` of :meth:`make_value_estimator` is 0 by default; where a
-    batch holds ``stored_target`` [N, L], these are the targets. Sequences, and their burn-in, start from their stored
-    state; with ``store="step"`` every step that has ``is_init`` set starts from the state stored there.
+    Keys and arguments as in :class:`PQNLoss`, but ``lmbda`` of :meth:`make_value_estimator` is 0 by
+    default; where a batch holds ``stored_target`` [N, L], these are the targets. Sequences, and
+    their burn-in, start from their stored state; with ``store="step"`` every step that has
+    ``is_init`` set starts from the state stored there.
     """
 
     def _default_value_estimator(self) -> None:
@@ -34,35 +36,50 @@ class DQNLoss(PQNLoss):
 
 
 class DQN(Learner):
-    """Puts every window into the replay and learns from sequences drawn from it; arguments as in :class:`PQN`."""
+    """Puts every window into the replay and learns from sequences drawn from it; arguments as in
+    :class:`PQN`.
+    """
 
     config: DQNConfig
     loss: DQNLoss
 
-    def __init__(self, network: TensorDictModuleBase, config: DQNConfig, training: Training) -> None:
+    def __init__(
+        self, network: TensorDictModuleBase, config: DQNConfig, training: Training
+    ) -> None:
         has_target = config.target_every > 0
-        options: Any = {"burn_in": config.burn_in, "delay_value": has_target, "functional": has_target}
+        options: Any = {
+            "burn_in": config.burn_in,
+            "delay_value": has_target,
+            "functional": has_target,
+        }
         loss = DQNLoss(network, time_limit=config.time_limit, **options)
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
         if has_target:
-            HardUpdate(loss)  # the target parameters are taken care of; it leaves out buffers, so see update()
+            # the target parameters are taken care of; it leaves out buffers, so see update()
+            HardUpdate(loss)
         self.labels = DQNLoss(network, time_limit=config.time_limit, functional=False)
         self.labels.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         self.replay = SequenceReplay(config.replay_sequences, training.folder)
         self.updates = 0
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float]:
-        """Store one window and learn from sequences drawn from the replay, once it holds enough; see `PQN.update`."""
+        """Store one window and learn from sequences drawn from the replay, once it holds enough;
+        see `PQN.update`.
+        """
         config = self.config
         if config.targets == "stored":
             batch = batch.copy().set("stored_target", self._present_targets(batch))
         self.replay.add(batch)
         if len(self.replay) >= max(config.learning_starts, config.batch_sequences):
             if config.target_every and self.updates % config.target_every == 0:
-                self.loss.target_value_network_params.data.update_(self.loss.value_network_params.data)
+                self.loss.target_value_network_params.data.update_(
+                    self.loss.value_network_params.data
+                )
             self.updates += 1
-            drawn = self.replay.sample(config.batch_sequences, self.training.generator, self.training.device)
+            drawn = self.replay.sample(
+                config.batch_sequences, self.training.generator, self.training.device
+            )
             data = self.loss.prepare(drawn)
             for minibatch in self.minibatches(data):
                 self.gradient_step(minibatch, frames)
@@ -72,14 +89,17 @@ class DQN(Learner):
     @torch.no_grad()
     def _present_targets(self, batch: TensorDictBase) -> Tensor:
         """Targets float [N, L] by the present network, row by row to bound memory."""
-        data, targets = self.labels.prepare(batch), []
+        data = self.labels.prepare(batch)
+        targets = []
         for row in data.split(1):
             q = unroll(self.labels.value_network, self.labels.inputs, row, "action_value")
             targets.append(self.labels.targets(row, q, row["reward"].shape[1]))
         return torch.cat(targets)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the trained weights and the generator that the coming updates depend on."""
+        """Everything but the trained weights and the generator that the coming updates depend
+        on.
+        """
         more: dict[str, Any] = {"replay": self.replay.state_dict(), "learner_updates": self.updates}
         if self.config.target_every:
             target = self.loss.target_value_network_params.flatten_keys(".")
@@ -87,7 +107,9 @@ class DQN(Learner):
         return super().state_dict() | more
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go back to a saved moment; a ``CheckpointError`` if a file of the replay is missing or damaged."""
+        """Go back to a saved moment; a ``CheckpointError`` if a file of the replay is missing or
+        damaged.
+        """
         self.replay.load_state_dict(state["replay"])
         super().load_state_dict(state)
         self.updates = state["learner_updates"]

@@ -12,7 +12,9 @@ from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
 from arcade_torch.agents.metrics import student_half_width
 
 MOST_EPISODES = 2**16
-"""Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB at 128 pixels."""
+"""Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB
+at 128 pixels.
+"""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,9 @@ class EvalResult:
 
     @property
     def ci(self) -> float:
-        """Half width of Student's 95 % interval of the mean return; NaN for one episode, which tells none."""
+        """Half width of Student's 95 % interval of the mean return; NaN for one episode, which
+        tells none.
+        """
         return student_half_width(self.returns)
 
     @property
@@ -47,19 +51,26 @@ class EvalResult:
         """The mean with its interval, and of how many episodes."""
         if len(self.returns) == 1:
             return f"return {self.mean:.3f} of one episode, which gives no interval"
-        return f"mean return {self.mean:.3f} +- {self.ci:.3f} (95 %) over {len(self.returns)} episodes"
+        return (
+            f"mean return {self.mean:.3f} +- {self.ci:.3f} (95 %) over {len(self.returns)} episodes"
+        )
 
 
 def held_out_seed(seed: int) -> int:
-    """The environment seed of evaluation seed ``seed``, in [0, 2**30) else ValueError: training uses environment seeds
-    below 2**30, evaluation those from 2**30 on, so no environment is ever in both.
+    """The environment seed of evaluation seed ``seed``, in [0, 2**30) else ValueError: training
+    uses environment seeds below 2**30, evaluation those from 2**30 on, so no environment is ever in
+    both.
     """
     require(0 <= seed < SEED_LIMIT, "seed", seed, f"in [0, {SEED_LIMIT})")
     return SEED_LIMIT + seed
 
 
-def make_env(config: TrainConfig, num_envs: int, seed: int, observability: str | None = None) -> arcade_torch.ArcadeEnv:
-    """Environments of a run, of the twin it names (or another); of ``"mixed"`` the first half are MDPs."""
+def make_env(
+    config: TrainConfig, num_envs: int, seed: int, observability: str | None = None
+) -> arcade_torch.ArcadeEnv:
+    """Environments of a run, of the twin it names (or another); of ``"mixed"`` the first half are
+    MDPs.
+    """
     twin: Any = observability or config.observability
     return arcade_torch.make(
         config.env,
@@ -73,8 +84,12 @@ def make_env(config: TrainConfig, num_envs: int, seed: int, observability: str |
     )
 
 
-def make_eval_env(config: TrainConfig, episodes: int, observability: Literal["full", "partial"] | None = None) -> Any:
-    """The environments an evaluation of this config plays in, one an episode; of another twin on request."""
+def make_eval_env(
+    config: TrainConfig, episodes: int, observability: Literal["full", "partial"] | None = None
+) -> Any:
+    """The environments an evaluation of this config plays in, one an episode; of another twin on
+    request.
+    """
     return make_env(config, episodes, held_out_seed(0), observability)
 
 
@@ -86,27 +101,43 @@ def evaluate(
     seed: int = 0,
     env: Any = None,
 ) -> EvalResult:
-    """Play greedily; gives returns and lengths of the first finished episode of each of ``episodes`` environments.
+    """Play greedily; gives returns and lengths of the first finished episode of each of
+    ``episodes`` environments.
 
     Every environment contributes exactly one episode, so long episodes count as much as short ones.
 
     Args:
-        agent: an ``Agent``, played where its network is; with ``env``, anything with ``initial_state`` and ``act``.
-        observability: twin to play; default the one the agent was trained on (of a mixed training, half the episodes
-            each). With ``env`` given, its own is put back afterwards.
+        agent: an ``Agent``, played where its network is; with ``env``, anything with
+            ``initial_state`` and ``act``.
+        observability: twin to play; default the one the agent was trained on (of a mixed training,
+            half the episodes each). With ``env`` given, its own is put back afterwards.
         episodes: number of environments, and of episodes.
-        seed: evaluation seed in [0, 2**30); the same seed plays the same episodes for every agent. Disjoint from all
-            training seeds, see :func:`held_out_seed`.
-        env: environments from :func:`make_eval_env` to use again (saves compiling); their number replaces ``episodes``.
+        seed: evaluation seed in [0, 2**30); the same seed plays the same episodes for every agent.
+            Disjoint from all training seeds, see :func:`held_out_seed`.
+        env: environments from :func:`make_eval_env` to use again (saves compiling); their number
+            replaces ``episodes``.
 
     Raises:
-        ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is unknown.
+        ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is
+            unknown.
     """
-    require(1 <= episodes <= MOST_EPISODES, "episodes", episodes, f"a whole number from 1 to {MOST_EPISODES}")
-    require(observability in (None, "full", "partial"), "observability", observability, "'full' or 'partial'")
+    require(
+        1 <= episodes <= MOST_EPISODES,
+        "episodes",
+        episodes,
+        f"a whole number from 1 to {MOST_EPISODES}",
+    )
+    require(
+        observability in (None, "full", "partial"),
+        "observability",
+        observability,
+        "'full' or 'partial'",
+    )
     if env is None:
         device = str(next(agent.network.parameters()).device)
-        env = make_eval_env(replace(agent.config, device=device, cuda_graphs=False), episodes, observability)
+        env = make_eval_env(
+            replace(agent.config, device=device, cuda_graphs=False), episodes, observability
+        )
     before = env.observability
     try:
         if observability is not None:
@@ -122,7 +153,8 @@ def _play(agent: Any, env: Any) -> EvalResult:
     obs = env.reset()
     num_envs = env.batch_size[0]
     state = agent.initial_state(num_envs)
-    returns, lengths = np.zeros(num_envs, np.float32), np.zeros(num_envs, np.int64)
+    returns = np.zeros(num_envs, np.float32)
+    lengths = np.zeros(num_envs, np.int64)
     playing = np.ones(num_envs, bool)
     while playing.any():
         action, _, state = agent.act(obs, state)

@@ -1,4 +1,6 @@
-"""What PQN, PPO and DQN share: schedules, the order of minibatches, the gradient step, the check for NaN."""
+"""What PQN, PPO and DQN share: schedules, the order of minibatches, the gradient step, the check
+for NaN.
+"""
 
 import math
 from collections.abc import Iterator
@@ -21,20 +23,29 @@ class NonFiniteError(RuntimeError):
 
 
 def linear(start: float, end: float, frames: float, duration: float) -> float:
-    """Straight line from ``start`` at frame 0 to ``end`` at frame ``duration``, constant afterwards."""
+    """Straight line from ``start`` at frame 0 to ``end`` at frame ``duration``, constant
+    afterwards.
+    """
     return end if frames >= duration else start + (end - start) * (frames / duration)
 
 
 def learning_rate_at(config: LearnerConfig, frames: float, total_frames: int) -> float:
     """Step size after ``frames`` of ``total_frames`` frames."""
-    return linear(config.learning_rate, config.learning_rate_end, frames, config.lr_decay_fraction * total_frames)
+    return linear(
+        config.learning_rate,
+        config.learning_rate_end,
+        frames,
+        config.lr_decay_fraction * total_frames,
+    )
 
 
 def epsilon_at(config: LearnerConfig, frames: float, total_frames: int) -> float | None:
     """Probability of a uniformly random action; None for a learner that samples its own policy."""
     if not isinstance(config, QConfig):
         return None
-    return linear(config.epsilon_start, config.epsilon_end, frames, config.exploration_fraction * total_frames)
+    return linear(
+        config.epsilon_start, config.epsilon_end, frames, config.exploration_fraction * total_frames
+    )
 
 
 @dataclass(frozen=True)
@@ -49,22 +60,31 @@ class Training:
 
 
 class Learner:
-    """The plumbing below an algorithm's ``update``: one gradient step, minibatches, schedules, the check for NaN.
+    """The plumbing below an algorithm's ``update``: one gradient step, minibatches, schedules, the
+    check for NaN.
 
     Args:
-        loss: gives a TensorDict; the sum of its ``loss*`` entries is minimised, all its scalars become metrics.
+        loss: gives a TensorDict; the sum of its ``loss*`` entries is minimised, all its scalars
+            become metrics.
         config: numbers of the algorithm.
         training: of the run.
         optimizer: ``"radam"`` or ``"adam"``, see :func:`make_optimizer`.
     """
 
     def __init__(
-        self, loss: LossModule, config: LearnerConfig, training: Training, optimizer: Literal["radam", "adam"]
+        self,
+        loss: LossModule,
+        config: LearnerConfig,
+        training: Training,
+        optimizer: Literal["radam", "adam"],
     ) -> None:
-        self.loss, self.config, self.training = loss, config, training
+        self.loss = loss
+        self.config = config
+        self.training = training
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = make_optimizer(self.parameters, config.learning_rate, optimizer)
-        self.norm: nn.Module = getattr(loss, "advantage_norm", None) or nn.Module()  # of PPO; in the checkpoint too
+        # of PPO; in the checkpoint too
+        self.norm: nn.Module = getattr(loss, "advantage_norm", None) or nn.Module()
         self.frames_per_step = config.frames_per_update / config.grad_steps_per_update
         self.grad_steps = 0
         self.learning_rate = config.learning_rate
@@ -72,7 +92,9 @@ class Learner:
         self._metrics: list[TensorDictBase] = []
 
     def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:
-        """The minibatches of all epochs, each epoch over the rows of ``data`` in a random order of its own."""
+        """The minibatches of all epochs, each epoch over the rows of ``data`` in a random order of
+        its own.
+        """
         for _ in range(self.config.epochs):
             order = torch.randperm(len(data), generator=self.training.generator)
             shuffled = data[order.to(self.training.device, non_blocking=True)]
@@ -100,25 +122,41 @@ class Learner:
         Raises:
             NonFiniteError: a loss, a gradient or a weight is not finite; names the gradient step.
         """
-        steps, self._metrics = self._metrics, []
+        steps = self._metrics
+        self._metrics = []
         if not steps:
             return {"lr": self.learning_rate}
         self.grad_steps += len(steps)
         names = list(steps[0].keys())
-        table = torch.stack([torch.stack([step[name] for name in names]) for step in steps]).tolist()
+        table = torch.stack(
+            [torch.stack([step[name] for name in names]) for step in steps]
+        ).tolist()
         for number, row in enumerate(table):
             for name, text in (("loss", "loss"), ("grad_norm", "gradient norm")):
                 if not math.isfinite(value := row[names.index(name)]):
-                    raise NonFiniteError(f"the {text} is {value} at gradient step {number + 1} of {len(table)}")
+                    raise NonFiniteError(
+                        f"the {text} is {value} at gradient step {number + 1} of {len(table)}"
+                    )
         if not bool(torch.stack([p.detach().sum() for p in self.parameters]).isfinite().all()):
-            bad = [n for n, p in self.loss.named_parameters() if not bool(p.detach().isfinite().all())]
+            bad = [
+                n for n, p in self.loss.named_parameters() if not bool(p.detach().isfinite().all())
+            ]
             raise NonFiniteError(f"the weights {', '.join(bad[:3])} are not finite")
-        means = {name: sum(column) / len(table) for name, column in zip(names, zip(*table, strict=True), strict=True)}
+        means = {
+            name: sum(column) / len(table)
+            for name, column in zip(names, zip(*table, strict=True), strict=True)
+        }
         return means | {"lr": self.learning_rate}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but the trained weights and the generator that the coming updates depend on."""
-        return {"optimizer": self.optimizer.state_dict(), "grad_steps": self.grad_steps, "norm": self.norm.state_dict()}
+        """Everything but the trained weights and the generator that the coming updates depend
+        on.
+        """
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "grad_steps": self.grad_steps,
+            "norm": self.norm.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment; the weights are loaded elsewhere."""
@@ -127,7 +165,8 @@ class Learner:
         options = {name: value for name, value in group.items() if name != "params"}
         self.optimizer.load_state_dict(state["optimizer"])
         self.norm.load_state_dict(state.get("norm", {}))  # older checkpoints have none
-        # The config decides these; the step size is set before every step, and on CUDA a tensor there.
+        # The config decides these; the step size is set before every step, and on CUDA a tensor
+        # there.
         self.optimizer.param_groups[0].update(options)
         self.grad_steps = state["grad_steps"]
 
@@ -135,12 +174,13 @@ class Learner:
 def make_optimizer(
     parameters: list[nn.Parameter], learning_rate: float, kind: Literal["radam", "adam"] = "radam"
 ) -> torch.optim.Optimizer:
-    """RAdam (PQN, DQN; eps 1e-8) or Adam (PPO; eps 1e-5) with the constants of the paper: betas 0.9, 0.999, no decay.
+    """RAdam (PQN, DQN; eps 1e-8) or Adam (PPO; eps 1e-5) with the constants of the paper: betas
+    0.9, 0.999, no decay.
 
     On CUDA the step size, which :func:`set_learning_rate` moves, is a tensor that a graph can read.
 
-    Source: Liu et al., "On the variance of the adaptive learning rate and beyond", arXiv 1908.03265;
-    Kingma & Ba, arXiv 1412.6980.
+    Source: Liu et al., "On the variance of the adaptive learning rate and beyond", arXiv
+    1908.03265; Kingma & Ba, arXiv 1412.6980.
     """
     cuda = bool(parameters) and parameters[0].device.type == "cuda"
     lr = torch.tensor(learning_rate, device=parameters[0].device) if cuda else learning_rate
@@ -154,8 +194,8 @@ def make_optimizer(
 class FusedRAdam(torch.optim.Adam):
     """RAdam by the fused kernel of Adam, one pass over the weights on a CPU instead of fourteen.
 
-    RAdam's step is Adam's with a step size that depends on the number of steps alone; in the first five steps, where
-    the variance is not yet known, it is one along the mean of the gradients.
+    RAdam's step is Adam's with a step size that depends on the number of steps alone; in the first
+    five steps, where the variance is not yet known, it is one along the mean of the gradients.
 
     Source: Liu et al., arXiv 1908.03265, algorithm 2; equal to ``torch.optim.RAdam``.
     """
@@ -164,15 +204,20 @@ class FusedRAdam(torch.optim.Adam):
     def step(self, closure: Any = None) -> Any:
         """One step, as :meth:`torch.optim.Optimizer.step`."""
         group = self.param_groups[0]
-        lr, eps, (beta1, beta2) = group["lr"], group["eps"], group["betas"]
+        lr = group["lr"]
+        eps = group["eps"]
+        (beta1, beta2) = group["betas"]
         t = 1 + int(next((state["step"] for state in self.state.values()), 0))
-        largest, correction = 2 / (1 - beta2) - 1, 1 - beta2**t
-        length = largest - 2 * t * beta2**t / correction  # of the average of squares: what the variance is known by
+        largest = 2 / (1 - beta2) - 1
+        correction = 1 - beta2**t
+        # of the average of squares: what the variance is known by
+        length = largest - 2 * t * beta2**t / correction
         factor = (length - 4) * (length - 2) * largest / ((largest - 4) * (largest - 2) * length)
         group["lr"] = lr * math.sqrt(factor) if length > 5 else 0.0  # 0: only the averages move
         group["eps"] = eps / math.sqrt(correction)
         result = super().step(closure)
-        group["lr"], group["eps"] = lr, eps
+        group["lr"] = lr
+        group["eps"] = eps
         if length <= 5:
             for parameter, state in self.state.items():
                 parameter.add_(state["exp_avg"], alpha=-lr / (1 - beta1**t))
@@ -182,4 +227,6 @@ class FusedRAdam(torch.optim.Adam):
 def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:
     """Give every parameter group the same step size; in place where it is a tensor."""
     for group in optimizer.param_groups:
-        group["lr"] = group["lr"].fill_(learning_rate) if isinstance(group["lr"], Tensor) else learning_rate
+        group["lr"] = (
+            group["lr"].fill_(learning_rate) if isinstance(group["lr"], Tensor) else learning_rate
+        )

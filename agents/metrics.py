@@ -13,7 +13,8 @@ EWM_SPAN = 100  # in points of the curve (paper score) or in updates (running av
 
 
 def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
-    """Exponentially weighted mean without bias adjustment: ``y[0] = x[0]``, ``y[t] = y[t-1] + alpha (x[t] - y[t-1])``.
+    """Exponentially weighted mean without bias adjustment: ``y[0] = x[0]``, ``y[t] = y[t-1] + alpha
+    (x[t] - y[t-1])``.
 
     ``alpha = 2 / (span + 1)``; values and result are float [P].
     """
@@ -25,7 +26,8 @@ def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
 
 
 def student_half_width(values: ArrayLike, confidence: float = 0.95) -> float:
-    """Half the width of Student's interval of the mean of some values; NaN where one value alone gives none.
+    """Half the width of Student's interval of the mean of some values; NaN where one value alone
+    gives none.
 
     Example:
         >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
@@ -43,26 +45,33 @@ def student_half_width(values: ArrayLike, confidence: float = 0.95) -> float:
 def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None = None) -> float:
     """The number the paper reports for a run: the best smoothed training return.
 
-    The training curve is interpolated linearly on 1,000 equispaced points in [0, ``max_frames``] (constant beyond the
-    ends) and smoothed by an exponentially weighted mean with span 100 points; its maximum is the score. It contains
-    exploration noise and never goes down; keep it beside a greedy evaluation, not in place of one.
+    The training curve is interpolated linearly on 1,000 equispaced points in [0, ``max_frames``]
+    (constant beyond the ends) and smoothed by an exponentially weighted mean with span 100 points;
+    its maximum is the score. It contains exploration noise and never goes down; keep it beside a
+    greedy evaluation, not in place of one.
 
     Args:
         frames: float [P], increasing; frames seen at each point of the history.
-        returns: float [P], at each point the return of every environment's last finished episode, averaged.
+        returns: float [P], at each point the return of every environment's last finished episode,
+            averaged.
         max_frames: end of the frame axis; default the last of ``frames``.
 
     Returns:
         The score, in units of the undiscounted return.
 
     Raises:
-        ValueError: the history is empty, its two parts differ in length, or ``frames`` is not finite and increasing.
+        ValueError: the history is empty, its two parts differ in length, or ``frames`` is not
+            finite and increasing.
 
     Source: POPGym Arcade (ICML 2026), plotting of the reference implementation.
     """
-    x, y = np.asarray(frames, dtype=np.float64), np.asarray(returns, dtype=np.float64)
+    x = np.asarray(frames, dtype=np.float64)
+    y = np.asarray(returns, dtype=np.float64)
     if x.ndim != 1 or x.shape != y.shape or len(x) == 0:
-        raise ValueError(f"frames and returns must be two histories of one length >= 1; got {x.shape} and {y.shape}")
+        raise ValueError(
+            f"frames and returns must be two histories of one length >= 1; got {x.shape} and "
+            f"{y.shape}"
+        )
     if not (np.isfinite(x).all() and np.all(np.diff(x) > 0)):
         raise ValueError("frames must be finite and increase from row to row")
     grid = np.linspace(0.0, x[-1] if max_frames is None else max_frames, CURVE_POINTS)
@@ -73,10 +82,13 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
 class EpisodeStats:
     """Returns of training episodes, followed from window to window."""
 
-    last: NDArray[np.float64]  # [N], return of the last finished episode of each environment; NaN before the first
+    # [N], return of the last finished episode of each environment; NaN before the first
+    last: NDArray[np.float64]
     episodes: int = 0  # finished so far
-    smooth: float | None = None  # running average of finished episodes (span 100 windows); None before the first
-    finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))  # [E], those of the last window
+    # running average of finished episodes (span 100 windows); None before the first
+    smooth: float | None = None
+    # [E], those of the last window
+    finished: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
     def update(self, episode_reward: Tensor, done: Tensor) -> float | None:
         """Read one window of new steps.
@@ -86,24 +98,39 @@ class EpisodeStats:
             done: bool [N, T].
 
         Returns:
-            The last finished return of each environment, averaged over the window, for :func:`paper_score`; None until
-            each has one: 0 in its place, as in published scores, beats what is negative (docs/differences.md, Tetris).
+            The last finished return of each environment, averaged over the window, for
+            :func:`paper_score`; None until each has one: 0 in its place, as in published scores,
+            beats what is negative (docs/differences.md, Tetris).
         """
-        returns, ends = episode_reward.cpu().double().numpy(), done.cpu().numpy()
+        returns = episode_reward.cpu().double().numpy()
+        ends = done.cpu().numpy()
         self.finished = returns[ends]
-        latest = np.maximum.accumulate(np.where(ends, np.arange(ends.shape[1]), -1), axis=1)  # step of the last end
-        known = np.where(latest >= 0, np.take_along_axis(returns, latest.clip(0), axis=1), self.last[:, None])
+        # step of the last end
+        latest = np.maximum.accumulate(np.where(ends, np.arange(ends.shape[1]), -1), axis=1)
+        known = np.where(
+            latest >= 0, np.take_along_axis(returns, latest.clip(0), axis=1), self.last[:, None]
+        )
         self.last = known[:, -1].copy()
         self.episodes += len(self.finished)
         if len(self.finished):
             mean = float(self.finished.mean())
-            self.smooth = mean if self.smooth is None else self.smooth + 2 / (EWM_SPAN + 1) * (mean - self.smooth)
+            self.smooth = (
+                mean
+                if self.smooth is None
+                else self.smooth + 2 / (EWM_SPAN + 1) * (mean - self.smooth)
+            )
         return None if np.isnan(known).any() else float(known.mean())
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""
-        return {"last": torch.from_numpy(self.last.copy()), "episodes": self.episodes, "smooth": self.smooth}
+        return {
+            "last": torch.from_numpy(self.last.copy()),
+            "episodes": self.episodes,
+            "smooth": self.smooth,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go back to a saved moment."""
-        self.last, self.episodes, self.smooth = state["last"].numpy().copy(), state["episodes"], state["smooth"]
+        self.last = state["last"].numpy().copy()
+        self.episodes = state["episodes"]
+        self.smooth = state["smooth"]

@@ -1,4 +1,6 @@
-"""Policies: TensorDict modules for ``ArcadeCollector``; TorchRL's rollouts and collectors need a memory's primer."""
+"""Policies: TensorDict modules for ``ArcadeCollector``; TorchRL's rollouts and collectors need a
+memory's primer.
+"""
 
 from dataclasses import replace
 from os import PathLike
@@ -34,11 +36,12 @@ def make_policy(
         network: of Q-values (``action_value``), or an actor-critic (``logits``).
         explore: for Q-values, append TorchRL's ``EGreedyModule``; for an actor-critic, sample.
         epsilon: probability of a random action; move it by ``policy[-1].eps.fill_(...)``.
-        num_actions: A; None: the outputs of the last linear layer in the network's ``head``, 5 if it has none.
+        num_actions: A; None: the outputs of the last linear layer in the network's ``head``, 5 if
+            it has none.
 
     Returns:
-        A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it samples. Random numbers
-        come from torch's global generator.
+        A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it
+        samples. Random numbers come from torch's global generator.
     """
     if isinstance(network, ActorCriticNetwork):
         return make_actor(network, deterministic=not explore)
@@ -46,18 +49,24 @@ def make_policy(
     if explore:
         head = network.head if isinstance(network, MemoryNetwork) else nn.Identity()
         sizes = [layer.out_features for layer in head.modules() if isinstance(layer, nn.Linear)]
-        parts.append(EGreedyModule(Categorical(num_actions or [5, *sizes][-1]), eps_init=float(epsilon), eps_end=0.0))
+        parts.append(
+            EGreedyModule(
+                Categorical(num_actions or [5, *sizes][-1]), eps_init=float(epsilon), eps_end=0.0
+            )
+        )
     return TensorDictSequential(*parts)
 
 
 class Agent(TensorDictModuleBase):
-    """A trained network and the config it was trained with; as a TensorDict module it is the greedy policy.
+    """A trained network and the config it was trained with; as a TensorDict module it is the greedy
+    policy.
 
     Attributes:
         config: of the run that trained it.
         network: on its device; see :meth:`outputs` for what its outputs mean.
         frames: training frames behind it.
-        offers: what :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs", "value").
+        offers: what :meth:`outputs` can be asked for: ("q", "value") or ("logits", "probs",
+            "value").
 
     Example:
         >>> from arcade_torch import ArcadeCollector, make
@@ -71,10 +80,13 @@ class Agent(TensorDictModuleBase):
 
     def __init__(self, config: TrainConfig, network: Network, frames: int = 0) -> None:
         super().__init__()
-        self.config, self.network, self.frames = config, network, frames
+        self.config = config
+        self.network = network
+        self.frames = frames
         self.offers = network.offers if isinstance(network, ActorCriticNetwork) else ("q", "value")
         self.policy = make_policy(network, explore=False)
-        self.in_keys, self.out_keys = self.policy.in_keys, self.policy.out_keys
+        self.in_keys = self.policy.in_keys
+        self.out_keys = self.policy.out_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the greedy action and what it rests on."""
@@ -86,20 +98,24 @@ class Agent(TensorDictModuleBase):
         return self.network.initial_state(batch_size)
 
     @torch.no_grad()
-    def act(self, obs: TensorDictBase, state: TensorDictBase) -> tuple[Tensor, dict[str, Tensor], TensorDictBase]:
+    def act(
+        self, obs: TensorDictBase, state: TensorDictBase
+    ) -> tuple[Tensor, dict[str, Tensor], TensorDictBase]:
         """Greedy actions, with the recurrent state as an argument and a result.
 
         Args:
-            obs: root entries ``pixels`` [N, ...], ``last_action`` int64 [N], ``is_init`` bool [N, 1].
+            obs: root entries ``pixels`` [N, ...], ``last_action`` int64 [N], ``is_init`` bool [N,
+                1].
             state: recurrent state, TensorDict [N].
 
         Returns:
-            ``(action int64 [N], extras, new state)``, with the extras ``q_value`` float32 [N, A], or ``logits`` [N, A]
-            and ``state_value`` [N].
+            ``(action int64 [N], extras, new state)``, with the extras ``q_value`` float32 [N, A],
+            or ``logits`` [N, A] and ``state_value`` [N].
         """
         pixels = obs.get("pixels").unsqueeze(1)
         steps = pixels.shape[0], 1
-        last_action, is_init = obs.get("last_action").reshape(steps), obs.get("is_init").reshape(steps)
+        last_action = obs.get("last_action").reshape(steps)
+        is_init = obs.get("is_init").reshape(steps)
         out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
         out = out.squeeze(1)
         if isinstance(self.network, ActorCriticNetwork):
@@ -108,26 +124,37 @@ class Agent(TensorDictModuleBase):
         return out.argmax(-1), {"q_value": out}, state
 
     def outputs(self, out: Tensor, what: str) -> Tensor:
-        """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else ValueError).
+        """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else
+        ValueError).
 
-        ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``: of the state,
-        [..., 1], the best of its Q-values where it has these.
+        ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``:
+        of the state, [..., 1], the best of its Q-values where it has these.
         """
-        require(what in self.offers, "what", what, f"one that this agent offers: {', '.join(self.offers)}")
+        require(
+            what in self.offers,
+            "what",
+            what,
+            f"one that this agent offers: {', '.join(self.offers)}",
+        )
         if isinstance(self.network, ActorCriticNetwork):
             return self.network.select(out, what)
         return out.amax(-1, keepdim=True) if what == "value" else out
 
 
 def build_network(config: TrainConfig) -> Network:
-    """The freshly initialised network of a config, on its device; the same seed gives the same weights, and no global
-    draw moves.
+    """The freshly initialised network of a config, on its device; the same seed gives the same
+    weights, and no global draw moves.
     """
     make: Any = make_actor_critic if config.algorithm == "ppo" else make_network
-    options = {"predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0, **config.network_options}
+    options = {
+        "predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0,
+        **config.network_options,
+    }
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(config.seed)
-        network: Network = make(config.network, memory=config.memory, obs_size=config.obs_size, **options)
+        network: Network = make(
+            config.network, memory=config.memory, obs_size=config.obs_size, **options
+        )
     for module in network.modules():
         if isinstance(module, Encoder):
             module.amp = config.amp
@@ -135,7 +162,9 @@ def build_network(config: TrainConfig) -> Network:
 
 
 def compile_network(network: nn.Module, backend: str = "inductor") -> None:
-    """Compile encoders, memories and heads in place, also for losses that hold them; weights keep their names."""
+    """Compile encoders, memories and heads in place, also for losses that hold them; weights keep
+    their names.
+    """
     for module in network.modules():
         if isinstance(module, MemoryNetwork):
             for part in (module.encoder, module.block, module.head):
@@ -146,23 +175,32 @@ def _check_weights(path: Path, saved: dict[str, Tensor], wanted: dict[str, Tenso
     """Raise CheckpointError for weights that would load without a word and mean nothing."""
     for name, value in saved.items():
         if name in wanted and value.dtype != wanted[name].dtype:
-            raise CheckpointError(f"the weight {name} in {path} is {value.dtype}, the network has {wanted[name].dtype}")
+            raise CheckpointError(
+                f"the weight {name} in {path} is {value.dtype}, the network has "
+                f"{wanted[name].dtype}"
+            )
         if value.is_floating_point() and not bool(value.isfinite().all()):
-            raise CheckpointError(f"the weight {name} in {path} is not finite: take the checkpoint before")
+            raise CheckpointError(
+                f"the weight {name} in {path} is not finite: take the checkpoint before"
+            )
 
 
 def load(path: str | PathLike[str], device: str | torch.device | None = None) -> Agent:
     """Load an agent.
 
     Args:
-        path: a run folder (its newest whole checkpoint), its ``checkpoints`` folder, or one checkpoint folder.
-        device: where to put the network; default the device of the run if it is there, else the CPU.
+        path: a run folder (its newest whole checkpoint), its ``checkpoints`` folder, or one
+            checkpoint folder.
+        device: where to put the network; default the device of the run if it is there, else the
+            CPU.
 
     Returns:
-        The agent, in evaluation mode: a policy for ``ArcadeCollector``, and for ``env.rollout`` if a memory is primed.
+        The agent, in evaluation mode: a policy for ``ArcadeCollector``, and for ``env.rollout`` if
+        a memory is primed.
 
     Raises:
-        CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was found.
+        CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was
+            found.
     """
     checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
@@ -172,7 +210,9 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
         network.load_state_dict(checkpoint.weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
-        raise CheckpointError(f"the weights in {checkpoint.path} do not fit the network: {reason}") from error
+        raise CheckpointError(
+            f"the weights in {checkpoint.path} do not fit the network: {reason}"
+        ) from error
     if device is None:
         wanted = torch.device(config.device)
         device = wanted if (wanted.index or 0) < torch.cuda.device_count() else "cpu"

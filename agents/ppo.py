@@ -43,12 +43,13 @@ def ppo_objective(
         value: of the observation, by the critic that learns.
         old_value: the same before the first gradient step; None leaves the value unclipped.
         value_target: what the value should have been.
-        clip_epsilon: how far the ratio may leave 1, and the value its old one, before the gradient ends.
+        clip_epsilon: how far the ratio may leave 1, and the value its old one, before the gradient
+            ends.
 
     Returns:
-        ``policy_loss`` and ``value_loss`` with gradient; without one ``kl``, an estimate that is never
-        negative (Schulman, "Approximating KL divergence", k3), and ``clipped`` and ``value_clipped``,
-        1 where a clip is at work.
+        ``policy_loss`` and ``value_loss`` with gradient; without one ``kl``, an estimate that is
+        never negative (Schulman, "Approximating KL divergence", k3), and ``clipped`` and
+        ``value_clipped``, 1 where a clip is at work.
 
     Source: Schulman et al., arXiv 1707.06347, equation 7; value clipping as in the published code.
     """
@@ -81,22 +82,26 @@ def normalize(advantage: Tensor) -> Tensor:
 
 
 class PPOLoss(LossModule):
-    """:func:`ppo_objective` and an entropy bonus over whole sequences of a recurrent actor and critic.
+    """:func:`ppo_objective` and an entropy bonus over whole sequences of a recurrent actor and
+    critic.
 
     In keys: what the networks read, ``action``, ``action_log_prob``, ``is_init``, and what
     :class:`SequenceGAE` reads or writes. Advantages are made before the first gradient step and are
-    normalised in each minibatch, unless an ``advantage_norm`` divides them (``update`` it once a window
-    with what it is to follow, advantages or value targets).
+    normalised in each minibatch, unless an ``advantage_norm`` divides them (``update`` it once a
+    window with what it is to follow, advantages or value targets).
 
-    Out keys, those of TorchRL's ``ClipPPOLoss``: ``loss_objective``, ``loss_critic``, ``loss_entropy``
-    (with gradient, weighted; their sum is to be minimised), ``entropy``, ``kl_approx``,
-    ``clip_fraction``, ``value_clip_fraction``; and ``loss_prediction`` where that has a weight.
+    Out keys, those of TorchRL's ``ClipPPOLoss``: ``loss_objective``, ``loss_critic``,
+    ``loss_entropy`` (with gradient, weighted; their sum is to be minimised), ``entropy``,
+    ``kl_approx``, ``clip_fraction``, ``value_clip_fraction``; and ``loss_prediction`` where that
+    has a weight.
 
     Args:
-        actor_network: a probabilistic TensorDict module (:func:`make_actor`, ``ProbabilisticActor``).
+        actor_network: a probabilistic TensorDict module (:func:`make_actor`,
+            ``ProbabilisticActor``).
         critic_network: any TensorDict module that writes ``state_value`` [*, 1].
         time_limit: see :class:`SequenceGAE`.
-        clip_epsilon: see :func:`ppo_objective`; a buffer, ``loss.clip_epsilon.fill_(...)`` moves it.
+        clip_epsilon: see :func:`ppo_objective`; a buffer, ``loss.clip_epsilon.fill_(...)`` moves
+            it.
         clip_value: whether the value is clipped as well.
         entropy_coeff: weight of the entropy bonus; a buffer.
         critic_coeff: weight of the value loss, which is half the squared error.
@@ -195,11 +200,15 @@ class PPOLoss(LossModule):
 
         Args:
             value_type: an estimator of TorchRL; None for :class:`SequenceGAE`.
-            **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``, and ``critic``, where the loss's
-                own reads what the actor has written (``ActorCriticNetwork.estimator``).
+            **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``, and
+                ``critic``, where the loss's own reads what the actor has written
+                (``ActorCriticNetwork.estimator``).
         """
         if value_type is None:
-            hyperparams = {"critic": self.critic_network, "time_limit": self.time_limit} | hyperparams
+            hyperparams = {
+                "critic": self.critic_network,
+                "time_limit": self.time_limit,
+            } | hyperparams
             self._value_estimator = SequenceGAE(**hyperparams)
         else:
             of_torchrl = [kind for kind in ValueEstimators if kind is not ValueEstimators.VTrace]
@@ -211,9 +220,19 @@ class PPOLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         """Let the estimator know the names of the entries."""
-        names = ("advantage", "value_target", "value", "reward", "done", "terminated", "sample_log_prob")
+        names = (
+            "advantage",
+            "value_target",
+            "value",
+            "reward",
+            "done",
+            "terminated",
+            "sample_log_prob",
+        )
         if self._value_estimator is not None:
-            self._value_estimator.set_keys(**{name: getattr(self.tensor_keys, name) for name in names})
+            self._value_estimator.set_keys(
+                **{name: getattr(self.tensor_keys, name) for name in names}
+            )
         self._set_in_keys()
 
     @dispatch  # type: ignore[untyped-decorator]
@@ -221,8 +240,9 @@ class PPOLoss(LossModule):
         """The parts of the loss.
 
         Args:
-            tensordict: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock batch [B, T]; with
-                ``advantage``, ``value_target``, ``state_value`` (else they are estimated with the present critic).
+            tensordict: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock
+                batch [B, T]; with ``advantage``, ``value_target``, ``state_value`` (else they are
+                estimated with the present critic).
 
         Returns:
             The out keys.
@@ -287,7 +307,8 @@ class PPOLoss(LossModule):
 class Choice(Categorical):
     """A categorical distribution that samples something even where logits are NaN.
 
-    ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name the update.
+    ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name
+    the update.
     """
 
     deterministic_sample = Categorical.mode  # the name that TorchRL asks for
@@ -314,14 +335,18 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
         distribution_class=Choice,
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
-        default_interaction_type=ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM,
+        default_interaction_type=ExplorationType.DETERMINISTIC
+        if deterministic
+        else ExplorationType.RANDOM,
     )
 
 
 class PPO(Learner):
-    """Estimates advantages once a window, then goes over it for some epochs; arguments as in :class:`PQN`.
+    """Estimates advantages once a window, then goes over it for some epochs; arguments as in
+    :class:`PQN`.
 
-    The network has an ``actor`` (writes ``logits``), a ``critic`` (``state_value``) and the critic's ``estimator``.
+    The network has an ``actor`` (writes ``logits``), a ``critic`` (``state_value``) and the
+    critic's ``estimator``.
     """
 
     config: PPOConfig
@@ -331,26 +356,37 @@ class PPO(Learner):
         names = ("time_limit", "entropy_coeff", "critic_coeff", "prediction_coeff")
         options: Any = {name: getattr(config, name) for name in names}
         if config.advantage_decay:
-            options["advantage_norm"] = PopArtValueNorm(beta=config.advantage_decay, epsilon=1e-8).to(training.device)
-        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=config.clip, **options)
+            options["advantage_norm"] = PopArtValueNorm(
+                beta=config.advantage_decay, epsilon=1e-8
+            ).to(training.device)
+        loss = PPOLoss(
+            make_actor(network.actor), network.critic, clip_epsilon=config.clip, **options
+        )
         chunks = config.minibatches
-        loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam, chunks=chunks, critic=network.estimator)
+        loss.make_value_estimator(
+            gamma=config.gamma, lmbda=config.lam, chunks=chunks, critic=network.estimator
+        )
         super().__init__(loss, config, training, optimizer="adam")
 
     def update(self, batch: TensorDictBase, frames: float) -> dict[str, float | None]:
         """Learn from one window, with ``action_log_prob``; see `PQN.update`."""
         data = self.loss.value_estimator(batch)
-        if self.loss.advantage_norm is not None:  # a running mean and deviation of whatever it is given
+        # a running mean and deviation of whatever it is given
+        if self.loss.advantage_norm is not None:
             self.loss.advantage_norm.update(data["advantage"])
         for minibatch in self.minibatches(data):
-            left = self.config.entropy_coeff * self.config.entropy_end ** (frames / self.training.total_frames)
+            left = self.config.entropy_coeff * self.config.entropy_end ** (
+                frames / self.training.total_frames
+            )
             self.loss.entropy_coeff.fill_(left)
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()
         return metrics | {
             "policy_loss": metrics["loss_objective"],
-            "value_loss": metrics["loss_critic"] / self.config.critic_coeff if self.config.critic_coeff else None,
+            "value_loss": metrics["loss_critic"] / self.config.critic_coeff
+            if self.config.critic_coeff
+            else None,
             "kl": metrics["kl_approx"],
             "q_mean": float(data["state_value"].mean()),
             "td_error": float(data["advantage"].abs().mean()),

@@ -1,4 +1,6 @@
-"""PQN: Q-learning with lambda-returns, no replay buffer, no target network; with memory or without."""
+"""PQN: Q-learning with lambda-returns, no replay buffer, no target network; with memory or
+without.
+"""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -15,30 +17,45 @@ from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
 from arcade_torch.agents.config import Bootstrap, CountOrZero, PQNConfig, TimeLimit, coerce, require
-from arcade_torch.agents.layout import Key, NetworkInputs, insert_final_observations, is_stock, unroll
+from arcade_torch.agents.layout import (
+    Key,
+    NetworkInputs,
+    insert_final_observations,
+    is_stock,
+    unroll,
+)
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import QLambdaEstimator
 
 
 class PQNLoss(LossModule):
-    """Half the squared distance of Q(s, a) to its Q(lambda) return, whose values come from the very same pass.
+    """Half the squared distance of Q(s, a) to its Q(lambda) return, whose values come from the very
+    same pass.
 
-    In keys: what the network reads, ``action`` (categorical or one-hot), ``is_init``, ``("next", "reward" |
-    "terminated" | "truncated")``, and the true next observations: as ``final_pixels``, ``final_index``, ``final_mask``
-    with ``initial_state`` (batches [N] of ``ArcadeCollector.collect()``), or dense under "next" (stock TorchRL batches
-    [B, T]). Rows are whole sequences; never shuffle or flatten time. Half of TorchRL's ``DQNLoss(delay_value=False)``
+    In keys: what the network reads, ``action`` (categorical or one-hot), ``is_init``, ``("next",
+    "reward" | "terminated" | "truncated")``, and the true next observations: as ``final_pixels``,
+    ``final_index``, ``final_mask`` with ``initial_state`` (batches [N] of
+    ``ArcadeCollector.collect()``), or dense under "next" (stock TorchRL batches [B, T]). Rows are
+    whole sequences; never shuffle or flatten time. Half of TorchRL's ``DQNLoss(delay_value=False)``
     with TD(lambda), on the same batch.
 
-    Out keys: ``loss`` (with gradient), ``q_mean``, ``target_mean``, ``td_error`` (mean absolute), detached.
+    Out keys: ``loss`` (with gradient), ``q_mean``, ``target_mean``, ``td_error`` (mean absolute),
+    detached.
 
     Args:
-        value_network: any TensorDict module that writes ``action_value`` [*, A], a ``QValueActor`` for one.
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
-        bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its value.
-        delay_value: keep target parameters, which then give the next values (``SoftUpdate``, ``HardUpdate``).
-        burn_in: first steps that only bring the memory up to date, without gradient; memories with one ``store`` only.
+        value_network: any TensorDict module that writes ``action_value`` [*, A], a ``QValueActor``
+            for one.
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame;
+            ``"terminal"``: it terminates.
+        bootstrap: ``"next"``: every step has a target; ``"last"``: the last step only lends its
+            value.
+        delay_value: keep target parameters, which then give the next values (``SoftUpdate``,
+            ``HardUpdate``).
+        burn_in: first steps that only bring the memory up to date, without gradient; memories with
+            one ``store`` only.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        functional: hold the parameters apart from the network, as TorchRL's losses do; False saves that time.
+        functional: hold the parameters apart from the network, as TorchRL's losses do; False saves
+            that time.
 
     Source: Gallici et al., arXiv 2407.04811; POPGym Arcade (ICML 2026).
     """
@@ -82,21 +99,34 @@ class PQNLoss(LossModule):
         super().__init__()
         self.functional = functional
         if functional:
-            self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
+            self.convert_to_functional(
+                value_network, "value_network", create_target_params=delay_value
+            )
         else:
             require(not delay_value, "functional", functional, "True with delay_value")
             self.value_network = value_network
         self.inputs = NetworkInputs(value_network)
-        require(not burn_in or len(self.inputs.stores) < 2, "burn_in", burn_in, "0 with memories that differ in store")
+        require(
+            not burn_in or len(self.inputs.stores) < 2,
+            "burn_in",
+            burn_in,
+            "0 with memories that differ in store",
+        )
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.bootstrap = coerce("bootstrap", bootstrap, Bootstrap)
-        self.delay_value, self.burn_in, self.reduction = delay_value, coerce("burn_in", burn_in, CountOrZero), reduction
+        self.delay_value = delay_value
+        self.burn_in = coerce("burn_in", burn_in, CountOrZero)
+        self.reduction = reduction
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:
-        """Entries that every batch holds; when names are set, assign others for plain tensors in another order."""
+        """Entries that every batch holds; when names are set, assign others for plain tensors in
+        another order.
+        """
         keys = self.tensor_keys
-        roots = dict.fromkeys([*self.inputs.observation_keys, *self.inputs.state_keys, keys.action, keys.is_init])
+        roots = dict.fromkeys(
+            [*self.inputs.observation_keys, *self.inputs.state_keys, keys.action, keys.is_init]
+        )
         outcome = [("next", key) for key in (keys.reward, keys.terminated, keys.truncated)]
         nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
         self.in_keys = [*roots, *outcome, *nexts]
@@ -107,7 +137,8 @@ class PQNLoss(LossModule):
         """Choose how targets are made.
 
         Args:
-            value_type: an estimator of TorchRL (TD0, TD1, TDLambda) or an instance; None for :class:`QLambdaEstimator`.
+            value_type: an estimator of TorchRL (TD0, TD1, TDLambda) or an instance; None for
+                :class:`QLambdaEstimator`.
             **hyperparams: ``gamma`` (0.99) and ``lmbda`` (0.95).
         """
         if value_type is None:
@@ -123,11 +154,15 @@ class PQNLoss(LossModule):
         self.make_value_estimator()
 
     def prepare(self, batch: TensorDictBase) -> TensorDict:
-        """Insert the final observations, once for all minibatches; rows of the result are what :meth:`forward` takes.
+        """Insert the final observations, once for all minibatches; rows of the result are what
+        :meth:`forward` takes.
 
         See :func:`insert_final_observations`, whose result [N] it is.
         """
-        keys = {x: getattr(self.tensor_keys, x) for x in ("action", "is_init", "reward", "terminated", "truncated")}
+        keys = {
+            x: getattr(self.tensor_keys, x)
+            for x in ("action", "is_init", "reward", "terminated", "truncated")
+        }
         return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in, **keys)
 
     @dispatch  # type: ignore[untyped-decorator]
@@ -135,8 +170,9 @@ class PQNLoss(LossModule):
         """Loss and metrics of a batch, and the priority of its steps, which is written into it.
 
         Args:
-            tensordict: sequences [N], a stock batch [..., T], or rows of what :meth:`prepare` gave, which get no
-                priorities; with ``priority_weight``, [N] or one a step, if the loss is to be weighted.
+            tensordict: sequences [N], a stock batch [..., T], or rows of what :meth:`prepare` gave,
+                which get no priorities; with ``priority_weight``, [N] or one a step, if the loss is
+                to be weighted.
 
         Returns:
             The out keys.
@@ -147,17 +183,24 @@ class PQNLoss(LossModule):
         """
         data = tensordict if "position" in tensordict else self.prepare(tensordict)
         params: Any = self.value_network_params if self.functional else None
-        with nullcontext() if params is None else params.to_module(self.value_network, preserve_module_state=False):
+        with (
+            nullcontext()
+            if params is None
+            else params.to_module(self.value_network, preserve_module_state=False)
+        ):
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
-        position, action = data["position"][:, :steps], data["action"][:, :steps]
+        position = data["position"][:, :steps]
+        action = data["action"][:, :steps]
         if action.ndim == 3 and action.shape[-1] == q.shape[-1]:  # one-hot
             action = action.int().argmax(-1)
         chosen = q.flatten(1).gather(1, position * q.shape[-1] + action.reshape(position.shape))
         target = self.targets(data, q.detach(), steps)
         error = chosen - target
-        rows, trained = tensordict, slice(self.burn_in, self.burn_in + steps)
-        if data is not tensordict and is_stock(tensordict, self.tensor_keys.is_init):  # its masks are those of steps
+        rows = tensordict
+        trained = slice(self.burn_in, self.burn_in + steps)
+        # its masks are those of steps
+        if data is not tensordict and is_stock(tensordict, self.tensor_keys.is_init):
             rows = tensordict[..., trained]
             error, chosen, target = (x.reshape(rows.shape) for x in (error, chosen, target))
         weight = self._maybe_get_priority_weight(rows)
@@ -165,15 +208,23 @@ class PQNLoss(LossModule):
         loss = self._reduce_loss(0.5 * error.square(), rows, weights=weight)
         each = {"q_mean": chosen.detach(), "target_mean": target, "td_error": error.detach().abs()}
         if data is not tensordict and not tensordict.is_locked:
-            size, length = each["td_error"].unsqueeze(-1), self.burn_in + data["reward"].shape[1]
-            every = size.mean(-2, keepdim=True).repeat_interleave(length, -2)  # what is not trained has the mean
-            tensordict[self.tensor_keys.priority] = every.slice_scatter(size, -2, trained.start, trained.stop)
-        means = {key: self._reduce_loss(value, rows, reduction="mean") for key, value in each.items()}
+            size = each["td_error"].unsqueeze(-1)
+            length = self.burn_in + data["reward"].shape[1]
+            # what is not trained has the mean
+            every = size.mean(-2, keepdim=True).repeat_interleave(length, -2)
+            tensordict[self.tensor_keys.priority] = every.slice_scatter(
+                size, -2, trained.start, trained.stop
+            )
+        means = {
+            key: self._reduce_loss(value, rows, reduction="mean") for key, value in each.items()
+        }
         return TensorDict(loss=loss, **means, batch_size=[])
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
-        """Returns of the first S ``steps`` of what :meth:`prepare` gave, from Q-values [B, L + K, A]: float [B, S]."""
+        """Returns of the first S ``steps`` of what :meth:`prepare` gave, from Q-values [B, L + K,
+        A]: float [B, S].
+        """
         next_value = self.next_values(data, q, steps)
         keys = self.tensor_keys
         outcome = TensorDict(batch_size=next_value.shape)
@@ -185,9 +236,13 @@ class PQNLoss(LossModule):
 
     @torch.no_grad()
     def next_values(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
-        """Best Q-values of the true next observations, float [B, S]; of the target network if there is one."""
+        """Best Q-values of the true next observations, float [B, S]; of the target network if there
+        is one.
+        """
         if self.delay_value:
-            with self.target_value_network_params.to_module(self.value_network, preserve_module_state=False):
+            with self.target_value_network_params.to_module(
+                self.value_network, preserve_module_state=False
+            ):
                 q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         value = q.amax(-1)
         following = (data["position"][:, :steps] + 1).clamp_max(value.shape[1] - 1)
@@ -206,8 +261,12 @@ class PQN(Learner):
     config: PQNConfig
     loss: PQNLoss
 
-    def __init__(self, network: TensorDictModuleBase, config: PQNConfig, training: Training) -> None:
-        loss = PQNLoss(network, time_limit=config.time_limit, bootstrap=config.bootstrap, functional=False)
+    def __init__(
+        self, network: TensorDictModuleBase, config: PQNConfig, training: Training
+    ) -> None:
+        loss = PQNLoss(
+            network, time_limit=config.time_limit, bootstrap=config.bootstrap, functional=False
+        )
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
 

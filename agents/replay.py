@@ -1,9 +1,10 @@
-"""A replay of sequences: whole windows, each written to one file and never changed, so that a checkpoint only names
-them.
+"""A replay of sequences: whole windows, each written to one file and never changed, so that a
+checkpoint only names them.
 
-Every window of the collector becomes one memory-mapped file; what is used stays in memory as long as the machine has
-room. The oldest leaves when the capacity is reached, and its file when no kept checkpoint can need it any more.
-TorchRL's ``TensorDictReplayBuffer`` stores the same batches, but writes everything again for every checkpoint.
+Every window of the collector becomes one memory-mapped file; what is used stays in memory as long
+as the machine has room. The oldest leaves when the capacity is reached, and its file when no kept
+checkpoint can need it any more. TorchRL's ``TensorDictReplayBuffer`` stores the same batches, but
+writes everything again for every checkpoint.
 """
 
 import tempfile
@@ -18,7 +19,13 @@ from safetensors.torch import load_file, save
 from tensordict import TensorDict, TensorDictBase
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.runs.files import CheckpointError, checksum, is_our_name, is_ours, write_atomic
+from arcade_torch.agents.runs.files import (
+    CheckpointError,
+    checksum,
+    is_our_name,
+    is_ours,
+    write_atomic,
+)
 
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
 
@@ -41,7 +48,8 @@ class SequenceReplay:
     """Draws sequences uniformly, in the form in which they were added.
 
     Args:
-        capacity: most sequences to keep, at least 1 (else ValueError); old windows leave whole, the newest stays.
+        capacity: most sequences to keep, at least 1 (else ValueError); old windows leave whole, the
+            newest stays.
         folder: where windows are written, made when first needed; None for a temporary folder.
     """
 
@@ -70,10 +78,14 @@ class SequenceReplay:
             CheckpointError: the frames at hand, of a run that goes on, have another size.
         """
         flat = batch.flatten_keys("/")
-        tensors = {key: value.detach().to("cpu", copy=True).contiguous() for key, value in flat.items()}
+        tensors = {
+            key: value.detach().to("cpu", copy=True).contiguous() for key, value in flat.items()
+        }
         size = tensors["pixels"].shape[2:]
         if self._segments and (held := self._segments[-1].data["pixels"].shape[2:]) != size:
-            raise CheckpointError(f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}")
+            raise CheckpointError(
+                f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}"
+            )
         file = self._folder / f"window-{self._added:09d}.safetensors"
         write_atomic(file, save(tensors))
         self._open(file)
@@ -89,7 +101,9 @@ class SequenceReplay:
             raise CheckpointError(f"{file} holds other frames than the windows before it")
         self._segments.append(_Segment(file, TensorDict(tensors, [len(tensors["pixels"])]), digest))
 
-    def sample(self, count: int, generator: torch.Generator, device: torch.device | str = "cpu") -> TensorDict:
+    def sample(
+        self, count: int, generator: torch.Generator, device: torch.device | str = "cpu"
+    ) -> TensorDict:
         """Draw sequences uniformly, each at most once.
 
         Args:
@@ -127,16 +141,27 @@ class SequenceReplay:
         """Go back to a saved moment; a ``CheckpointError`` if a file is missing or damaged."""
         if not isinstance(state, Mapping) or not isinstance(state.get("files"), Mapping):
             raise CheckpointError("the checkpoint does not name the windows of a replay")
-        require(type(state["added"]) is int and 0 <= state["added"] < 10**12, "added", state["added"], "a count")
+        require(
+            type(state["added"]) is int and 0 <= state["added"] < 10**12,
+            "added",
+            state["added"],
+            "a count",
+        )
         self._added = state["added"]
         self._segments.clear()
         for name, digest in state["files"].items():
             if not is_our_name(name, "window"):
-                raise CheckpointError(f"the checkpoint names {name!r}, which is no window of a replay")
+                raise CheckpointError(
+                    f"the checkpoint names {name!r}, which is no window of a replay"
+                )
             file = self._folder / name
             if not is_ours(file, "window"):
-                raise CheckpointError(f"{file} is missing: the replay of this checkpoint is not whole")
+                raise CheckpointError(
+                    f"{file} is missing: the replay of this checkpoint is not whole"
+                )
             if checksum(file) != digest:
-                raise CheckpointError(f"{file} is damaged: it does not have the checksum in the checkpoint")
+                raise CheckpointError(
+                    f"{file} is damaged: it does not have the checksum in the checkpoint"
+                )
             self._open(file, digest)
         self._lists = deque([set(state["files"])], maxlen=_OLD_LISTS)

@@ -1,4 +1,6 @@
-"""Returns and advantages over a window: functions of tensors, and the same as value estimators of TorchRL."""
+"""Returns and advantages over a window: functions of tensors, and the same as value estimators of
+TorchRL.
+"""
 
 from contextlib import nullcontext
 from typing import Any
@@ -24,40 +26,46 @@ def q_lambda_return(
 ) -> Tensor:
     r"""Backward Q(lambda) return over a window.
 
-    With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done = terminated | truncated``::
+    With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done =
+    terminated | truncated``::
 
-        G[t] = r[t] + gamma * m[t]                                          at a truncation and at the last step
-        G[t] = r[t]                                                         at a termination
-        G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
+        G[t] = r[t] + gamma * m[t]                                          at a truncation and at
+        the last step G[t] = r[t]                                                         at a
+        termination G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
 
-    Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by doubling, in
-    ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over time.
+    Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by
+    doubling, in ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over
+    time.
 
     Args:
         reward: float [B, T], reward received on leaving observation ``t``.
-        next_value: float [B, T], ``max_a Q`` of the true next observation: the final frame where an episode was cut.
-            Values at terminated steps are ignored, whatever they are.
+        next_value: float [B, T], ``max_a Q`` of the true next observation: the final frame where an
+            episode was cut. Values at terminated steps are ignored, whatever they are.
         terminated: bool [B, T], the task's own end; removes the bootstrap and cuts the recursion.
         truncated: bool [B, T], cut by a limit; keeps the bootstrap, cuts the recursion.
         gamma: discount per step, in [0, 1].
         lam: trace decay in [0, 1]; 0 gives the one-step target, 1 the Monte-Carlo return.
-        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a termination, as the published
-            implementation does.
+        time_limit: ``"bootstrap"`` or ``"terminal"``; the latter treats a truncation as a
+            termination, as the published implementation does.
 
     Returns:
         float [B, T], in the dtype of ``reward``.
 
     Raises:
-        ValueError: shapes differ or are not [B, T]; integer rewards; ``gamma``, ``lam`` or ``time_limit`` not as above.
+        ValueError: shapes differ or are not [B, T]; integer rewards; ``gamma``, ``lam`` or
+            ``time_limit`` not as above.
 
-    Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade (ICML 2026), PQN.
+    Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade
+        (ICML 2026), PQN.
 
     Example:
         >>> ones, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
         >>> q_lambda_return(ones, ones, no, no, gamma=0.5, lam=1.0)
         tensor([[1.8750, 1.7500, 1.5000]])
     """
-    value, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit)
+    value, trace = values_and_traces(
+        reward, next_value, terminated, truncated, gamma, lam, time_limit
+    )
     return solve_backward(reward + (gamma - trace) * value, trace)
 
 
@@ -73,8 +81,9 @@ def gae(
 ) -> Tensor:
     r"""Generalised advantage estimate over a window.
 
-    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``, in which the value
-    ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a termination::
+    With ``done = terminated | truncated`` and the error ``delta[t] = r[t] + gamma * v'[t] - v[t]``,
+    in which the value ``v'[t]`` of the observation that step ``t`` really led to counts as 0 at a
+    termination::
 
         A[t] = delta[t]                                at an end and at the last step
         A[t] = delta[t] + gamma * lam * A[t + 1]       elsewhere
@@ -88,7 +97,8 @@ def gae(
         terminated: bool [B, T]; this and what follows as in :func:`q_lambda_return`.
         truncated: bool [B, T].
         gamma: discount per step, in [0, 1].
-        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the value.
+        lam: trace decay in [0, 1]; 0 gives the one-step error, 1 the Monte-Carlo return minus the
+            value.
         time_limit: ``"bootstrap"`` or ``"terminal"``.
 
     Returns:
@@ -104,7 +114,9 @@ def gae(
         >>> gae(ones, ones, ones, no, no, gamma=0.5, lam=1.0)
         tensor([[0.8750, 0.7500, 0.5000]])
     """
-    after, trace = values_and_traces(reward, next_value, terminated, truncated, gamma, lam, time_limit, value)
+    after, trace = values_and_traces(
+        reward, next_value, terminated, truncated, gamma, lam, time_limit, value
+    )
     return solve_backward(reward + gamma * after - value, trace)
 
 
@@ -118,12 +130,16 @@ def values_and_traces(
     time_limit: TimeLimit,
     *others: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """What a step may count on, both [B, T]: the next value, 0 behind a termination; gamma times lambda, 0 at every end
-    and at the last step. Arguments that do not fit are refused, ``others`` for their shape alone.
+    """What a step may count on, both [B, T]: the next value, 0 behind a termination; gamma times
+    lambda, 0 at every end and at the last step. Arguments that do not fit are refused, ``others``
+    for their shape alone.
     """
     shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
     if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
-        raise ValueError(f"rewards, values, terminated, truncated must be of one shape [B, T], T >= 1; got {shapes}")
+        raise ValueError(
+            "rewards, values, terminated, truncated must be of one shape [B, T], T >= 1; got "
+            f"{shapes}"
+        )
     if not reward.is_floating_point():  # traces were 0
         raise ValueError(f"the dtype of rewards must be a floating one; got {reward.dtype}")
     if not (0.0 <= gamma <= 1.0 and 0.0 <= lam <= 1.0):
@@ -138,7 +154,8 @@ def values_and_traces(
 
 def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
     """Solve ``G[t] = base[t] + trace[t] * G[t + 1]`` with ``G[T] = 0`` by doubling."""
-    steps, reach = base.shape[1], 1
+    steps = base.shape[1]
+    reach = 1
     while reach < steps:
         head = torch.addcmul(base[:, :-reach], trace[:, : steps - reach], base[:, reach:])
         base = torch.cat((head, base[:, -reach:]), dim=1)
@@ -149,18 +166,23 @@ def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
 
 
 class QLambdaEstimator(TDLambdaEstimator):
-    """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its shapes are static.
+    """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its
+    shapes are static.
 
-    TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which waits for the device.
+    TorchRL's vectorised TD(lambda) gives the same numbers but splits a batch at its ends, which
+    waits for the device.
 
     Args:
         gamma: discount per step, in [0, 1].
         lmbda: trace decay, in [0, 1].
-        value_network: see ``TDLambdaEstimator``; not needed where ``next_value`` is given, as our losses do.
+        value_network: see ``TDLambdaEstimator``; not needed where ``next_value`` is given, as our
+            losses do.
         **kwargs: see ``TDLambdaEstimator``.
     """
 
-    def __init__(self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any
+    ) -> None:
         super().__init__(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
         self._floats = float(gamma), float(lmbda)
 
@@ -172,29 +194,36 @@ class QLambdaEstimator(TDLambdaEstimator):
         time_dim: int | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """Lambda-returns, float [B, T, 1], of a batch with ``("next", "reward" | "done" | "terminated")`` [B, T, 1].
+        """Lambda-returns, float [B, T, 1], of a batch with ``("next", "reward" | "done" |
+        "terminated")`` [B, T, 1].
 
-        The values of the true next observations are ``next_value`` [B, T, 1], or what the value network makes of the
-        batch, with ``target_params`` and ``kwargs``. Time is the second dimension, whatever ``time_dim``.
+        The values of the true next observations are ``next_value`` [B, T, 1], or what the value
+        network makes of the batch, with ``target_params`` and ``kwargs``. Time is the second
+        dimension, whatever ``time_dim``.
         """
         keys = self.tensor_keys
         if next_value is None:
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
         names = (keys.reward, keys.done, keys.terminated)
         reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
-        return q_lambda_return(reward, next_value.squeeze(-1), terminated, done, *self._floats).unsqueeze(-1)
+        return q_lambda_return(
+            reward, next_value.squeeze(-1), terminated, done, *self._floats
+        ).unsqueeze(-1)
 
 
 class SequenceGAE(nn.Module):
-    """Advantages by one pass of the critic over each sequence, final observations read where they belong.
+    """Advantages by one pass of the critic over each sequence, final observations read where they
+    belong.
 
-    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value`` [..., L, 1].
+    A value estimator for :class:`PPOLoss`: writes ``advantage``, ``value_target``, ``state_value``
+    [..., L, 1].
 
     Args:
         critic: any TensorDict module that writes ``state_value`` [*, 1].
         gamma: discount per step, in [0, 1].
         lmbda: lambda of the estimate, in [0, 1].
-        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame; ``"terminal"``: it terminates.
+        time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame;
+            ``"terminal"``: it terminates.
         chunks: parts that the rows are read in, which bounds memory.
     """
 
@@ -210,30 +239,50 @@ class SequenceGAE(nn.Module):
         self.__dict__["critic"] = critic  # its parameters belong to the loss
         self.inputs = NetworkInputs(critic)
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
-        self.gamma, self.lmbda, self.chunks = gamma, lmbda, chunks
-        self.names: dict[str, Any] = {key: key for key in ("reward", "terminated", "advantage", "value_target")}
+        self.gamma = gamma
+        self.lmbda = lmbda
+        self.chunks = chunks
+        self.names: dict[str, Any] = {
+            key: key for key in ("reward", "terminated", "advantage", "value_target")
+        }
         self.names["value"] = "state_value"
 
     def set_keys(self, **names: Any) -> None:
-        """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``; the rest is unused."""
+        """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``;
+        the rest is unused.
+        """
         self.names |= {name: key for name, key in names.items() if name in self.names}
 
     @torch.no_grad()
-    def forward(self, batch: TensorDictBase, params: Any = None, target_params: Any = None) -> TensorDictBase:
+    def forward(
+        self, batch: TensorDictBase, params: Any = None, target_params: Any = None
+    ) -> TensorDictBase:
         """Estimate advantages; gives the same object, with the three entries.
 
         Args:
-            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [..., L] with next observations.
+            batch: sequences [N] of ``ArcadeCollector.collect()``, or a stock batch [..., L] with
+                next observations.
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
         names = {name: self.names[name] for name in ("reward", "terminated")}
         data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
-        with nullcontext() if params is None else params.to_module(self.critic, preserve_module_state=False):
-            values = [unroll(self.critic, self.inputs, rows, self.names["value"]) for rows in data.chunk(self.chunks)]
-        value, position = torch.cat(values).squeeze(-1), data["position"]
-        here, following = value.gather(1, position), value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
-        advantage = gae(data["reward"], here, following, data["terminated"], data["cut"], self.gamma, self.lmbda)
+        with (
+            nullcontext()
+            if params is None
+            else params.to_module(self.critic, preserve_module_state=False)
+        ):
+            values = [
+                unroll(self.critic, self.inputs, rows, self.names["value"])
+                for rows in data.chunk(self.chunks)
+            ]
+        value = torch.cat(values).squeeze(-1)
+        position = data["position"]
+        here = value.gather(1, position)
+        following = value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
+        advantage = gae(
+            data["reward"], here, following, data["terminated"], data["cut"], self.gamma, self.lmbda
+        )
         entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
         shape = batch.shape if is_stock(batch) else advantage.shape
         for key, entry in entries.items():

@@ -1,4 +1,6 @@
-"""Training: collect, update, then log, evaluate, save; the same for every algorithm and memory, and for none."""
+"""Training: collect, update, then log, evaluate, save; the same for every algorithm and memory, and
+for none.
+"""
 
 import dataclasses
 import errno
@@ -27,7 +29,12 @@ from arcade_torch.agents.metrics import EpisodeStats, paper_score
 from arcade_torch.agents.policy import Agent, build_network, compile_network, make_policy
 from arcade_torch.agents.ppo import PPO
 from arcade_torch.agents.pqn import PQN
-from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, load_latest, save_checkpoint
+from arcade_torch.agents.runs.checkpoint import (
+    Checkpoint,
+    list_checkpoints,
+    load_latest,
+    save_checkpoint,
+)
 from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
@@ -50,36 +57,49 @@ class TrainResult:
     frames: int  # of training
     seconds: float  # spent collecting and learning
     evaluation: EvalResult | None = None  # greedy, at the end; None if interrupted
-    train_max_ewm: float | None = None  # the paper's score of the training curve; None where an env ended no episode
+    # the paper's score of the training curve; None where an env ended no episode
+    train_max_ewm: float | None = None
 
 
 class Trainer:
     """One run in memory: environments, policy, learner, and what makes it resumable.
 
-    Random actions are drawn from torch's global generator, as TorchRL's modules do: seed it, or use :func:`train`.
+    Random actions are drawn from torch's global generator, as TorchRL's modules do: seed it, or use
+    :func:`train`.
 
     Args:
         config: of the run.
         replay_folder: where a replay writes, made when first needed; None for a temporary folder.
 
     Raises:
-        ValueError: the device is not there; the game, the memory model, the network or one of their options is unknown.
+        ValueError: the device is not there; the game, the memory model, the network or one of their
+            options is unknown.
     """
 
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
-        self.config, numbers = config, config.learner
+        self.config = config
+        numbers = config.learner
         device, _ = pick_devices(config.device)  # refused here if it is not there
         self.network = build_network(config)  # learns
-        self.acting = build_network(config) if numbers.average_share else self.network  # is saved, too
+        # is saved, too
+        self.acting = build_network(config) if numbers.average_share else self.network
         for network in {self.network, self.acting} if config.compile else ():
             compile_network(network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
-        self.random = torch.cuda.default_generators[device.index] if device.type == "cuda" else torch.default_generator
-        training = Training(self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs)
+        self.random = (
+            torch.cuda.default_generators[device.index]
+            if device.type == "cuda"
+            else torch.default_generator
+        )
+        training = Training(
+            self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs
+        )
         self.learner = LEARNERS[config.algorithm](self.network, numbers, training)
         self.policy = make_policy(self.acting).to(device)
-        self.explorers = [module for module in self.policy.modules() if isinstance(module, EGreedyModule)]
+        self.explorers = [
+            module for module in self.policy.modules() if isinstance(module, EGreedyModule)
+        ]
         self.env = make_env(config, numbers.num_envs, config.seed)
         self.return_range = self.env.game.return_range
         if numbers.average_share:
@@ -97,7 +117,9 @@ class Trainer:
             store_states=False,
         )
         self.stats = EpisodeStats(np.full(numbers.num_envs, np.nan))
-        self.frames, self.updates, self.seconds = 0, 0, 0.0
+        self.frames = 0
+        self.updates = 0
+        self.seconds = 0.0
 
     @property
     def done(self) -> bool:
@@ -105,9 +127,12 @@ class Trainer:
         return self.updates >= self.config.num_updates
 
     def warm_up(self) -> None:
-        """Random play before training: fills the overlap and calibrates the input scaling; not counted as frames."""
+        """Random play before training: fills the overlap and calibrates the input scaling; not
+        counted as frames.
+        """
         numbers = self.config.learner
-        steps = max(0, numbers.warmup_steps - numbers.steps_before)  # the first window fills the overlap too
+        # the first window fills the overlap too
+        steps = max(0, numbers.warmup_steps - numbers.steps_before)
         windows = -(-steps // numbers.num_steps)
         stride = max(1, numbers.frames_per_update * windows // 3200)  # 3,200 frames are plenty
         seen = []
@@ -123,19 +148,24 @@ class Trainer:
         Raises:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
         """
-        began, numbers = time.perf_counter(), self.config.learner
+        began = time.perf_counter()
+        numbers = self.config.learner
         epsilon = epsilon_at(numbers, self.frames, self.total_frames)
         for explorer in self.explorers:
             explorer.eps.fill_(epsilon)
         batch = self.collector.collect()
         new = slice(numbers.steps_before, None)
-        last = self.stats.update(*(batch["next", key][:, new].squeeze(-1) for key in ("episode_reward", "done")))
+        last = self.stats.update(
+            *(batch["next", key][:, new].squeeze(-1) for key in ("episode_reward", "done"))
+        )
         try:
             if not bool(batch["next", "reward"].isfinite().all()):
                 raise NonFiniteError("a reward is not finite")
             metrics = self.learner.update(batch, self.frames)
         except NonFiniteError as error:
-            raise NonFiniteError(f"update {self.updates + 1} (after {self.frames} frames): {error}") from error
+            raise NonFiniteError(
+                f"update {self.updates + 1} (after {self.frames} frames): {error}"
+            ) from error
         self.frames += numbers.frames_per_update
         self.updates += 1
         if self.acting is not self.network:
@@ -175,7 +205,9 @@ class Trainer:
         }
 
     def load(self, checkpoint: Checkpoint) -> None:
-        """Go back to where a checkpoint was made; a ``CheckpointError`` if its state is not one of this trainer."""
+        """Go back to where a checkpoint was made; a ``CheckpointError`` if its state is not one of
+        this trainer.
+        """
         state: Any = {} if checkpoint.trainer is None else checkpoint.trainer
         try:
             check_state(state, self._expected_state())
@@ -186,18 +218,34 @@ class Trainer:
             self.shuffle.set_state(state["shuffle"])
             self.collector.load_state_dict(state["collector"], strict=False)
             self.stats.load_state_dict(state["stats"])
-            self.frames, self.updates, self.seconds = state["frames"], state["updates"], state["seconds"]
-            require(self.frames == checkpoint.frames, "frames", self.frames, f"{checkpoint.frames}, as in its name")
+            self.frames = state["frames"]
+            self.updates = state["updates"]
+            self.seconds = state["seconds"]
+            require(
+                self.frames == checkpoint.frames,
+                "frames",
+                self.frames,
+                f"{checkpoint.frames}, as in its name",
+            )
             made = self.updates * self.config.learner.frames_per_update
-            require(self.frames == made, "updates", self.updates, f"as many as make {self.frames} frames")
+            require(
+                self.frames == made,
+                "updates",
+                self.updates,
+                f"as many as make {self.frames} frames",
+            )
         except CheckpointError:
             raise
         except Exception as error:  # whatever a damaged state leads to, it is not to be used
             reason = " ".join(f"{type(error).__name__}: {error}".split())[:300]
-            raise CheckpointError(f"the state in {checkpoint.path} does not fit this run: {reason}") from error
+            raise CheckpointError(
+                f"the state in {checkpoint.path} does not fit this run: {reason}"
+            ) from error
 
     def _expected_state(self) -> dict[str, Any]:
-        """What a saved state of this trainer looks like; the replay, which looks at its files itself, is left out."""
+        """What a saved state of this trainer looks like; the replay, which looks at its files
+        itself, is left out.
+        """
         collector = self.collector.state_dict()
         collector.pop("policy_state_dict", None)
         learner = Learner.state_dict(self.learner)
@@ -227,27 +275,31 @@ def train(
 ) -> TrainResult:
     """Train an agent in a run folder.
 
-    SIGINT, SIGTERM and SIGHUP (a dropped connection) end the run at the next update with a checkpoint and status
-    ``"interrupted"``; a second SIGINT ends it at once. A killed run goes on from its last checkpoint, to the bit on
-    one machine. Torch's global generator is seeded for the run and put back afterwards.
+    SIGINT, SIGTERM and SIGHUP (a dropped connection) end the run at the next update with a
+    checkpoint and status ``"interrupted"``; a second SIGINT ends it at once. A killed run goes on
+    from its last checkpoint, to the bit on one machine. Torch's global generator is seeded for the
+    run and put back afterwards.
 
     Args:
         config: what to train.
         run_dir: folder of the run; must be empty or absent unless ``resume``.
-        resume: go on with the run in the folder (from the start if it has no checkpoint yet); a finished run returns
-            its result at once, an absent one is started.
-        progress: called after every update with the row of ``metrics.csv``, ``total_frames``, and ``eval_return``, the
-            mean of the last greedy evaluation (None before the first).
-        on_evaluation: called with the agent after every greedy evaluation; it may play, and must change nothing.
+        resume: go on with the run in the folder (from the start if it has no checkpoint yet); a
+            finished run returns its result at once, an absent one is started.
+        progress: called after every update with the row of ``metrics.csv``, ``total_frames``, and
+            ``eval_return``, the mean of the last greedy evaluation (None before the first).
+        on_evaluation: called with the agent after every greedy evaluation; it may play, and must
+            change nothing.
 
     Returns:
         How it ended.
 
     Raises:
-        RunFolderError: the folder is taken, holds another run, or cannot be written: nothing was changed. Or it was
-            removed, or its disk is full, during the training: the last checkpoint is whole.
+        RunFolderError: the folder is taken, holds another run, or cannot be written: nothing was
+            changed. Or it was removed, or its disk is full, during the training: the last
+            checkpoint is whole.
         CheckpointError: ``resume`` found only damaged checkpoints.
-        NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last checkpoint is good.
+        NonFiniteError: a quantity became NaN or infinite; names update and quantity. The last
+            checkpoint is good.
         LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
         ValueError: the game, the memory model, the network or the device does not exist.
     """
@@ -257,7 +309,11 @@ def train(
     check_logger(config.logger)
     if (result := folder.finished()) is not None:
         return result_from(folder.path, result)
-    with own_settings(config), closing(Trainer(config, folder.replay)) as trainer, folder.claim(config):
+    with (
+        own_settings(config),
+        closing(Trainer(config, folder.replay)) as trainer,
+        folder.claim(config),
+    ):
         if (result := folder.finished()) is not None:  # by another process, a moment ago
             return result_from(folder.path, result)
         return _Run(config, folder, trainer, progress, on_evaluation).go()
@@ -265,7 +321,9 @@ def train(
 
 @dataclass
 class _Run:
-    """The loop of one run, and what it writes into its folder; the first five as in :func:`train`."""
+    """The loop of one run, and what it writes into its folder; the first five as in
+    :func:`train`.
+    """
 
     config: TrainConfig
     folder: RunFolder
@@ -277,15 +335,24 @@ class _Run:
     saved_at: int = -1
 
     def go(self) -> TrainResult:
-        """Run from the newest whole checkpoint, or the beginning, to the end, or to the first signal."""
+        """Run from the newest whole checkpoint, or the beginning, to the end, or to the first
+        signal.
+        """
         if list_checkpoints(self.folder.checkpoints):
-            self.saved_at = load_latest(self.folder.checkpoints, self.config, use=self.trainer.load).frames
+            self.saved_at = load_latest(
+                self.folder.checkpoints, self.config, use=self.trainer.load
+            ).frames
         else:
             self.trainer.warm_up()
-        path, frames = self.folder.path, self.trainer.frames
+        path = self.folder.path
+        frames = self.trainer.frames
         with (
-            closing(CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)) as self.metrics,
-            closing(CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames - self.trainer.done)) as self.evals,
+            closing(
+                CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)
+            ) as self.metrics,
+            closing(
+                CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames - self.trainer.done)
+            ) as self.evals,
             closing(RunLogger(self.config, path, frames)) as self.logger,
         ):
             try:
@@ -294,7 +361,11 @@ class _Run:
             except NonFiniteError as error:
                 self._report("failed", error=str(error))
                 newest = list_checkpoints(self.folder.checkpoints)[:1]
-                left = f"the last good checkpoint is {newest[0]}" if newest else "there was no checkpoint yet"
+                left = (
+                    f"the last good checkpoint is {newest[0]}"
+                    if newest
+                    else "there was no checkpoint yet"
+                )
                 raise NonFiniteError(f"{error}; {left}") from error
             except OSError as error:  # a full disk, for one
                 with suppress(OSError):
@@ -313,10 +384,14 @@ class _Run:
         safe = f"{newest[0].name} is whole" if newest else "there is no checkpoint yet"
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         cure = "make room" if full else "put that right"
-        return f"could not write {where}: {error.strerror or error}; {safe}: {cure}, then go on with --resume"
+        return (
+            f"could not write {where}: {error.strerror or error}; {safe}: {cure}, then go on with "
+            "--resume"
+        )
 
     def _loop(self) -> TrainResult:
-        trainer, config = self.trainer, self.config
+        trainer = self.trainer
+        config = self.config
         with stop_signals() as stopped:
             while not trainer.done and not stopped():
                 row = trainer.update()
@@ -328,7 +403,9 @@ class _Run:
                     self._save()
                 self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
                 if self.progress is not None:
-                    self.progress(row | {"total_frames": trainer.total_frames, "eval_return": self.last_eval})
+                    self.progress(
+                        row | {"total_frames": trainer.total_frames, "eval_return": self.last_eval}
+                    )
         self._save()
         if trainer.done:
             return self._finish()
@@ -345,7 +422,12 @@ class _Run:
             self.eval_env = make_eval_env(self.config, self.config.eval_episodes)
         agent = Agent(self.config, self.trainer.acting, self.trainer.frames)
         result = evaluate(agent, env=self.eval_env)
-        row = {"frames": agent.frames, "mean": result.mean, "std": result.std, "n": len(result.returns)}
+        row = {
+            "frames": agent.frames,
+            "mean": result.mean,
+            "std": result.std,
+            "n": len(result.returns),
+        }
         self.evals.append(row)
         self.logger.log("eval", row)
         self.last_eval = result.mean
@@ -359,13 +441,19 @@ class _Run:
         self.folder.check_there()
         if self.saved_at != trainer.frames:
             weights = trainer.acting.state_dict()
-            save_checkpoint(self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict())
+            save_checkpoint(
+                self.folder.checkpoints, self.config, trainer.frames, weights, trainer.state_dict()
+            )
             self.saved_at = trainer.frames
 
     def _finish(self) -> TrainResult:
         began = time.perf_counter()
         result = self._evaluate()
-        rows = [row for row in read_csv(self.folder.path / "metrics.csv", strict=False) if row["train_return_last"]]
+        rows = [
+            row
+            for row in read_csv(self.folder.path / "metrics.csv", strict=False)
+            if row["train_return_last"]
+        ]
         points = [[float(row[name]) for row in rows] for name in ("frames", "train_return_last")]
         score = paper_score(points[0], points[1]) if rows else None
         final = {
@@ -390,8 +478,12 @@ class _Run:
 
 def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
     """How a finished run ended, from its ``eval.json``."""
-    evaluation = EvalResult(np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64))
-    return TrainResult(path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"])
+    evaluation = EvalResult(
+        np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64)
+    )
+    return TrainResult(
+        path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"]
+    )
 
 
 @contextmanager
@@ -411,7 +503,8 @@ def own_settings(config: TrainConfig) -> Iterator[None]:
 def stop_signals() -> Iterator[Callable[[], bool]]:
     """Turn SIGINT, SIGTERM and SIGHUP into a request to stop.
 
-    A signal that is ignored (SIGHUP under ``nohup``) stays so, and outside the main thread all stay as they are.
+    A signal that is ignored (SIGHUP under ``nohup``) stays so, and outside the main thread all stay
+    as they are.
     """
     asked = threading.Event()
 

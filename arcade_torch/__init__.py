@@ -1,6 +1,8 @@
-"""POPGym Arcade for PyTorch: ten pixel games as MDP/POMDP twins, stepped in JAX, seen by TorchRL without a copy.
+"""POPGym Arcade for PyTorch: ten pixel games as MDP/POMDP twins, stepped in JAX, seen by TorchRL
+without a copy.
 
-Public names are resolved on first use: importing the package costs little, ``arcade_torch.envs_jax`` loads no torch.
+Public names are resolved on first use: importing the package costs little,
+``arcade_torch.envs_jax`` loads no torch.
 """
 
 from importlib import import_module
@@ -9,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from arcade_torch import program
 
-if program.is_command_line():  # before the imports that take long: a signal during them is answered in one line
+# before the imports that take long: a signal during them is answered in one line
+if program.is_command_line():
     program.begin()
 
 import arcade_torch.process
@@ -40,7 +43,10 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
-            raise AttributeError(f"module 'arcade_torch' has no attribute {name!r}; public names: {', '.join(__all__)}")
+            raise AttributeError(
+                f"module 'arcade_torch' has no attribute {name!r}; public names: "
+                f"{', '.join(__all__)}"
+            )
         return globals().setdefault(name, getattr(import_module(_PUBLIC[name]), name))
 
 

@@ -23,38 +23,44 @@ from arcade_torch.validation import check_flags, whole
 class ArcadeCollector(BaseCollector):
     """Collects windows of T steps from N envs.
 
-    Two products. ``collect()`` gives **sequences**: TensorDict [N] of entries [N, L, ...] with L = overlap + T, and the
-    recurrent state before index 0 (``initial_state``). **Iteration** gives the T new steps in the layout of TorchRL's
-    collectors, TensorDict [N, T], so that TorchRL's losses and trainers take it. Both are the data that ``env.rollout``
-    and TorchRL's ``Collector`` give, to the bit; only ``state`` (of an env with ``state_in_td=True``) is left out.
+    Two products. ``collect()`` gives **sequences**: TensorDict [N] of entries [N, L, ...] with L =
+    overlap + T, and the recurrent state before index 0 (``initial_state``). **Iteration** gives the
+    T new steps in the layout of TorchRL's collectors, TensorDict [N, T], so that TorchRL's losses
+    and trainers take it. Both are the data that ``env.rollout`` and TorchRL's ``Collector`` give,
+    to the bit; only ``state`` (of an env with ``state_in_td=True``) is left out.
 
-    The first window acts ``overlap`` more steps, to fill the overlap; they are not counted as frames. The same happens
-    after somebody else stepped, reset or loaded the env: no window holds steps from both sides of such a change, and
-    the policy's state begins anew there, as do the episodes that had ended.
+    The first window acts ``overlap`` more steps, to fill the overlap; they are not counted as
+    frames. The same happens after somebody else stepped, reset or loaded the env: no window holds
+    steps from both sides of such a change, and the policy's state begins anew there, as do the
+    episodes that had ended.
 
     Args:
         env: The env, not wrapped (TorchRL's ``Collector`` is for transformed envs).
-        policy: A TensorDict module or a callable that reads root keys and writes ``action``; None for random actions.
-            Its recurrent state (primers of ``make_tensordict_primer``) is carried from ``("next", key)`` to ``key``. A
-            module that reads ``is_init`` begins anew by itself; for others the primers' values are put back.
+        policy: A TensorDict module or a callable that reads root keys and writes ``action``; None
+            for random actions. Its recurrent state (primers of ``make_tensordict_primer``) is
+            carried from ``("next", key)`` to ``key``. A module that reads ``is_init`` begins anew
+            by itself; for others the primers' values are put back.
         frames_per_batch: N * T.
-        total_frames: Iteration ends after so many frames; -1 for never. ``collect`` does not look at it.
-        overlap: Steps of the previous window that stand in front of ``collect``'s sequences. Their ``initial_state`` is
-            the one that was theirs when they were acted.
-        compress: uint8 [N, S, S, 3] -> uint8 [N, ...], what is stored of a frame. The policy sees the compressed frame
-            too, so that acting and learning see the same.
-        final_frames: Which final frames are drawn: ``"all"``, and batches hold dense ``("next", "pixels")``; those of
-            steps that were ``"truncated"`` and not terminated (a bootstrap needs no others), as ``final_pixels`` of
-            sequences; or ``"none"``. Iterated batches hold next frames with ``"all"`` alone.
+        total_frames: Iteration ends after so many frames; -1 for never. ``collect`` does not look
+            at it.
+        overlap: Steps of the previous window that stand in front of ``collect``'s sequences. Their
+            ``initial_state`` is the one that was theirs when they were acted.
+        compress: uint8 [N, S, S, 3] -> uint8 [N, ...], what is stored of a frame. The policy sees
+            the compressed frame too, so that acting and learning see the same.
+        final_frames: Which final frames are drawn: ``"all"``, and batches hold dense ``("next",
+            "pixels")``; those of steps that were ``"truncated"`` and not terminated (a bootstrap
+            needs no others), as ``final_pixels`` of sequences; or ``"none"``. Iterated batches hold
+            next frames with ``"all"`` alone.
         init_random_frames: Act at random for so many frames; the policy still runs, for its state.
         seed: Seed of env and random actions; None leaves the env as it is.
-        return_same_td: Whether all batches share one storage, so that a batch is overwritten by the next one: half the
-            memory, for loops that are done with a batch before the next one is collected.
+        return_same_td: Whether all batches share one storage, so that a batch is overwritten by the
+            next one: half the memory, for loops that are done with a batch before the next one is
+            collected.
         compact_obs: Leave ``("next", "pixels")`` out of iterated batches.
-        store: Keys to store beside the standard ones (a prefix stands for all below it); None for everything that the
-            policy writes.
-        store_states: Whether batches hold a policy's recurrent state at every step, as TorchRL's losses expect. Turn it
-            off for large states.
+        store: Keys to store beside the standard ones (a prefix stands for all below it); None for
+            everything that the policy writes.
+        store_states: Whether batches hold a policy's recurrent state at every step, as TorchRL's
+            losses expect. Turn it off for large states.
         exploration_type: As in TorchRL's collectors.
         post_collect_hook: Called with every iterated batch.
 
@@ -64,7 +70,8 @@ class ArcadeCollector(BaseCollector):
 
     Example:
         >>> from arcade_torch import make
-        >>> collector = ArcadeCollector(make("CartPoleEasy", num_envs=2), None, frames_per_batch=8, total_frames=16)
+        >>> env = make("CartPoleEasy", num_envs=2)
+        >>> collector = ArcadeCollector(env, None, frames_per_batch=8, total_frames=16)
         >>> [tuple(batch.shape) for batch in collector]
         [(2, 4), (2, 4)]
     """
@@ -93,20 +100,26 @@ class ArcadeCollector(BaseCollector):
         total_frames = whole("total_frames", total_frames)
         overlap = whole("overlap", overlap)
         seed = None if seed is None else whole("seed", seed)
-        check_flags("return_same_td compact_obs store_states", (return_same_td, compact_obs, store_states))
+        check_flags(
+            "return_same_td compact_obs store_states", (return_same_td, compact_obs, store_states)
+        )
         _check_arguments(env, policy, frames_per_batch, overlap, final_frames)
         self.env: ArcadeEnv = env
         self.policy = policy
         self.requested_frames_per_batch = self.frames_per_batch = frames_per_batch
         self.total_frames = float("inf") if total_frames < 0 else total_frames
         self.init_random_frames = init_random_frames
-        self.return_same_td, self.compact_obs = return_same_td, compact_obs
+        self.return_same_td = return_same_td
+        self.compact_obs = compact_obs
         self.exploration_type = exploration_type
         self.closed = False
         self._weight_updater = None
         self._weight_sync_schemes: dict[str, Any] | None = None
-        self._num_envs, self._steps, self._overlap = env.num_envs, frames_per_batch // env.num_envs, overlap
-        self._compress, self._final_frames = compress, final_frames
+        self._num_envs = env.num_envs
+        self._steps = frames_per_batch // env.num_envs
+        self._overlap = overlap
+        self._compress = compress
+        self._final_frames = final_frames
         self._draws_in_place = compress is None and env.draws_safely()
         self._generator = torch.Generator(env.device)
         self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")))
@@ -127,14 +140,17 @@ class ArcadeCollector(BaseCollector):
         self._seen = (-1, -1)  # the env's generation that the observation is of
         self._acted = 0  # steps since the first reset
         self._state = TensorDict({}, batch_size=[self._num_envs])
-        self._window_starts: deque[TensorDict] = deque()  # recurrent states before the coming windows
+        # recurrent states before the coming windows
+        self._window_starts: deque[TensorDict] = deque()
         self._begin_trajectories()
 
     def _begin_trajectories(self) -> None:
         """Give the episodes of all envs new numbers."""
         first = self._next_traj_id
         self._next_traj_id = first + self._num_envs
-        self._traj_ids = torch.arange(first, self._next_traj_id, dtype=torch.int64, device=self.env.device)
+        self._traj_ids = torch.arange(
+            first, self._next_traj_id, dtype=torch.int64, device=self.env.device
+        )
         self._numbered = self._iter  # the last window whose episodes were numbered
 
     @property
@@ -149,32 +165,40 @@ class ArcadeCollector(BaseCollector):
             random: Act uniformly at random; the policy still runs, for its state.
 
         Returns:
-            TensorDict [N]: ``pixels`` uint8 [N, L, ...], ``action`` and ``last_action`` int64 [N, L], ``is_init`` bool,
-            ``step_count`` int64, ``episode_reward`` float32 [N, L, 1], what the policy wrote [N, L, ...],
-            ``("next", ...)`` with reward, done, terminated, truncated, step_count and episode_reward [N, L, 1], and
-            ``initial_state`` TensorDict [N], the policy's recurrent state before step 0 under the policy's own keys.
+            TensorDict [N]: ``pixels`` uint8 [N, L, ...], ``action`` and ``last_action`` int64 [N,
+            L], ``is_init`` bool, ``step_count`` int64, ``episode_reward`` float32 [N, L, 1], what
+            the policy wrote [N, L, ...], ``("next", ...)`` with reward, done, terminated,
+            truncated, step_count and episode_reward [N, L, 1], and ``initial_state`` TensorDict
+            [N], the policy's recurrent state before step 0 under the policy's own keys.
 
-            The observations that follow a step: with ``final_frames="all"`` dense ``("next", "pixels")`` [N, L, ...].
-            Otherwise they are the ``pixels`` at the following index but for K places an env: ``final_pixels`` uint8
-            [N, K, ...], ``final_index`` int64 [N, K], the step in [0, L) after which each was seen, ascending where
-            ``final_mask`` bool [N, K] is true; unused places say L - 1 and hold any frame. The last place is that of
-            step L - 1, unused where that step terminated; the others are those of steps that were truncated and not
-            terminated, and L - 1 steps hold ``ceil((L - 1) / max_steps)`` of them at most. With ``"none"`` there is the
-            last place alone, unused where the last step ended its episode.
+            The observations that follow a step: with ``final_frames="all"`` dense ``("next",
+            "pixels")`` [N, L, ...]. Otherwise they are the ``pixels`` at the following index but
+            for K places an env: ``final_pixels`` uint8 [N, K, ...], ``final_index`` int64 [N, K],
+            the step in [0, L) after which each was seen, ascending where ``final_mask`` bool [N, K]
+            is true; unused places say L - 1 and hold any frame. The last place is that of step L -
+            1, unused where that step terminated; the others are those of steps that were truncated
+            and not terminated, and L - 1 steps hold ``ceil((L - 1) / max_steps)`` of them at most.
+            With ``"none"`` there is the last place alone, unused where the last step ended its
+            episode.
 
         Raises:
-            RuntimeError: The collector has been shut down, or a game truncated before its time limit.
+            RuntimeError: The collector has been shut down, or a game truncated before its time
+                limit.
         """
         buffer, initial_state = self._collect_window(random, dense=self._final_frames == "all")
         return buffer.sequences(initial_state)
 
     def iterator(self) -> Iterator[TensorDictBase]:
-        """Yield TensorDict [N, T] in TorchRL's layout until ``total_frames`` have been collected."""
+        """Yield TensorDict [N, T] in TorchRL's layout until ``total_frames`` have been
+        collected.
+        """
         while self._frames < self.total_frames:
             compact = self.compact_obs or self._final_frames != "all"
             buffer, _ = self._collect_window(random=False, dense=not compact)
             batch = buffer.transitions(compact)
-            batch["collector"] = TensorDict({"traj_ids": self._trajectories(buffer)}, batch_size=batch.batch_size)
+            batch["collector"] = TensorDict(
+                {"traj_ids": self._trajectories(buffer)}, batch_size=batch.batch_size
+            )
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             self._numbered = self._iter  # a window that a hook refused was not
@@ -183,21 +207,25 @@ class ArcadeCollector(BaseCollector):
 
     @torch.no_grad()
     def _collect_window(self, random: bool, dense: bool) -> tuple[RolloutBuffer, TensorDict]:
-        """Act the steps of one window; returns its storage, and the recurrent state before its first step."""
+        """Act the steps of one window; returns its storage, and the recurrent state before its
+        first step.
+        """
         if self.closed:
             raise RuntimeError("the collector has been shut down: make a new one")
         if self.pre_collect_hook is not None:
             self.pre_collect_hook()
         buffer, obs = self._look()
         first_window = self._acted == 0
-        # Taken away until the window is whole: whatever ends it early, the next one begins with new storage.
+        # Taken away until the window is whole: whatever ends it early, the next one begins with new
+        # storage.
         self._buffer = None
         self._obs = {}  # nothing holds the first frames
         self._seen = (-1, -1)
         first = buffer.begin(carry=not first_window, reuse=self.return_same_td, dense=dense)
         began_with = {key: value for key, value in obs.items() if key != "pixels"}
         random = random or self.policy is None or self._frames < self.init_random_frames
-        as_wanted = exploration_type() is self.exploration_type  # of the whole process: threads must not take turns
+        # of the whole process: threads must not take turns
+        as_wanted = exploration_type() is self.exploration_type
         with nullcontext() if as_wanted else set_exploration_type(self.exploration_type):
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
@@ -214,10 +242,13 @@ class ArcadeCollector(BaseCollector):
         return buffer, initial_state
 
     def _look(self) -> tuple[RolloutBuffer, dict[str, torch.Tensor]]:
-        """Have a current observation and a place to store it, whatever happened to the env since the last window."""
+        """Have a current observation and a place to store it, whatever happened to the env since
+        the last window.
+        """
         if self._obs is None:
             self._observe(self.env.reset())
-        elif self.env.generation[0] != self._seen[0]:  # somebody else moved the env: what was seen before leads nowhere
+        # somebody else moved the env: what was seen before leads nowhere
+        elif self.env.generation[0] != self._seen[0]:
             self._acted = 0
             self._begin_trajectories()
             self._observe(self.env.maybe_reset(self.env.observe()))
@@ -231,7 +262,9 @@ class ArcadeCollector(BaseCollector):
             sizes = self._num_envs, self._overlap, self._steps, self._obs["pixels"].shape[1:]
             shortest = min(game.max_steps for game in self.env.games)
             task = self.env.task if self.env.task_in_td else None
-            self._buffer = RolloutBuffer(*sizes, self.env.device, self._final_frames, shortest, task)
+            self._buffer = RolloutBuffer(
+                *sizes, self.env.device, self._final_frames, shortest, task
+            )
         return self._buffer, self._obs
 
     def _observe(self, root: TensorDictBase) -> None:
@@ -246,13 +279,18 @@ class ArcadeCollector(BaseCollector):
     def _advance(
         self, buffer: RolloutBuffer, obs: dict[str, torch.Tensor], step: int, random: bool
     ) -> dict[str, torch.Tensor]:
-        """Act, step and store; what is not drawn into the storage is copied while JAX computes the step."""
+        """Act, step and store; what is not drawn into the storage is copied while JAX computes the
+        step.
+        """
         if self._acted % self._steps == 0:
             self._window_starts.append(self._runner.begin_anew(self._state, obs["is_init"]).clone())
         action, extras, self._state = self._runner(obs, self._state)
         if random or action is None:
-            num_actions, device = self.env.game.num_actions, self.env.device
-            action = torch.randint(num_actions, (self._num_envs,), generator=self._generator, device=device)
+            num_actions = self.env.game.num_actions
+            device = self.env.device
+            action = torch.randint(
+                num_actions, (self._num_envs,), generator=self._generator, device=device
+            )
         store_action = functools.partial(buffer.write_action, step, obs["pixels"], action)
         into = buffer.place(step + 1) if self._draws_in_place else None
         raw = self.env.step_raw(action, while_computing=store_action, into=into)
@@ -270,7 +308,9 @@ class ArcadeCollector(BaseCollector):
         return following
 
     def _may_have_ended(self, numbers: torch.Tensor) -> bool:
-        """Whether a final observation may be wanted; a look is free on the CPU, where kept states scatter memory."""
+        """Whether a final observation may be wanted; a look is free on the CPU, where kept states
+        scatter memory.
+        """
         first = TERMINATED if self._final_frames == "all" else TRUNCATED
         return not is_host(numbers.device) or bool(numbers.numpy()[:, first:].any())
 
@@ -299,12 +339,16 @@ class ArcadeCollector(BaseCollector):
         self.reset()
         return following
 
-    def _maybe_fallback_update(self, policy_or_weights: Any = None, *, model_id: str | None = None) -> None:
+    def _maybe_fallback_update(
+        self, policy_or_weights: Any = None, *, model_id: str | None = None
+    ) -> None:
         """Weights are live, since the policy is shared; only other weights have to be copied."""
         if policy_or_weights is None or policy_or_weights is self.policy:
             return
         if not isinstance(self.policy, nn.Module):
-            raise TypeError(f"the policy is a {type(self.policy).__name__}, which has no weights to update")
+            raise TypeError(
+                f"the policy is a {type(self.policy).__name__}, which has no weights to update"
+            )
         weights = policy_or_weights
         if isinstance(weights, nn.Module):
             weights = TensorDict.from_module(weights)
@@ -313,13 +357,17 @@ class ArcadeCollector(BaseCollector):
         TensorDict.from_module(self.policy).data.update_(weights.data)
 
     def state_dict(self) -> OrderedDict[str, Any]:
-        """Everything that determines the coming batches: env, recurrent state, overlap, counters, policy weights.
+        """Everything that determines the coming batches: env, recurrent state, overlap, counters,
+        policy weights.
 
-        Only tensors, numbers, strings and containers, so that ``torch.load(weights_only=True)`` reads it. Random
-        numbers that a policy draws from torch's global generator are the caller's to save.
+        Only tensors, numbers, strings and containers, so that ``torch.load(weights_only=True)``
+        reads it. Random numbers that a policy draws from torch's global generator are the caller's
+        to save.
         """
         out: OrderedDict[str, Any] = OrderedDict(frames=self._frames, iter=self._iter)
-        out["acted"], out["moved"] = self._acted, self.env.generation[0] != self._seen[0]  # by others: see _look
+        # by others: see _look
+        out["acted"] = self._acted
+        out["moved"] = self.env.generation[0] != self._seen[0]
         out["sizes"] = [self._num_envs, self._steps, self._overlap]
         out["generator"] = self._generator.get_state()
         if isinstance(self.policy, nn.Module):
@@ -335,8 +383,11 @@ class ArcadeCollector(BaseCollector):
         out["overlap"] = self._buffer.overlap_state()
         return out
 
-    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True, **kwargs: Any) -> None:
-        """Go on where ``state_dict`` was taken: the next batch is the one that would have come then.
+    def load_state_dict(
+        self, state_dict: dict[str, Any], strict: bool = True, **kwargs: Any
+    ) -> None:
+        """Go on where ``state_dict`` was taken: the next batch is the one that would have come
+        then.
 
         Args:
             state_dict: What ``state_dict`` gave for a collector of the same sizes.
@@ -344,19 +395,25 @@ class ArcadeCollector(BaseCollector):
             **kwargs: Ignored.
 
         Raises:
-            ValueError: It is of another game, or of other sizes, or has an overlap with other ``final_frames``.
+            ValueError: It is of another game, or of other sizes, or has an overlap with other
+                ``final_frames``.
         """
-        saved, sizes = list(state_dict["sizes"]), [self._num_envs, self._steps, self._overlap]
+        saved = list(state_dict["sizes"])
+        sizes = [self._num_envs, self._steps, self._overlap]
         if saved != sizes:
-            raise ValueError(f"the saved collector has (envs, steps, overlap) {saved}, this one has {sizes}")
+            raise ValueError(
+                f"the saved collector has (envs, steps, overlap) {saved}, this one has {sizes}"
+            )
         self.env.set_extra_state(state_dict["env_state_dict"])
         if isinstance(self.policy, nn.Module) and (strict or "policy_state_dict" in state_dict):
             self.policy.load_state_dict(state_dict["policy_state_dict"], strict=strict)
         self._generator.set_state(state_dict["generator"].cpu())
         self.reset()
-        self._frames, self._iter = int(state_dict["frames"]), int(state_dict["iter"])
+        self._frames = int(state_dict["frames"])
+        self._iter = int(state_dict["iter"])
         given = self._gave_numbers and self._next_traj_id > int(state_dict.get("next_traj_id", 0))
-        if "traj_ids" in state_dict and not given:  # an older state: its numbers stand in batches that came after it
+        # an older state: its numbers stand in batches that came after it
+        if "traj_ids" in state_dict and not given:
             self._traj_ids = state_dict["traj_ids"].to(self.env.device)
             self._next_traj_id = int(state_dict["next_traj_id"])
         self._numbered = int(state_dict.get("numbered", self._iter))
@@ -367,23 +424,35 @@ class ArcadeCollector(BaseCollector):
         self._state = self._as_state(state_dict["recurrent_state"], initial)
         starts = [self._as_state(state, initial) for state in state_dict["window_starts"]]
         if self._acted and len(starts) != -(-self._overlap // self._steps):
-            raise ValueError(f"the saved collector has {len(starts)} states before its coming windows")
+            raise ValueError(
+                f"the saved collector has {len(starts)} states before its coming windows"
+            )
         self._window_starts.extend(starts)
-        self._obs, self._buffer = {}, None  # somebody may still hold batches of the old storage
-        if not state_dict.get("moved", self._acted == 0):  # where others had moved the env, _look begins anew
+        # somebody may still hold batches of the old storage
+        self._obs = {}
+        self._buffer = None
+        # where others had moved the env, _look begins anew
+        if not state_dict.get("moved", self._acted == 0):
             self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
 
     def _as_state(self, state: dict[str, Any], like: TensorDict) -> TensorDict:
         """A saved recurrent state; a ValueError if its entries are not those of the policy."""
         saved = TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
-        layouts = [{key: (value.dtype, value.shape) for key, value in td.items(True, True)} for td in (saved, like)]
+        layouts = [
+            {key: (value.dtype, value.shape) for key, value in td.items(True, True)}
+            for td in (saved, like)
+        ]
         if layouts[0] != layouts[1]:
             raise ValueError("the saved recurrent state is not one of this policy")
         return saved
 
-    def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
-        """Give the storage back. The arguments are ignored: no process has to end, the env has nothing to close."""
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        """Give the storage back. The arguments are ignored: no process has to end, the env has
+        nothing to close.
+        """
         self.closed = True
         self._buffer = self._obs = None
 
@@ -393,20 +462,34 @@ class ArcadeCollector(BaseCollector):
         return f"ArcadeCollector({self.env.game!r}, {sizes})"
 
 
-def _check_arguments(env: Any, policy: Any, frames_per_batch: int, overlap: int, final_frames: str) -> None:
+def _check_arguments(
+    env: Any, policy: Any, frames_per_batch: int, overlap: int, final_frames: str
+) -> None:
     """Refuse what cannot work, before anything is allocated."""
     if not isinstance(env, ArcadeEnv):
-        raise TypeError(f"env is a {type(env).__name__}, expected an ArcadeEnv; others go with torchrl's Collector")
+        raise TypeError(
+            f"env is a {type(env).__name__}, expected an ArcadeEnv; others go with torchrl's "
+            "Collector"
+        )
     if env.one_hot:
-        raise ValueError("ArcadeCollector stores actions as integers: make the env with categorical_actions=True")
+        raise ValueError(
+            "ArcadeCollector stores actions as integers: make the env with categorical_actions=True"
+        )
     if policy is not None and not callable(policy):
         raise TypeError(
-            f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or None for random actions"
+            f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or "
+            "None for random actions"
         )
     num_envs = env.num_envs
     if frames_per_batch < num_envs or frames_per_batch % num_envs:
-        raise ValueError(f"frames_per_batch is {frames_per_batch}, expected an int multiple of num_envs ({num_envs})")
+        raise ValueError(
+            f"frames_per_batch is {frames_per_batch}, expected an int multiple of num_envs "
+            f"({num_envs})"
+        )
     if overlap < 0:
         raise ValueError(f"overlap is {overlap}, expected an int of 0 or more")
     if final_frames not in get_args(FinalFrames):
-        raise ValueError(f"final_frames is {final_frames!r}, allowed: {', '.join(map(repr, get_args(FinalFrames)))}")
+        raise ValueError(
+            f"final_frames is {final_frames!r}, allowed: "
+            f"{', '.join(map(repr, get_args(FinalFrames)))}"
+        )

@@ -31,7 +31,9 @@ def forget(env: Any) -> None:
 
 
 def warn_of_twins(env: Any) -> None:
-    """Say once in a process that an env which begins plays what others play, in this process or in other workers."""
+    """Say once in a process that an env which begins plays what others play, in this process or in
+    other workers.
+    """
     global _warned
     noted = [envs for envs in _LIVE.values() if env in envs]
     if not noted or _warned:
@@ -45,7 +47,8 @@ def warn_of_twins(env: Any) -> None:
         return
     _warned = True
     says = (
-        f"this env has the default seed, 0, and plays the very same episodes as {others}: give each its own "
+        f"this env has the default seed, 0, and plays the very same episodes as {others}: give "
+        "each its own "
         "(arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them"
     )
     if in_worker:  # where TorchRL silences warnings

@@ -1,7 +1,8 @@
 """Tensors and arrays over the same memory: torch <-> JAX through DLPack, without a copy.
 
-What is shared is shared both ways: a write through torch shows in JAX, whose arrays are meant never to change. Tensors
-that come from JAX are therefore **read only by contract**; clone before writing in place.
+What is shared is shared both ways: a write through torch shows in JAX, whose arrays are meant never
+to change. Tensors that come from JAX are therefore **read only by contract**; clone before writing
+in place.
 """
 
 import functools
@@ -18,8 +19,9 @@ from torch.utils.dlpack import from_dlpack
 def share_gpu() -> bool:
     """Let JAX and torch live on one GPU: stop JAX from taking 75 % of its memory at the first use.
 
-    Sets ``XLA_PYTHON_CLIENT_PREALLOCATE=false`` unless the user has set it, and only where torch has CUDA. It takes
-    effect if it is called before JAX makes its first array; importing this module calls it.
+    Sets ``XLA_PYTHON_CLIENT_PREALLOCATE=false`` unless the user has set it, and only where torch
+    has CUDA. It takes effect if it is called before JAX makes its first array; importing this
+    module calls it.
 
     Returns:
         Whether this process is set up to share a GPU.
@@ -38,27 +40,32 @@ from arcade_torch.envs_jax.validation import format_value  # noqa: E402
 from arcade_torch.process import missing_platform  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
-_ALIGNMENT_BYTES = {"cpu": 64, "cuda": 16}  # below it JAX copies; on a GPU its programs refuse the argument
+# below it JAX copies; on a GPU its programs refuse the argument
+_ALIGNMENT_BYTES = {"cpu": 64, "cuda": 16}
 
 
-with warnings.catch_warnings():  # torch says once in a process that memory is read only, as that of JAX is
+# torch says once in a process that memory is read only, as that of JAX is
+with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     torch.from_numpy(np.frombuffer(bytes(1), np.uint8))
 
 
 def is_host(value: jax.Array | jax.Device | torch.device) -> bool:
-    """Whether something is on the CPU, where the host reads memory without waiting for a transfer."""
+    """Whether something is on the CPU, where the host reads memory without waiting for a
+    transfer.
+    """
     kind = value.type if isinstance(value, torch.device) else value.platform
     return (kind() if callable(kind) else kind) == "cpu"
 
 
 def to_torch(array: jax.Array | np.ndarray, device: torch.device | None = None) -> torch.Tensor:
-    """See a JAX array, or a numpy view of one, as a tensor. Waits until the array has been computed.
+    """See a JAX array, or a numpy view of one, as a tensor. Waits until the array has been
+    computed.
 
     Args:
         array: Any JAX array but typed random keys (export their ``jax.random.key_data``).
-        device: Where the tensor is wanted; default: where the array is. On another device than the array's, the data
-            is copied.
+        device: Where the tensor is wanted; default: where the array is. On another device than the
+            array's, the data is copied.
 
     Returns:
         The tensor, over the same memory when the device is the same. Read only by contract.
@@ -72,7 +79,8 @@ def to_torch(array: jax.Array | np.ndarray, device: torch.device | None = None) 
     if isinstance(array, np.ndarray) or is_host(array):
         tensor = torch.from_numpy(np.asarray(array))  # half the price of DLPack
     else:
-        tensor = from_dlpack(array)  # not the capsule form, which would not hand torch's stream to JAX
+        # not the capsule form, which would not hand torch's stream to JAX
+        tensor = from_dlpack(array)
     if device is None or tensor.device == device:
         return tensor
     if device.type == "cuda" and tensor.device.type == "cpu":
@@ -84,12 +92,12 @@ def to_torch(array: jax.Array | np.ndarray, device: torch.device | None = None) 
 def to_jax(tensor: torch.Tensor) -> jax.Array:
     """See a tensor as a JAX array, or say why that would need a copy.
 
-    JAX would copy silently in the refused cases; ask for the copy yourself instead (``.to(torch.int32)``,
-    ``.contiguous()``, ``.clone()``).
+    JAX would copy silently in the refused cases; ask for the copy yourself instead
+    (``.to(torch.int32)``, ``.contiguous()``, ``.clone()``).
 
     Args:
-        tensor: At most 32 bits an element, dense, detached, and aligned to 64 bytes on the CPU, to 16 on a GPU (fresh
-            tensors are).
+        tensor: At most 32 bits an element, dense, detached, and aligned to 64 bytes on the CPU, to
+            16 on a GPU (fresh tensors are).
 
     Returns:
         An array over the same memory. Do not write to the tensor as long as JAX may read it.
@@ -102,21 +110,26 @@ def to_jax(tensor: torch.Tensor) -> jax.Array:
         >>> to_jax(torch.zeros(2, dtype=torch.int64))
         Traceback (most recent call last):
             ...
-        TypeError: torch.int64 would be copied on its way to JAX: convert it yourself with .to(torch.int32)
+        TypeError: torch.int64 would be copied on its way to JAX: convert it ...
     """
     if tensor.dtype in _WIDE and not jax.config.read("jax_enable_x64"):
         raise TypeError(
-            f"{tensor.dtype} would be copied on its way to JAX: convert it yourself with .to({_WIDE[tensor.dtype]})"
+            f"{tensor.dtype} would be copied on its way to JAX: convert it yourself with "
+            f".to({_WIDE[tensor.dtype]})"
         )
     if tensor.requires_grad:
         raise ValueError("the tensor requires grad, JAX cannot record it: pass tensor.detach()")
     if not (tensor.is_contiguous() or _is_dense(tensor)):
-        raise ValueError(f"strides {tensor.stride()} of shape {tuple(tensor.shape)} have holes: pass .contiguous()")
+        raise ValueError(
+            f"strides {tensor.stride()} of shape {tuple(tensor.shape)} have holes: pass "
+            ".contiguous()"
+        )
     alignment = _ALIGNMENT_BYTES.get(tensor.device.type, 1)
     if tensor.data_ptr() % alignment:
         raise ValueError(
             f"the tensor does not begin at a multiple of {alignment} bytes, "
-            f"JAX {'would copy' if is_host(tensor.device) else 'cannot compute with'} it: pass .clone()"
+            f"JAX {'would copy' if is_host(tensor.device) else 'cannot compute with'} it: pass "
+            ".clone()"
         )
     array: jax.Array = jax.dlpack.from_dlpack(tensor)
     return array
@@ -124,15 +137,18 @@ def to_jax(tensor: torch.Tensor) -> jax.Array:
 
 def _is_dense(tensor: torch.Tensor) -> bool:
     """Whether some order of the axes makes the tensor contiguous."""
-    order = sorted(range(tensor.ndim), key=lambda axis: (tensor.stride(axis), tensor.shape[axis]), reverse=True)
+    order = sorted(
+        range(tensor.ndim), key=lambda axis: (tensor.stride(axis), tensor.shape[axis]), reverse=True
+    )
     return tensor.permute(order).is_contiguous()
 
 
 def int32_argument(tensor: torch.Tensor, jax_device: jax.Device) -> np.ndarray | jax.Array:
     """Make integers ready for a compiled function: a private int32 copy.
 
-    The copy is deliberate: JAX reads arguments after the call has returned, when the caller may write to them. Where
-    JAX computes on the CPU it is a numpy array, three times cheaper than DLPack.
+    The copy is deliberate: JAX reads arguments after the call has returned, when the caller may
+    write to them. Where JAX computes on the CPU it is a numpy array, three times cheaper than
+    DLPack.
     """
     if is_host(jax_device):
         return tensor.to("cpu", torch.int32, copy=True).numpy()
@@ -140,9 +156,11 @@ def int32_argument(tensor: torch.Tensor, jax_device: jax.Device) -> np.ndarray |
 
 
 def wait_for_torch(device: torch.device, jax_device: jax.Device) -> None:
-    """Wait until torch has read the frames that it has let go of: on a GPU, JAX may take their memory for what is next.
+    """Wait until torch has read the frames that it has let go of: on a GPU, JAX may take their
+    memory for what is next.
 
-    A step need not wait: JAX waits for its actions, which stand behind those reads in torch's current stream.
+    A step need not wait: JAX waits for its actions, which stand behind those reads in torch's
+    current stream.
     """
     if not (is_host(device) or is_host(jax_device)):
         torch.cuda.current_stream(device).synchronize()
@@ -155,7 +173,9 @@ def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 def write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
-    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's price or less."""
+    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's
+    price or less.
+    """
     if is_host(target.device):
         target.numpy()[index] = values.numpy()
     else:
@@ -166,9 +186,11 @@ class TensorMemory:
     """Gives tensors, in memory of earlier ones that nobody can see any more; see ``Reused``."""
 
     def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
-        self._shape, self._device = shape, device
+        self._shape = shape
+        self._device = device
         self._reused = Reused(most=2)  # what is in use, and the one before it
-        self.canvas: Canvas | None = None  # under the last tensor, on the CPU: steps may draw into it
+        # under the last tensor, on the CPU: steps may draw into it
+        self.canvas: Canvas | None = None
 
     def take(self) -> torch.Tensor:
         """uint8 of the shape, with any content."""
@@ -185,11 +207,13 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
         device: The device on which tensors are wanted, or None for the one that JAX computes on.
 
     Returns:
-        The torch device (with an index for CUDA) and the JAX device. They are of different kinds only if CUDA is asked
-        for and JAX has the CPU alone; then every frame is copied, and a warning says so once.
+        The torch device (with an index for CUDA) and the JAX device. They are of different kinds
+        only if CUDA is asked for and JAX has the CPU alone; then every frame is copied, and a
+        warning says so once.
 
     Raises:
-        ValueError: Unknown kind of device, no such GPU, torch without CUDA, or JAX without the device of JAX_PLATFORMS.
+        ValueError: Unknown kind of device, no such GPU, torch without CUDA, or JAX without the
+            device of JAX_PLATFORMS.
     """
     if problem := missing_platform():
         raise ValueError(problem)
@@ -199,16 +223,23 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
     try:
         wanted = torch.device(device)
     except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"device is {format_value(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ...") from error
+        raise ValueError(
+            f"device is {format_value(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ..."
+        ) from error
     if wanted.type == "cpu":
         return torch.device("cpu"), jax.devices("cpu")[0]
     if wanted.type != "cuda":
         raise ValueError(f"device is {str(device)!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...")
     if not torch.cuda.is_available():
-        raise ValueError(f"device is {str(device)!r}, but torch sees no GPU: use 'cpu', or install torch with CUDA")
+        raise ValueError(
+            f"device is {str(device)!r}, but torch sees no GPU: use 'cpu', or install torch with "
+            "CUDA"
+        )
     index = wanted.index if wanted.index is not None else torch.cuda.current_device()
     if index >= torch.cuda.device_count():
-        raise ValueError(f"device is {str(device)!r}, but there are {torch.cuda.device_count()} GPUs")
+        raise ValueError(
+            f"device is {str(device)!r}, but there are {torch.cuda.device_count()} GPUs"
+        )
     wanted = torch.device("cuda", index)
     if jax.default_backend() != "gpu":
         warn_frames_are_copied()
@@ -221,9 +252,14 @@ def warn_frames_are_copied() -> None:
     """Say once that torch is on CUDA and JAX is not, and which package is missing."""
     major = (torch.version.cuda or "12").split(".")[0]
     package = f"jax-cuda{major}-plugin"
-    have = "is installed but found no GPU" if importlib.util.find_spec(package.replace("-", "_")) else "is missing"
+    have = (
+        "is installed but found no GPU"
+        if importlib.util.find_spec(package.replace("-", "_"))
+        else "is missing"
+    )
     warnings.warn(
-        f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied to the GPU. "
+        f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied "
+        "to the GPU. "
         f"Install it with: pip install 'jax[cuda{major}]'",
         stacklevel=2,
     )

@@ -1,4 +1,6 @@
-"""``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that JAX wrote."""
+"""``ArcadeEnv``: a batch of JAX games as one TorchRL environment whose frames are the memory that
+JAX wrote.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +33,12 @@ from arcade_torch.process import check_process
 from arcade_torch.snapshot import Snapshots
 from arcade_torch.specs import RawStep, make_specs
 
-_INTEGERS = {torch.int64: np.uint64, torch.int32: np.uint32, torch.int16: np.uint16, torch.int8: np.uint8}
+_INTEGERS = {
+    torch.int64: np.uint64,
+    torch.int32: np.uint32,
+    torch.int16: np.uint16,
+    torch.int8: np.uint8,
+}
 _INTEGERS[torch.uint8] = np.uint8
 Place = tuple[Canvas, int, torch.Tensor]
 
@@ -51,33 +58,40 @@ _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
 
 
 class ArcadeEnv(EnvBase):
-    """A batch of N episodes of one game or of several, as a TorchRL environment with ``batch_size=[N]``.
+    """A batch of N episodes of one game or of several, as a TorchRL environment with
+    ``batch_size=[N]``.
 
-    Every key of the root and of ``"next"``: ``pixels`` uint8 [N, S, S, 3] (zero copy: **never write to it in place**),
-    ``last_action`` int64 [N] (the action that led here; it survives an episode's end, and is 0 at the very first
-    step), ``is_init`` bool [N, 1], ``step_count`` int64 [N, 1], ``episode_reward`` float32 [N, 1], ``done``,
-    ``terminated``, ``truncated`` bool [N, 1]; ``"next"`` has ``reward`` float32 [N, 1] too. ``("next", "pixels")`` at
-    an end is the true final frame; the following root is the first frame of the new episode. With several games also
-    ``task`` int64 [N]: which of ``games`` an env plays, at every step and in every episode the same.
+    Every key of the root and of ``"next"``: ``pixels`` uint8 [N, S, S, 3] (zero copy: **never write
+    to it in place**), ``last_action`` int64 [N] (the action that led here; it survives an episode's
+    end, and is 0 at the very first step), ``is_init`` bool [N, 1], ``step_count`` int64 [N, 1],
+    ``episode_reward`` float32 [N, 1], ``done``, ``terminated``, ``truncated`` bool [N, 1];
+    ``"next"`` has ``reward`` float32 [N, 1] too. ``("next", "pixels")`` at an end is the true final
+    frame; the following root is the first frame of the new episode. With several games also
+    ``task`` int64 [N]: which of ``games`` an env plays, at every step and in every episode the
+    same.
 
-    Envs that an entry ``_step`` (bool [N]) leaves out stay where they are: their ``"next"`` repeats the root, reward 0.
+    Envs that an entry ``_step`` (bool [N]) leaves out stay where they are: their ``"next"`` repeats
+    the root, reward 0.
 
-    ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal seeds and actions
-    give equal bits, whatever N, and whichever path is taken.
+    ``step_and_maybe_reset`` (which ``rollout`` and ``Collector`` use) is one compiled call. Equal
+    seeds and actions give equal bits, whatever N, and whichever path is taken.
 
-    Threads may each step envs of their own at the same time; one env belongs to one thread at a time. Other processes
-    have to be spawned: in one that was forked after this package was loaded and JAX had started, no env can be made.
+    Threads may each step envs of their own at the same time; one env belongs to one thread at a
+    time. Other processes have to be spawned: in one that was forked after this package was loaded
+    and JAX had started, no env can be made.
 
     Args:
-        game: A game, several as ``MixedGames``, or a compiled one (whose functions are then shared).
+        game: A game, several as ``MixedGames``, or a compiled one (whose functions are then
+            shared).
         num_envs: N.
         observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
         seed: Seed of the batch; None draws one from torch.
         device: Device of all tensors; None for the device that JAX computes on.
         categorical_actions: Actions are int64 [N]; False: one-hot [N, num_actions].
-        state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and makes every step start
-            from the ``state`` it is handed, so that a planner can branch. The twin is the one that was set last; resets
-            go on with the random keys of the last step, whichever branch that was on.
+        state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and
+            makes every step start from the ``state`` it is handed, so that a planner can branch.
+            The twin is the one that was set last; resets go on with the random keys of the last
+            step, whichever branch that was on.
         task_in_td: Whether there is a key ``task``; None: if there are several games.
         debug: Whether actions are checked on CUDA too.
 
@@ -126,21 +140,28 @@ class ArcadeEnv(EnvBase):
         running = self._batched.without_ends(first)
         self._live = Live(running, self._none_ended, self._no_ends)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
-        self._memory, self._ends = FrameMemory(shape, jax_device), FrameMemory(shape, jax_device)
+        self._memory = FrameMemory(shape, jax_device)
+        self._ends = FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, first, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
-        made = make_specs(num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device)
+        made = make_specs(
+            num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device
+        )
         self.action_spec, observation, self.reward_spec, self.done_spec = made
         if state_in_td:
             observation["state"] = self._snapshots.spec()
-            self.state_spec = type(observation)(state=self._snapshots.spec(), shape=(num_envs,), device=torch_device)
+            self.state_spec = type(observation)(
+                state=self._snapshots.spec(), shape=(num_envs,), device=torch_device
+            )
         self.observation_spec = observation
         self._begun = False
         self._set_seed(seed)
 
     @property
     def game(self) -> Game[Any] | Mixture:
-        """The game that is played, or what the games have in common: id, limits of steps and returns, picture size."""
+        """The game that is played, or what the games have in common: id, limits of steps and
+        returns, picture size.
+        """
         return self._batched.game
 
     @property
@@ -168,22 +189,32 @@ class ArcadeEnv(EnvBase):
         partial = self.observability
         twin = "full" if not partial.any() else "partial" if partial.all() else "mixed"
         device = str(self.device)
-        return f"ArcadeEnv({self.game.id}, num_envs={self.num_envs}, observability={twin!r}, {device=})"
+        return (
+            f"ArcadeEnv({self.game.id}, num_envs={self.num_envs}, observability={twin!r}, "
+            f"{device=})"
+        )
 
     def to(self, device: torch.device | str) -> "ArcadeEnv":
-        """The env itself: it stays on the device it was made for, and refuses any other (ValueError)."""
+        """The env itself: it stays on the device it was made for, and refuses any other
+        (ValueError).
+        """
         wanted = pick_devices(device)[0]
         if wanted != self.device:
-            raise ValueError(f"this env stays on {self.device}, where it was made: make one with device='{wanted}'")
+            raise ValueError(
+                f"this env stays on {self.device}, where it was made: make one with "
+                f"device='{wanted}'"
+            )
         return self
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(
-            "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to its set_state()"
+            "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to "
+            "its set_state()"
         )
 
     def set_observability(self, observability: Observability) -> None:
-        """Change which twin is shown, also in mid-episode; only the frames drawn from now on change.
+        """Change which twin is shown, also in mid-episode; only the frames drawn from now on
+        change.
 
         Args:
             observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
@@ -194,15 +225,19 @@ class ArcadeEnv(EnvBase):
         """
         flags = partial_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
-        self._live.batch = self._live.batch._replace(partial=jax.device_put(flags, self._jax_device))
+        self._live.batch = self._live.batch._replace(
+            partial=jax.device_put(flags, self._jax_device)
+        )
         self._live.view += 1
 
     def get_state(self) -> TensorDict:
-        """Copy everything that determines the future: game states, random keys, observability, counts.
+        """Copy everything that determines the future: game states, random keys, observability,
+        counts.
 
         Returns:
-            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the same game. Episodes
-            that have ended stay so: a step gives their flags again and the reward 0, until they are reset.
+            TensorDict [N]; plain tensors, safe to save, index, stack and hand to another env of the
+            same game. Episodes that have ended stay so: a step gives their flags again and the
+            reward 0, until they are reset.
         """
         return self._snapshots.export(self._with_ends())
 
@@ -210,10 +245,12 @@ class ArcadeEnv(EnvBase):
         """Go on from a snapshot.
 
         Args:
-            state: What ``get_state`` gave, here or on another env of the same game with as many envs.
+            state: What ``get_state`` gave, here or on another env of the same game with as many
+                envs.
 
         Returns:
-            The root tensordict of that state: what a policy acts on next. ``done`` is false everywhere.
+            The root tensordict of that state: what a policy acts on next. ``done`` is false
+            everywhere.
 
         Raises:
             ValueError: The state of another game or batch size, or a broken one.
@@ -225,7 +262,8 @@ class ArcadeEnv(EnvBase):
         """Draw the live state.
 
         Returns:
-            The root tensordict: what a policy acts on next; ``done`` where an episode has ended and waits for a reset.
+            The root tensordict: what a policy acts on next; ``done`` where an episode has ended and
+            waits for a reset.
         """
         wait_for_torch(self.device, self._jax_device)
         frames = to_torch(self._batched.render(self._with_ends()), self.device)
@@ -233,7 +271,9 @@ class ArcadeEnv(EnvBase):
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Changes of the state (steps, resets, loads) and of the observability, so that a collector notices others'."""
+        """Changes of the state (steps, resets, loads) and of the observability, so that a collector
+        notices others'.
+        """
         return self._live.generation, self._live.view
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -246,14 +286,20 @@ class ArcadeEnv(EnvBase):
         self._go_on_from(saved, saved.get("ends", None))
 
     def step_raw(
-        self, action: torch.Tensor, while_computing: Callable[[], object] | None = None, into: Place | None = None
+        self,
+        action: torch.Tensor,
+        while_computing: Callable[[], object] | None = None,
+        into: Place | None = None,
     ) -> RawStep:
-        """Step, begin anew where an episode ended, and draw once: one compiled call and no tensordict.
+        """Step, begin anew where an episode ended, and draw once: one compiled call and no
+        tensordict.
 
         Args:
-            action: Integers [N] in 0..4 (one-hot [N, 5] with ``categorical_actions=False``). Not read after the return.
+            action: Integers [N] in 0..4 (one-hot [N, 5] with ``categorical_actions=False``). Not
+                read after the return.
             while_computing: Called while JAX computes, for work that needs no result of this step.
-            into: Where to draw: a canvas, the index on its second axis, and the frames there; None: memory of the env.
+            into: Where to draw: a canvas, the index on its second axis, and the frames there; None:
+                memory of the env.
 
         Returns:
             The step; export from it what is needed.
@@ -276,34 +322,48 @@ class ArcadeEnv(EnvBase):
         else:
             canvas.wait()
         self._go_on(step.root)  # on the CPU the step is done; argument lives until here
-        return RawStep(frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial))
+        return RawStep(
+            frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial)
+        )
 
     def draws_safely(self) -> bool:
-        """Whether steps may draw into memory that tensors lie over: a step that fails would take it along."""
+        """Whether steps may draw into memory that tensors lie over: a step that fails would take it
+        along.
+        """
         return not self._compiled.calls_back(self._live.batch)
 
     def final_observations(self, max_steps: int) -> FinalObservations:
-        """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among them when asked."""
+        """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among
+        them when asked.
+        """
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
-    def _go_on(self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None) -> None:
-        """Put another state in place, all at once: an interrupt leaves the old state or the new one.
+    def _go_on(
+        self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None
+    ) -> None:
+        """Put another state in place, all at once: an interrupt leaves the old state or the new
+        one.
 
         Args:
             batch: Without flags of an end.
             ended: Where it has ended; None: nowhere.
-            ends: bool [N, 2], what a root says of that: where its last step terminated or truncated; None: nowhere.
+            ends: bool [N, 2], what a root says of that: where its last step terminated or
+                truncated; None: nowhere.
         """
         ended = self._none_ended if ended is None else ended
         ends = self._no_ends if ends is None else ends
-        vars(self._live).update(batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1)
+        vars(self._live).update(
+            batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1
+        )
 
     def _go_on_from(self, state: TensorDictBase | None, ends: torch.Tensor | None = None) -> None:
         """Put a snapshot in place."""
         batch = self._snapshots.load(state)
         terminated, truncated = self._batched.ends(batch)
         some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
-        self._go_on(self._batched.without_ends(batch), (terminated, truncated) if some_ended else None, ends)
+        self._go_on(
+            self._batched.without_ends(batch), (terminated, truncated) if some_ended else None, ends
+        )
 
     def _still_ended(self, rows: np.ndarray) -> Ended:
         """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
@@ -320,22 +380,33 @@ class ArcadeEnv(EnvBase):
     def _check_action(self, action: torch.Tensor) -> torch.Tensor:
         """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
         validation.check_tensor(action, "action")
-        num_actions, shape = self.game.num_actions, (self.num_envs,)
+        num_actions = self.game.num_actions
+        shape = (self.num_envs,)
         if self.one_hot:
             if action.shape != (*shape, num_actions):
-                raise ValueError(f"action has shape {tuple(action.shape)}, expected one-hot {(*shape, num_actions)}")
+                raise ValueError(
+                    f"action has shape {tuple(action.shape)}, expected one-hot "
+                    f"{(*shape, num_actions)}"
+                )
             if self._check_actions:
                 validation.check_one_hot(action)
             return action.to(torch.float32).argmax(-1)
         unsigned = _INTEGERS.get(action.dtype)
         if unsigned is None:
-            raise TypeError(f"action has dtype {action.dtype}, expected integers such as torch.int64")
+            raise TypeError(
+                f"action has dtype {action.dtype}, expected integers such as torch.int64"
+            )
         if action.shape != shape:
-            raise ValueError(f"action has shape {tuple(action.shape)}, expected {shape}, one integer an env")
+            raise ValueError(
+                f"action has shape {tuple(action.shape)}, expected {shape}, one integer an env"
+            )
         # Seen as unsigned, negative numbers are large: one comparison finds both kinds of error.
         if self._check_actions and action.cpu().numpy().view(unsigned).max() >= num_actions:
-            lowest, highest = int(action.min()), int(action.max())
-            raise ValueError(f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}")
+            lowest = int(action.min())
+            highest = int(action.max())
+            raise ValueError(
+                f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}"
+            )
         return action
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
@@ -349,7 +420,8 @@ class ArcadeEnv(EnvBase):
         if not self._begun:
             default_seeds.warn_of_twins(self)
             self._begun = True
-        # A mask that is true everywhere is no special case: other random numbers would be drawn than on the fused path.
+        # A mask that is true everywhere is no special case: other random numbers would be drawn
+        # than on the fused path.
         rows = np.ones(self.num_envs, np.bool_)
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
@@ -363,7 +435,8 @@ class ArcadeEnv(EnvBase):
         return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._state_in_td:  # go on from the state the caller handed over, and show the twin that was set last
+        # go on from the state the caller handed over, and show the twin that was set last
+        if self._state_in_td:
             twin = self._live.batch.partial
             self._go_on_from(tensordict.get("state", None))
             self._live.batch = self._live.batch._replace(partial=twin)
@@ -375,7 +448,8 @@ class ArcadeEnv(EnvBase):
         )
         frames = to_torch(self._memory.show(pixels), self.device)
         numbers = to_torch(packed, self.device)
-        ends = numbers[:, TERMINATED:] > 0  # not the flags that are handed out: those may be written to
+        # not the flags that are handed out: those may be written to
+        ends = numbers[:, TERMINATED:] > 0
         self._go_on(batch, ended, ends)
         following = self._next(frames, action, numbers)
         if self._state_in_td:
@@ -384,24 +458,34 @@ class ArcadeEnv(EnvBase):
             return self._only_marked(tensordict, before, following)
         return following
 
-    def _only_marked(self, tensordict: TensorDictBase, before: "Live", following: TensorDict) -> TensorDictBase:
-        """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the reward is 0."""
+    def _only_marked(
+        self, tensordict: TensorDictBase, before: "Live", following: TensorDict
+    ) -> TensorDictBase:
+        """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the
+        reward is 0.
+        """
         marked = validation.mask(tensordict, "_step", self.num_envs)
         stepped = Live(self._live.batch, self._live.ended, self._live.ends)
-        self._go_on(before.batch, before.ended, before.ends)  # where it stays if the next line refuses
+        # where it stays if the next line refuses
+        self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
         mask = jax.numpy.asarray(marked.cpu().numpy())
-        batch = choose_rows(mask, self._batched.wide(stepped.batch), self._batched.wide(before.batch))
+        batch = choose_rows(
+            mask, self._batched.wide(stepped.batch), self._batched.wide(before.batch)
+        )
         ended = choose_rows(mask, stepped.ended, before.ended)
         ends = stepped.ends.where(marked.unsqueeze(-1), before.ends)
         self._go_on(self._batched.narrow(batch), ended, ends)
         left_alone = following.apply(torch.zeros_like)
-        kept = (key for key in following.keys(True, True) if key != "reward")  # an old reward is not earned again
+        # an old reward is not earned again
+        kept = (key for key in following.keys(True, True) if key != "reward")
         left_alone.update(tensordict.select(*kept, strict=False))
         merged: TensorDictBase = following.where(marked, left_alone)
         return merged
 
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
         self._assert_tensordict_shape(tensordict)
         if self._state_in_td or "_step" in tensordict or self._post_step_mdp_hooks is not None:
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
@@ -410,11 +494,13 @@ class ArcadeEnv(EnvBase):
         raw = self.step_raw(action)
         last_action = action.to(torch.float32).argmax(-1) if self.one_hot else action
         following = self._next(raw.pixels, last_action, raw.numbers)
-        if following["done"].any():  # all envs are drawn again, which is no dearer than to copy their frames
+        # all envs are drawn again, which is no dearer than to copy their frames
+        if following["done"].any():
             ended = self._live.batch._replace(state=raw.final[0])
             drawn = self._ends.show(self._compiled.draw(ended, self._ends.spare()))
             following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
-        preset = tensordict.get("next", None)  # what the policy wrote for the next step, such as its recurrent state
+        # what the policy wrote for the next step, such as its recurrent state
+        preset = tensordict.get("next", None)
         if preset is not None:
             unknown = preset.exclude(*following.keys(True, True))
             following.update(unknown)
@@ -429,12 +515,16 @@ class ArcadeEnv(EnvBase):
         return tensordict, root
 
     def _set_seed(self, seed: int | None) -> None:
-        """Give every env a new random key and forget the last action; running episodes go on until they are reset."""
+        """Give every env a new random key and forget the last action; running episodes go on until
+        they are reset.
+        """
         if seed is None:
             seed = int(torch.randint(2**32, (), device="cpu"))
         default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
-        new = jax.device_put((env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device)
+        new = jax.device_put(
+            (env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device
+        )
         seeded = self._live.batch._replace(key=new[0], last_action=new[1])
         self._go_on(seeded, self._live.ended, self._live.ends)
 
@@ -445,15 +535,23 @@ class ArcadeEnv(EnvBase):
         """
         step_count = to_torch(batch.step_count, self.device).to(torch.int64).unsqueeze(-1)
         episode_reward = to_torch(batch.episode_reward, self.device).clone().unsqueeze(-1)
-        counts = {"is_init": step_count == 0, "step_count": step_count, "episode_reward": episode_reward}
+        counts = {
+            "is_init": step_count == 0,
+            "step_count": step_count,
+            "episode_reward": episode_reward,
+        }
         ends = self._live.ends & (step_count > 0)
         root = self._entries(frames, to_torch(batch.last_action, self.device), counts, ends)
         if self._state_in_td:
             root["state"] = self._snapshots.export(self._batched.with_ends(batch, *ended))
         return TensorDict(root, batch_size=self.batch_size, device=self.device)
 
-    def _next(self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor) -> TensorDict:
-        """The ``"next"`` tensordict. Frames and numbers are zero copy, since JAX never reads them again."""
+    def _next(
+        self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor
+    ) -> TensorDict:
+        """The ``"next"`` tensordict. Frames and numbers are zero copy, since JAX never reads them
+        again.
+        """
         is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         step_count = numbers[:, STEP_COUNT, None].to(torch.int64)
         episode_reward = numbers[:, EPISODE_REWARD, None].view(torch.float32)
@@ -463,9 +561,19 @@ class ArcadeEnv(EnvBase):
         return TensorDict._new_unsafe(following, batch_size=self.batch_size, device=self.device)
 
     def _entries(
-        self, frames: torch.Tensor, action: torch.Tensor, counts: dict[str, torch.Tensor], ends: torch.Tensor
+        self,
+        frames: torch.Tensor,
+        action: torch.Tensor,
+        counts: dict[str, torch.Tensor],
+        ends: torch.Tensor,
     ) -> dict[str, torch.Tensor]:
-        """The entries that root and ``"next"`` have in common; ``ends`` is bool [N, 2]: terminated, truncated."""
+        """The entries that root and ``"next"`` have in common; ``ends`` is bool [N, 2]: terminated,
+        truncated.
+        """
         entries = {"pixels": frames, "last_action": action.to(torch.int64, copy=True), **counts}
-        entries |= {"done": ends.any(-1, keepdim=True), "terminated": ends[:, :1], "truncated": ends[:, 1:]}
+        entries |= {
+            "done": ends.any(-1, keepdim=True),
+            "terminated": ends[:, :1],
+            "truncated": ends[:, 1:],
+        }
         return {**entries, "task": self.task} if self.task_in_td else entries

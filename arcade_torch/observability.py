@@ -1,4 +1,6 @@
-"""Which envs of a batch show the Markov state (MDP) and which the partial view (POMDP). Loads no torch."""
+"""Which envs of a batch show the Markov state (MDP) and which the partial view (POMDP). Loads no
+torch.
+"""
 
 from typing import Literal
 
@@ -18,12 +20,14 @@ def partial_flags(
     """Turn what a user may write into one flag an env.
 
     Args:
-        observability: ``"full"``, ``"partial"``, or bool [num_envs], array or tensor; None if not given.
+        observability: ``"full"``, ``"partial"``, or bool [num_envs], array or tensor; None if not
+            given.
         num_envs: Number of envs.
         partial_obs: The alias: true means ``"partial"``; None if not given.
 
     Returns:
-        bool [num_envs], true where the env shows its POMDP twin. False everywhere if neither is given. A new array.
+        bool [num_envs], true where the env shows its POMDP twin. False everywhere if neither is
+        given. A new array.
 
     Raises:
         ValueError: Both are given, or another word, type or shape.
@@ -32,7 +36,10 @@ def partial_flags(
     partial_obs = plain(partial_obs)
     if partial_obs is not None:
         if observability is not None:
-            raise ValueError("observability and partial_obs are given: keep observability, partial_obs is its alias")
+            raise ValueError(
+                "observability and partial_obs are given: keep observability, partial_obs is its "
+                "alias"
+            )
         if not isinstance(partial_obs, bool):
             raise TypeError(f"partial_obs is {format_value(partial_obs)}, allowed: True, False")
         return np.full(num_envs, partial_obs)
@@ -41,9 +48,13 @@ def partial_flags(
             raise ValueError(f"observability is {format_value(observability)}, {_ALLOWED}")
         return np.full(num_envs, observability == "partial")
     try:
-        flags = np.array(observability.cpu().numpy() if hasattr(observability, "cpu") else observability)
+        flags = np.array(
+            observability.cpu().numpy() if hasattr(observability, "cpu") else observability
+        )
     except ValueError:  # rows of different lengths
         flags = np.array(None)
     if flags.dtype != np.bool_ or flags.shape != (num_envs,):
-        raise ValueError(f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}")
+        raise ValueError(
+            f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}"
+        )
     return flags

@@ -1,4 +1,6 @@
-"""A TorchRL policy inside the collector: what it reads, the recurrent state it carries, what is stored of it."""
+"""A TorchRL policy inside the collector: what it reads, the recurrent state it carries, what is
+stored of it.
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -10,17 +12,20 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward", "task")  # task: if there are several
+# task: if there are several
+ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward", "task")
 
 
 class PolicyRunner:
     """Runs a policy, and carries what it writes under ``"next"`` to the root of the following step.
 
     Args:
-        policy: Reads root keys, writes ``action`` and, if recurrent, ``("next", <state key>)``; None writes nothing.
+        policy: Reads root keys, writes ``action`` and, if recurrent, ``("next", <state key>)``;
+            None writes nothing.
         batch_size: N.
         device: Device of the state.
-        store: Keys to store (a prefix stands for all below it); None for everything the policy writes.
+        store: Keys to store (a prefix stands for all below it); None for everything the policy
+            writes.
         store_states: Whether the recurrent state of every step may be stored.
     """
 
@@ -32,7 +37,9 @@ class PolicyRunner:
         store: Iterable[NestedKey] | None,
         store_states: bool,
     ) -> None:
-        self._policy, self._size, self._device = policy, [batch_size], device
+        self._policy = policy
+        self._size = [batch_size]
+        self._device = device
         self._store = None if store is None else [path_of(key) for key in store]
         self._store_states = store_states
         reads = () if policy is None else getattr(policy, "in_keys", ROOT_KEYS)
@@ -50,7 +57,11 @@ class PolicyRunner:
         state = TensorDict({}, batch_size=self._size, device=self._device)
         for primer in _primers(self._policy):
             for key, spec in primer.primers.items(True, True):
-                default = primer.default_value.get(key, 0.0) if hasattr(primer.default_value, "get") else 0.0
+                default = (
+                    primer.default_value.get(key, 0.0)
+                    if hasattr(primer.default_value, "get")
+                    else 0.0
+                )
                 shape = spec.shape[len(primer.primers.shape) :]
                 value = default() if callable(default) else default
                 zeros = torch.zeros((*self._size, *shape), dtype=spec.dtype, device=self._device)
@@ -59,14 +70,17 @@ class PolicyRunner:
         for key in getattr(self._policy, "in_keys", []):
             if unravel_key(("next", key)) in written and key not in state.keys(True, True):
                 raise KeyError(
-                    f"the policy reads {key!r} and writes it for the next step, but has no primer that says how it "
+                    f"the policy reads {key!r} and writes it for the next step, but has no primer "
+                    "that says how it "
                     f"begins: give the module a method make_tensordict_primer()"
                 )
         self._initial = state
         return state.clone()
 
     def begin_anew(self, state: TensorDict, is_init: torch.Tensor) -> TensorDict:
-        """The state with the primers' values where ``is_init`` (bool [N, 1]) is true; a new TensorDict."""
+        """The state with the primers' values where ``is_init`` (bool [N, 1]) is true; a new
+        TensorDict.
+        """
         out = TensorDict({}, batch_size=self._size, device=self._device)
         for key, value in state.items(True, True):
             first = self._initial.get(key, None)
@@ -80,13 +94,15 @@ class PolicyRunner:
         """Run one step from root entries and the state that the last call returned.
 
         Returns:
-            Actions int64 [N] (None without a policy), the entries to store [N, ...], the state after this step.
+            Actions int64 [N] (None without a policy), the entries to store [N, ...], the state
+            after this step.
         """
         if self._policy is None:
             return None, {}, state
         if self._sets_initial and len(state.keys()):
             state = self.begin_anew(state, obs["is_init"])
-        entries = {key: obs[key] for key in self.reads if key in obs}  # the same at every step: graphs hold one layout
+        # the same at every step: graphs hold one layout
+        entries = {key: obs[key] for key in self.reads if key in obs}
         td = TensorDict(entries | dict(state.items()), batch_size=self._size, device=self._device)
         td = self._policy(td)
         carried = TensorDict({}, batch_size=self._size, device=self._device)
@@ -114,7 +130,9 @@ def path_of(key: NestedKey) -> tuple[str, ...]:
 
 
 def _primers(policy: Any) -> list[TensorDictPrimer]:
-    """The primers of all modules inside a policy; ``CudaGraphModule`` is no module itself, but holds one."""
+    """The primers of all modules inside a policy; ``CudaGraphModule`` is no module itself, but
+    holds one.
+    """
     module = policy if isinstance(policy, nn.Module) else getattr(policy, "module", None)
     found = get_primers_from_module(module, warn=False) if isinstance(module, nn.Module) else None
     if found is None:

@@ -1,4 +1,6 @@
-"""Refuses processes in which JAX would hang or cannot start. Loads no JAX, and is loaded with the package."""
+"""Refuses processes in which JAX would hang or cannot start. Loads no JAX, and is loaded with the
+package.
+"""
 
 import os
 import sys
@@ -10,7 +12,8 @@ def _before_fork() -> None:
     """Note that JAX has started: here, or in a process that this one was forked from."""
     global _started_in
     bridge = sys.modules.get("jax._src.xla_bridge")
-    if _started_in is None and getattr(bridge, "backends_are_initialized", bool)():  # bool() is false
+    # bool() is false
+    if _started_in is None and getattr(bridge, "backends_are_initialized", bool)():
         _started_in = os.getpid()
 
 
@@ -19,16 +22,22 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 
 
 def check_process() -> None:
-    """Raise RuntimeError in a process that was forked after JAX had started: computing there would hang for ever."""
+    """Raise RuntimeError in a process that was forked after JAX had started: computing there would
+    hang for ever.
+    """
     if _started_in not in (None, os.getpid()):
         raise RuntimeError(
-            "this process was forked after JAX had started, where JAX hangs: start workers with 'spawn' (Gymnasium: "
-            "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it needs no workers"
+            "this process was forked after JAX had started, where JAX hangs: start workers with "
+            "'spawn' (Gymnasium: "
+            "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it "
+            "needs no workers"
         )
 
 
 def missing_platform() -> str:
-    """Why JAX cannot start on the platform that the environment asks for; empty if it can, or nothing was asked for."""
+    """Why JAX cannot start on the platform that the environment asks for; empty if it can, or
+    nothing was asked for.
+    """
     names = [name for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME") if os.environ.get(name)]
     if not names or "jax" not in sys.modules:
         return ""
@@ -37,5 +46,7 @@ def missing_platform() -> str:
     except Exception as error:  # an AssertionError without a word, or a RuntimeError
         asked = f"{names[0]} is {os.environ[names[0]]!r}"
         why = " ".join(str(error).split())[:200]
-        return f"{asked}, but JAX has no such device here: unset it, or set it to cpu" + (f" ({why})" if why else "")
+        return f"{asked}, but JAX has no such device here: unset it, or set it to cpu" + (
+            f" ({why})" if why else ""
+        )
     return ""

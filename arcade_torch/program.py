@@ -1,18 +1,21 @@
-"""What the process of the command line does first and last: standard streams, the signals that stop it, its end.
+"""What the process of the command line does first and last: standard streams, the signals that stop
+it, its end.
 
 It is loaded with the package, before everything that takes long, and loads nothing itself.
 
 SIGINT, SIGTERM and SIGHUP end every command with one line on stderr and exit code 130:
 
-* before a command has begun, and while it imports, at once: libraries in C++ abort when their import is interrupted;
-* while it works, by a ``KeyboardInterrupt``, so that open files are closed and half written ones are removed. JAX and
-  Python lose exceptions that arrive in one of their callbacks (three in ten did), so it is raised until it is seen;
+* before a command has begun, and while it imports, at once: libraries in C++ abort when their
+  import is interrupted;
+* while it works, by a ``KeyboardInterrupt``, so that open files are closed and half written ones
+  are removed. JAX and Python lose exceptions that arrive in one of their callbacks (three in ten
+  did), so it is raised until it is seen;
 * when it has done its work, with what came of the work;
-* on a second Ctrl-C at once, also in the middle of a compilation. A thread listens for it, because Python's handlers
-  wait until C returns.
+* on a second Ctrl-C at once, also in the middle of a compilation. A thread listens for it, because
+  Python's handlers wait until C returns.
 
-The process never reaches the end of the interpreter, which takes modules apart while threads of JAX and torch still
-run, and crashes there.
+The process never reaches the end of the interpreter, which takes modules apart while threads of JAX
+and torch still run, and crashes there.
 """
 
 import atexit
@@ -29,7 +32,9 @@ from typing import Any, Literal, NoReturn
 
 EXIT_STOPPED = 130
 """Exit code after each of `STOP_SIGNALS`."""
-STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+STOP_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 REPEAT_S = 0.5
 """A ``KeyboardInterrupt`` that got lost is raised again after this time."""
 
@@ -45,7 +50,9 @@ class _Process:
 
 
 def is_command_line() -> bool:
-    """Whether this process is ``arcade-torch`` or ``python -m arcade_torch.tools``, and no child or user of it."""
+    """Whether this process is ``arcade-torch`` or ``python -m arcade_torch.tools``, and no child or
+    user of it.
+    """
     script = "".join(sys.argv[:1])
     if script == "-m":
         return f"{__package__}.tools" in sys.orig_argv
@@ -53,7 +60,9 @@ def is_command_line() -> bool:
 
 
 def begin() -> None:
-    """Repair the standard streams and install the handlers, once; signals that are ignored (``nohup``) stay so."""
+    """Repair the standard streams and install the handlers, once; signals that are ignored
+    (``nohup``) stay so.
+    """
     if _Process.begun or threading.current_thread() is not threading.main_thread():
         return
     _Process.begun = True
@@ -68,7 +77,9 @@ def begin() -> None:
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
-    threading.Thread(target=_listen, args=(reader,), daemon=True, name="arcade-torch-signals").start()
+    threading.Thread(
+        target=_listen, args=(reader,), daemon=True, name="arcade-torch-signals"
+    ).start()
 
 
 @contextmanager
@@ -104,7 +115,9 @@ def leave(code: int) -> NoReturn:
 
 
 def _start_with_docstrings() -> None:
-    """Run this program again without ``-OO``: TorchRL adds to docstrings while it is imported, and fails without."""
+    """Run this program again without ``-OO``: TorchRL adds to docstrings while it is imported, and
+    fails without.
+    """
     words: list[str] = []
     rest = iter(sys.orig_argv[1:])
     for word in rest:
@@ -124,7 +137,9 @@ def _start_with_docstrings() -> None:
 
 
 def _repair_streams() -> None:
-    """Give closed standard streams ``/dev/null``, and let every character be written in some form."""
+    """Give closed standard streams ``/dev/null``, and let every character be written in some
+    form.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream: Any = getattr(sys, name)
         if stream is None:
@@ -174,7 +189,9 @@ def _is_unwinding() -> bool:
 
 
 def _listen(reader: int) -> None:
-    """End the process on the second signal if that is Ctrl-C; repeat the first one as long as nobody sees it."""
+    """End the process on the second signal if that is Ctrl-C; repeat the first one as long as
+    nobody sees it.
+    """
     signals = 0
     while True:
         again = REPEAT_S if _Process.asked and _Process.phase == "working" else None
@@ -190,7 +207,9 @@ def _listen(reader: int) -> None:
 
 
 def _repeat() -> None:
-    """Send the main thread the signal once more, unless a training has taken the handlers and saves."""
+    """Send the main thread the signal once more, unless a training has taken the handlers and
+    saves.
+    """
     ident = threading.main_thread().ident
     if signal.getsignal(signal.SIGTERM) is _stop and ident is not None:
         signal.pthread_kill(ident, signal.SIGTERM)

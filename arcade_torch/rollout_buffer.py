@@ -32,10 +32,12 @@ _ROOT_COLUMNS: dict[str, torch.dtype] = {
 
 
 class RolloutBuffer:
-    """The last L steps of N envs, and the observations that follow a step but do not stand at the next index.
+    """The last L steps of N envs, and the observations that follow a step but do not stand at the
+    next index.
 
-    With ``final_frames="all"`` the next observations are dense. Otherwise each env has K places for them: the last one
-    is for the observation after step L - 1, the others are for the truncations before it, in order of time.
+    With ``final_frames="all"`` the next observations are dense. Otherwise each env has K places for
+    them: the last one is for the observation after step L - 1, the others are for the truncations
+    before it, in order of time.
 
     Args:
         num_envs: N.
@@ -59,38 +61,53 @@ class RolloutBuffer:
         max_steps: int = 1,
         task: torch.Tensor | None = None,
     ) -> None:
-        self.num_envs, self.overlap, self.steps, self.length = num_envs, overlap, steps, overlap + steps
-        self.device, self.final_frames, self._frame_shape = device, final_frames, frame_shape
+        self.num_envs = num_envs
+        self.overlap = overlap
+        self.steps = steps
+        self.length = overlap + steps
+        self.device = device
+        self.final_frames = final_frames
+        self._frame_shape = frame_shape
         window = (num_envs, self.length, *frame_shape)
-        self._new_pixels, self._new_dense = TensorMemory(window, device), TensorMemory(window, device)
-        # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step has its own place.
+        self._new_pixels = TensorMemory(window, device)
+        self._new_dense = TensorMemory(window, device)
+        # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step
+        # has its own place.
         inside = -(-(self.length - 1) // max_steps) if final_frames == "truncated" else 0
         self._places = 1 + inside
         self._new_final = TensorMemory((num_envs, self._places, *frame_shape), device)
         self._extra_shapes: dict[NestedKey, tuple[tuple[int, ...], torch.dtype]] = {}
         self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
-        self._wanted = np.zeros((num_envs, self.length), np.bool_)  # whose final observation is kept
-        self._first, self._fills_dense = 0, False
+        # whose final observation is kept
+        self._wanted = np.zeros((num_envs, self.length), np.bool_)
+        self._first = 0
+        self._fills_dense = False
         self._allocate()
 
     def _allocate(self) -> None:
-        size, device = (self.num_envs, self.length), self.device
+        size = (self.num_envs, self.length)
+        device = self.device
         self.pixels = self._new_pixels.take()
         self._action = torch.zeros(size, dtype=torch.int64, device=device)
         self._numbers = torch.zeros((*size, NUM_NUMBERS), dtype=torch.int32, device=device)
-        self._root = {key: torch.zeros(size, dtype=dtype, device=device) for key, dtype in _ROOT_COLUMNS.items()}
+        self._root = {
+            key: torch.zeros(size, dtype=dtype, device=device)
+            for key, dtype in _ROOT_COLUMNS.items()
+        }
         self._extras = {
             key: torch.zeros((*size, *shape), dtype=dtype, device=device)
             for key, (shape, dtype) in self._extra_shapes.items()
         }
-        self._dense: torch.Tensor | None = None  # the observation after every step, made when it is asked for
+        # the observation after every step, made when it is asked for
+        self._dense: torch.Tensor | None = None
         self._final = self._new_final.take()
         self._final[:, :-1].zero_()  # the last place is written in every window
 
     @property
     def done(self) -> torch.Tensor:
         """bool [N, L], where an episode ended."""
-        return self._numbers[..., TERMINATED:].any(-1)  # no list of columns: it is copied to a GPU and waited for
+        # no list of columns: it is copied to a GPU and waited for
+        return self._numbers[..., TERMINATED:].any(-1)
 
     def begin(self, carry: bool, reuse: bool, dense: bool) -> int:
         """Make ready for new steps, and say which is the first.
@@ -102,17 +119,21 @@ class RolloutBuffer:
         """
         carry = carry and self.overlap > 0
         self._first = self.overlap if carry else 0
-        before, final, wanted = self._buffers(), self._final, self._wanted
+        before = self._buffers()
+        final = self._final
+        wanted = self._wanted
         if not reuse:
             self._allocate()
         self._wanted = np.zeros_like(wanted)
-        self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")  # the next window begins with it
+        # the next window begins with it
+        self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")
         if self._fills_dense and self._dense is None:
             self._dense = self._new_dense.take()
         if not carry:
             return self._first
         for key, target in self._buffers().items():
-            # Step by step when source and target overlap; upwards, so that nothing is overwritten before it is read.
+            # Step by step when source and target overlap; upwards, so that nothing is overwritten
+            # before it is read.
             portion = self.overlap if self.overlap <= self.steps else 1
             for first in range(0, self.overlap, portion):
                 start = first + self.steps
@@ -120,14 +141,18 @@ class RolloutBuffer:
         self._wanted[:, : self.overlap] = wanted[:, self.steps :]
         if self._places > 1:
             rows, steps = np.nonzero(self._wanted)
-            now, then = self._place_of(self._wanted, rows, steps), self._place_of(wanted, rows, steps + self.steps)
+            now = self._place_of(self._wanted, rows, steps)
+            then = self._place_of(wanted, rows, steps + self.steps)
             row, to, source = (upload(index, self.device) for index in (rows, now, then))
             self._final[row, to] = final[row, source]
         return self._first
 
     def place(self, step: int) -> Place | None:
-        """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends before it."""
-        canvas, config = self._new_pixels.canvas, cast(Any, jax.config)
+        """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends
+        before it.
+        """
+        canvas = self._new_pixels.canvas
+        config = cast(Any, jax.config)
         if (
             canvas is None
             or step == self.length
@@ -142,7 +167,9 @@ class RolloutBuffer:
         return None if moved else (canvas, step, self.pixels[:, step])
 
     def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
-        """Write what was seen and done. This copies the frames, unless they were drawn where they belong."""
+        """Write what was seen and done. This copies the frames, unless they were drawn where they
+        belong.
+        """
         target = self.pixels[:, step]
         if frames.data_ptr() != target.data_ptr():
             target.copy_(frames)
@@ -163,17 +190,21 @@ class RolloutBuffer:
 
     def _add_extra(self, key: NestedKey, shape: tuple[int, ...], dtype: torch.dtype) -> None:
         self._extra_shapes[key] = tuple(shape), dtype
-        self._extras[key] = torch.zeros((self.num_envs, self.length, *shape), dtype=dtype, device=self.device)
+        self._extras[key] = torch.zeros(
+            (self.num_envs, self.length, *shape), dtype=dtype, device=self.device
+        )
 
     def finish(self, root: Mapping[str, torch.Tensor], last: torch.Tensor) -> np.ndarray:
         """Work out what each step began with. The host waits here, once a window.
 
         Args:
-            root: What the first new step began with: last_action [N], is_init, step_count, episode_reward [N, 1].
+            root: What the first new step began with: last_action [N], is_init, step_count,
+                episode_reward [N, 1].
             last: What follows the last step, uint8 [N, ...].
 
         Returns:
-            bool [N, L], the new steps whose final observations are to be drawn; see ``write_final``.
+            bool [N, L], the new steps whose final observations are to be drawn; see
+            ``write_final``.
 
         Raises:
             RuntimeError: A game truncated earlier than at its time limit.
@@ -181,28 +212,41 @@ class RolloutBuffer:
         first = self._first
         for key, column in self._root.items():
             column[:, first] = root[key].reshape(self.num_envs)
-        before, after = slice(first, self.length - 1), slice(first + 1, self.length)
-        done, numbers = self.done[:, before], self._numbers[:, before]
+        before = slice(first, self.length - 1)
+        after = slice(first + 1, self.length)
+        done = self.done[:, before]
+        numbers = self._numbers[:, before]
         self._root["last_action"][:, after] = self._action[:, before]
         self._root["is_init"][:, after] = done
-        self._root["step_count"][:, after] = numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
-        self._root["episode_reward"][:, after] = numbers[..., EPISODE_REWARD].view(torch.float32).masked_fill(done, 0)
+        self._root["step_count"][:, after] = (
+            numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
+        )
+        self._root["episode_reward"][:, after] = (
+            numbers[..., EPISODE_REWARD].view(torch.float32).masked_fill(done, 0)
+        )
         self._final[:, -1] = last
         if self._dense is not None and self._fills_dense:
             self._dense[:, -1] = last
         if self.final_frames == "none" or (self.final_frames == "all" and not self._fills_dense):
             return np.zeros_like(self._wanted)
         flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
-        terminated, truncated = flags[..., 0], flags[..., 1]
-        self._wanted[:, first:] = terminated | truncated if self.final_frames == "all" else truncated & ~terminated
+        terminated = flags[..., 0]
+        truncated = flags[..., 1]
+        self._wanted[:, first:] = (
+            terminated | truncated if self.final_frames == "all" else truncated & ~terminated
+        )
         if self._places > 1 and self._wanted[:, :-1].sum(1).max() >= self._places:
-            raise RuntimeError("a game truncated an episode before its max_steps: collect with final_frames='all'")
+            raise RuntimeError(
+                "a game truncated an episode before its max_steps: collect with final_frames='all'"
+            )
         new = self._wanted.copy()
         new[:, :first] = False
         return new
 
     def write_final(self, rows: np.ndarray, steps: np.ndarray, frames: torch.Tensor) -> None:
-        """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n, ...]."""
+        """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n,
+        ...].
+        """
         places = self._place_of(self._wanted, rows, steps)
         if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
             write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
@@ -215,7 +259,9 @@ class RolloutBuffer:
         return np.where(steps == self.length - 1, self._places - 1, earlier)
 
     def sequences(self, initial_state: TensorDict) -> TensorDict:
-        """Everything as TensorDict [N] of entries [N, L, ...]; frames and extras are views of the storage."""
+        """Everything as TensorDict [N] of entries [N, L, ...]; frames and extras are views of the
+        storage.
+        """
         out = self._entries(0, [self.num_envs])
         out["initial_state"] = initial_state
         if self.final_frames == "all":
@@ -225,16 +271,24 @@ class RolloutBuffer:
         mask = np.zeros((self.num_envs, self._places), np.bool_)
         rows, steps = np.nonzero(self._wanted[:, :-1])
         places = self._place_of(self._wanted, rows, steps)
-        index[rows, places], mask[rows, places] = steps, True
+        index[rows, places] = steps
+        mask[rows, places] = True
         used = upload(mask, self.device)
-        ended = self._numbers[:, -1, TERMINATED] > 0 if self.final_frames == "truncated" else self.done[:, -1]
+        ended = (
+            self._numbers[:, -1, TERMINATED] > 0
+            if self.final_frames == "truncated"
+            else self.done[:, -1]
+        )
         used[:, -1] = ~ended
-        out["final_pixels"], out["final_mask"] = self._final, used
+        out["final_pixels"] = self._final
+        out["final_mask"] = used
         out["final_index"] = upload(index, self.device)
         return out
 
     def transitions(self, compact: bool) -> TensorDict:
-        """The T new steps as TensorDict [N, T] in TorchRL's layout; without ``("next", "pixels")`` if ``compact``."""
+        """The T new steps as TensorDict [N, T] in TorchRL's layout; without ``("next", "pixels")``
+        if ``compact``.
+        """
         size = [self.num_envs, self.steps]
         out = self._entries(self.overlap, size)
         flags = torch.zeros((4, *size, 1), dtype=torch.bool, device=self.device)
@@ -274,35 +328,65 @@ class RolloutBuffer:
 
     def _buffers(self) -> dict[NestedKey, torch.Tensor]:
         """All buffers with axes [N, L, ...]."""
-        dense = {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
-        fixed = {"pixels": self.pixels, "action": self._action, "outcomes": self._numbers, **self._root, **dense}
-        return {**fixed, **{("extras", *path_of(key)): buffer for key, buffer in self._extras.items()}}
+        dense = (
+            {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
+        )
+        fixed = {
+            "pixels": self.pixels,
+            "action": self._action,
+            "outcomes": self._numbers,
+            **self._root,
+            **dense,
+        }
+        return {
+            **fixed,
+            **{("extras", *path_of(key)): buffer for key, buffer in self._extras.items()},
+        }
 
     def overlap_state(self) -> dict[str, Any]:
         """What the next window needs of this one, as plain tensors: nothing without an overlap."""
         if not self.overlap:
             return {}
-        buffers = {"/".join(path_of(key)): buffer[:, self.steps :].clone() for key, buffer in self._buffers().items()}
-        return {"buffers": buffers, "final": self._final.clone(), "wanted": torch.from_numpy(self._wanted).clone()}
+        buffers = {
+            "/".join(path_of(key)): buffer[:, self.steps :].clone()
+            for key, buffer in self._buffers().items()
+        }
+        return {
+            "buffers": buffers,
+            "final": self._final.clone(),
+            "wanted": torch.from_numpy(self._wanted).clone(),
+        }
 
     def load_overlap_state(self, state: dict[str, Any]) -> None:
-        """Load what ``overlap_state`` gave; raises ValueError if that was a collector with other sizes."""
+        """Load what ``overlap_state`` gave; raises ValueError if that was a collector with other
+        sizes.
+        """
         if not state:
             return
         for name, saved in state["buffers"].items():
             parts = tuple(name.split("/"))
             if parts[0] == "extras" and parts[1:] not in map(path_of, self._extras):
-                self._add_extra(parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype)
+                self._add_extra(
+                    parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype
+                )
         if self.final_frames == "all":
             self._dense = self._new_dense.take()
-        here = {"/".join(path_of(key)): buffer[:, self.steps :] for key, buffer in self._buffers().items()}
-        here, there = {**here, "final": self._final}, {**state["buffers"], "final": state["final"]}
+        here = {
+            "/".join(path_of(key)): buffer[:, self.steps :]
+            for key, buffer in self._buffers().items()
+        }
+        here = {**here, "final": self._final}
+        there = {**state["buffers"], "final": state["final"]}
         for name in here | there:
             shapes = [tuple(each[name].shape) if name in each else None for each in (there, here)]
             if shapes[0] != shapes[1]:
-                raise ValueError(f"saved overlap {name!r} is {shapes[0]}, this collector's {shapes[1]}")
+                raise ValueError(
+                    f"saved overlap {name!r} is {shapes[0]}, this collector's {shapes[1]}"
+                )
             here[name].copy_(there[name])
         wanted = state["wanted"].cpu().numpy().copy()
         if (wanted.dtype, wanted.shape) != (self._wanted.dtype, self._wanted.shape):
-            raise ValueError(f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}")
+            raise ValueError(
+                f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}"
+            )
         self._wanted = wanted

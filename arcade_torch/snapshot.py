@@ -1,7 +1,8 @@
-"""Snapshots: everything a batch of episodes is, as a TensorDict that can be stored, cloned, indexed and loaded.
+"""Snapshots: everything a batch of episodes is, as a TensorDict that can be stored, cloned, indexed
+and loaded.
 
-Leaves are private copies, never views of live JAX memory. Random keys (uint32) travel as int32 of the same bits, since
-tensordict has no arithmetic for unsigned integers.
+Leaves are private copies, never views of live JAX memory. Random keys (uint32) travel as int32 of
+the same bits, since tensordict has no arithmetic for unsigned integers.
 """
 
 import zlib
@@ -19,7 +20,8 @@ from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched
 from arcade_torch.validation import check_tensor
 
-_ENDS = ("terminated", "truncated")  # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
+# flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
+_ENDS = ("terminated", "truncated")
 _SIGNED = {np.dtype(np.uint32): torch.int32, np.dtype(np.uint16): torch.int16}
 
 
@@ -38,24 +40,39 @@ def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
     for depth, name in enumerate(path):
         value = value.get(name, None) if isinstance(value, TensorDictBase) else None
         if value is None:
-            raise ValueError(f"the state has no entry {'.'.join(path[: depth + 1])!r}: pass what get_state() gave")
+            raise ValueError(
+                f"the state has no entry {'.'.join(path[: depth + 1])!r}: pass what get_state() "
+                "gave"
+            )
     check_tensor(value, f"state entry {'.'.join(path)!r}")
     leaf: torch.Tensor = value
     return leaf
 
 
 class Snapshots:
-    """Turns batches of one game, or of a mixture of games, into TensorDicts and back; ``batch`` is any one of them."""
+    """Turns batches of one game, or of a mixture of games, into TensorDicts and back; ``batch`` is
+    any one of them.
+    """
 
-    def __init__(self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device) -> None:
-        leaves, self._tree = jax.tree_util.tree_flatten_with_path(jax.eval_shape(batched.wide, batch))
-        self._keys = [tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/")) for path, _ in leaves]
+    def __init__(
+        self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device
+    ) -> None:
+        leaves, self._tree = jax.tree_util.tree_flatten_with_path(
+            jax.eval_shape(batched.wide, batch)
+        )
+        self._keys = [
+            tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/"))
+            for path, _ in leaves
+        ]
         self._dtypes = [np.dtype(leaf.dtype) for _, leaf in leaves]
         self._shapes = [torch.Size(leaf.shape) for _, leaf in leaves]
         self._num_envs = int(batch.step_count.shape[0])
-        self._batched, self._game_id = batched, batched.game.id
+        self._batched = batched
+        self._game_id = batched.game.id
         numbers = [fingerprint(group.game.id) for group in batched.groups]
-        self._games = torch.tensor(numbers, device="cpu")[torch.from_numpy(batched.task(self._num_envs))]
+        self._games = torch.tensor(numbers, device="cpu")[
+            torch.from_numpy(batched.task(self._num_envs))
+        ]
         self._device = device
         self._jax_device = jax_device
 
@@ -63,10 +80,10 @@ class Snapshots:
         """Copy a batch out of JAX.
 
         Returns:
-            TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own; in a mixture under the id of
-            each game, and zero in the envs that play another), ``partial`` bool [N], ``last_action`` and
-            ``step_count`` int32 [N], ``episode_reward`` float32 [N], ``terminated`` and ``truncated`` bool [N],
-            ``game`` int64 [N].
+            TensorDict [N] with ``key`` int32 [N, 2], ``state`` (nested, the game's own; in a
+            mixture under the id of each game, and zero in the envs that play another), ``partial``
+            bool [N], ``last_action`` and ``step_count`` int32 [N], ``episode_reward`` float32 [N],
+            ``terminated`` and ``truncated`` bool [N], ``game`` int64 [N].
         """
         game = self._games.to(self._device, copy=True)
         out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
@@ -77,10 +94,12 @@ class Snapshots:
         return out
 
     def load(self, td: TensorDictBase) -> Batch:
-        """Copy into JAX what ``export`` gave, here or for another env of the same game and number of envs.
+        """Copy into JAX what ``export`` gave, here or for another env of the same game and number
+        of envs.
 
         Raises:
-            ValueError: Another game, another number of envs, or leaves that are missing, or of another shape or type.
+            ValueError: Another game, another number of envs, or leaves that are missing, or of
+                another shape or type.
             TypeError: Not a TensorDict, or a leaf that is no tensor.
         """
         self._check_game(td)
@@ -89,12 +108,15 @@ class Snapshots:
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
             name = ".".join(key)
             is_older = key[-1] in _ENDS and td.get(key, None) is None
-            tensor = torch.zeros(shape, dtype=torch.bool, device="cpu") if is_older else _entry(td, key)
+            tensor = (
+                torch.zeros(shape, dtype=torch.bool, device="cpu") if is_older else _entry(td, key)
+            )
             same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
             if tensor.dtype not in same_bits or tensor.shape != shape:
                 found = str(tensor.dtype).removeprefix("torch.")
                 raise ValueError(
-                    f"state entry {name!r} is {found} {tuple(tensor.shape)}, {self._game_id} with {self._num_envs} "
+                    f"state entry {name!r} is {found} {tuple(tensor.shape)}, {self._game_id} with "
+                    f"{self._num_envs} "
                     f"envs expects {dtype} {tuple(shape)}"
                 )
             value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
@@ -106,22 +128,29 @@ class Snapshots:
         if not isinstance(td, TensorDictBase):
             raise TypeError(f"the state is a {type(td).__name__}: pass what get_state() gave")
         if td.batch_size != (self._num_envs,):
-            raise ValueError(f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} envs")
+            raise ValueError(
+                f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} "
+                "envs"
+            )
         game = _entry(td, ("game",))
         if game.dtype is not torch.int64 or game.shape != (self._num_envs,):
             raise ValueError(
-                f"state entry 'game' is {game.dtype} {tuple(game.shape)}, expected torch.int64 ({self._num_envs},)"
+                f"state entry 'game' is {game.dtype} {tuple(game.shape)}, expected torch.int64 "
+                f"({self._num_envs},)"
             )
         differs = (game.cpu() != self._games).nonzero()
         if len(differs):
             env = int(differs[0])
             known = {fingerprint(other): other for other in registered_ids()}
             theirs = known.get(int(game[env]), "another game")
-            raise ValueError(f"the state of env {env} is one of {theirs}, this env plays {self._game_id}")
+            raise ValueError(
+                f"the state of env {env} is one of {theirs}, this env plays {self._game_id}"
+            )
 
     def spec(self) -> Composite:
         """Spec of what ``export`` gives."""
-        num_envs, device = self._num_envs, self._device
+        num_envs = self._num_envs
+        device = self._device
         spec = Composite(shape=(num_envs,), device=device)
         spec["game"] = Unbounded(shape=(num_envs,), dtype=torch.int64, device=device)
         for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):

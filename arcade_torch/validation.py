@@ -1,4 +1,6 @@
-"""What ``ArcadeEnv`` refuses: arguments, tensordicts and entries that it could not use, in one clear line each."""
+"""What ``ArcadeEnv`` refuses: arguments, tensordicts and entries that it could not use, in one
+clear line each.
+"""
 
 import functools
 import warnings
@@ -12,7 +14,9 @@ from arcade_torch.envs_jax.validation import format_value, plain
 
 
 def check_flags(names: str, values: Sequence[Any]) -> None:
-    """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also be None."""
+    """Raise unless the options ``names`` (separated by spaces) are bools; ``task_in_td`` may also
+    be None.
+    """
     for name, value in zip(names.split(), values, strict=True):
         if not isinstance(plain(value), bool) and not (value is None and name == "task_in_td"):
             raise TypeError(f"{name} is {format_value(value)}, allowed: True, False")
@@ -27,14 +31,23 @@ def whole(name: str, value: Any) -> int:
 
 
 def check_tensordict(td: Any, num_envs: int) -> None:
-    """Raise if ``step`` and ``reset`` cannot use a tensordict: its kind, batch size, ``next`` or ``_step``."""
+    """Raise if ``step`` and ``reset`` cannot use a tensordict: its kind, batch size, ``next`` or
+    ``_step``.
+    """
     if not isinstance(td, TensorDictBase):
-        raise TypeError(f"got a {type(td).__name__}, expected a TensorDict of batch size [{num_envs}]")
+        raise TypeError(
+            f"got a {type(td).__name__}, expected a TensorDict of batch size [{num_envs}]"
+        )
     if td.batch_size != (num_envs,):
-        raise ValueError(f"the tensordict has batch_size {list(td.batch_size)}, expected [{num_envs}], one row an env")
+        raise ValueError(
+            f"the tensordict has batch_size {list(td.batch_size)}, expected [{num_envs}], one row "
+            "an env"
+        )
     following = td.get("next", None)
     if following is not None and not isinstance(following, TensorDictBase):
-        raise TypeError(f"entry 'next' is a {type(following).__name__}, expected a TensorDict: leave it out")
+        raise TypeError(
+            f"entry 'next' is a {type(following).__name__}, expected a TensorDict: leave it out"
+        )
     if "_step" in td:
         steps = mask(td, "_step", num_envs)
         if following is None and not bool(steps.any()):
@@ -45,7 +58,10 @@ def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
     """The entry ``key``; raises if there is none, or it is no dense tensor."""
     value = td.get(key, None)
     if value is None:
-        raise ValueError(f"the tensordict has no entry {key!r}; it has {', '.join(map(str, td.keys())) or 'none'}")
+        raise ValueError(
+            f"the tensordict has no entry {key!r}; it has "
+            f"{', '.join(map(str, td.keys())) or 'none'}"
+        )
     check_tensor(value, f"entry {key!r}")
     found: torch.Tensor = value
     return found
@@ -56,40 +72,57 @@ def check_tensor(value: Any, what: str) -> None:
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
     if value.layout is not torch.strided:
-        raise TypeError(f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()")
+        raise TypeError(
+            f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()"
+        )
 
 
 def check_one_hot(action: torch.Tensor) -> None:
-    """Raise ValueError unless every row, rounded (a softmax may miss the 1), holds a single one among zeros."""
+    """Raise ValueError unless every row, rounded (a softmax may miss the 1), holds a single one
+    among zeros.
+    """
     rounded = action.to(torch.float32).round()
     ones = (rounded == 1).sum(-1)
     others = ((rounded != 0) & (rounded != 1)).any(-1)
     wrong = (ones != 1) | others
     if bool(wrong.any()):
         row = int(wrong.nonzero()[0, 0])
-        raise ValueError(f"action of env {row} is {action[row].tolist()}, expected one-hot: a single 1 among zeros")
+        raise ValueError(
+            f"action of env {row} is {action[row].tolist()}, expected one-hot: a single 1 among "
+            "zeros"
+        )
 
 
 def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
-    """Raise if entries of ``td`` cannot stay where they are while other envs are reset or stepped, giving ``root``."""
-    for key, kept in td.items(True, True):  # TorchRL merges all of them, also those that reset does not know
+    """Raise if entries of ``td`` cannot stay where they are while other envs are reset or stepped,
+    giving ``root``.
+    """
+    # TorchRL merges all of them, also those that reset does not know
+    for key, kept in td.items(True, True):
         if isinstance(kept, torch.Tensor):
             check_tensor(kept, f"entry {key!r}")
     for key, fresh in root.items():
         kept = td.get(key, None)
         if kept is not None and (
-            isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor) or kept.shape != fresh.shape
+            isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor)
+            or kept.shape != fresh.shape
         ):
             found = f"{type(kept).__name__} {list(kept.shape)}"
-            raise ValueError(f"entry {key!r} is a {found}, expected shape {list(fresh.shape)} as the env gives it")
+            raise ValueError(
+                f"entry {key!r} is a {found}, expected shape {list(fresh.shape)} as the env gives "
+                "it"
+            )
 
 
 @functools.cache
 def warn_state_is_dropped(*keys: NestedKey) -> None:
-    """Say once that what a policy wrote for the next step does not get there: TorchRL carries what specs name."""
+    """Say once that what a policy wrote for the next step does not get there: TorchRL carries what
+    specs name.
+    """
     names = ", ".join(".".join((key,) if isinstance(key, str) else key) for key in keys)
     warnings.warn(
-        f"the policy wrote {names} for the next step, which does not get there, so a memory forgets: act in "
+        f"the policy wrote {names} for the next step, which does not get there, so a memory "
+        "forgets: act in "
         "TransformedEnv(env, get_primers_from_module(policy)), or with ArcadeCollector",
         stacklevel=2,
     )
@@ -101,5 +134,8 @@ def mask(td: TensorDictBase, key: str, num_envs: int) -> torch.Tensor:
     if value.dtype is not torch.bool:
         raise TypeError(f"entry {key!r} has dtype {value.dtype}, expected torch.bool")
     if value.shape not in ((num_envs,), (num_envs, 1)):
-        raise ValueError(f"entry {key!r} has shape {tuple(value.shape)}, expected ({num_envs}, 1), one flag an env")
+        raise ValueError(
+            f"entry {key!r} has shape {tuple(value.shape)}, expected ({num_envs}, 1), one flag an "
+            "env"
+        )
     return value.reshape(num_envs)

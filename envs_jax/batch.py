@@ -1,7 +1,7 @@
 """Many episodes at once: per-env keys, auto-reset, and one drawing a step.
 
-Every env carries its own random key, so env ``i`` of a large batch walks the very path it walks alone, and stepping
-then resetting by mask gives the same bits as the fused step.
+Every env carries its own random key, so env ``i`` of a large batch walks the very path it walks
+alone, and stepping then resetting by mask gives the same bits as the fused step.
 """
 
 import abc
@@ -27,11 +27,14 @@ class Batch(NamedTuple):
     key: Array  # uint32 [N, 2], advanced by every step and every reset of its env
     state: Any  # the game's state, leaves [N, ...]
     partial: Array  # bool [N], true where the player sees the POMDP twin
-    last_action: Array  # int32 [N], the action that led here; survives resets, 0 before the first step
+    # int32 [N], the action that led here; survives resets, 0 before the first step
+    last_action: Array
     step_count: Array  # int32 [N], steps since the episode began
     episode_reward: Array  # float32 [N], undiscounted return so far
-    terminated: Array = UNSET  # bool [N], whether the game has ended, where the state does not say it
-    truncated: Array = UNSET  # bool [N], whether the time limit was reached, where the state does not say it
+    # bool [N], whether the game has ended, where the state does not say it
+    terminated: Array = UNSET
+    # bool [N], whether the time limit was reached, where the state does not say it
+    truncated: Array = UNSET
 
 
 class Outcome(NamedTuple):
@@ -50,7 +53,8 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
     Args:
         seed: Seed of the whole batch, 0 <= seed < 2**32.
         num_envs: Number of envs.
-        first: Index of the first env; the key of env ``i`` depends on ``seed`` and ``first + i`` alone.
+        first: Index of the first env; the key of env ``i`` depends on ``seed`` and ``first + i``
+            alone.
 
     Returns:
         uint32 [num_envs, 2].
@@ -65,7 +69,9 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
     """
     seed = plain(seed)
     if not isinstance(seed, int) or isinstance(seed, bool):
-        raise TypeError(f"seed is {format_value(seed)}, expected a whole number from 0 to 4294967295")
+        raise TypeError(
+            f"seed is {format_value(seed)}, expected a whole number from 0 to 4294967295"
+        )
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)
@@ -83,7 +89,9 @@ def choose_rows(mask: Array, yes: Any, no: Any) -> Any:
 
 
 class Steps(abc.ABC):
-    """What a batch of one game and a batch of several do alike, put together from stepping, resetting and drawing."""
+    """What a batch of one game and a batch of several do alike, put together from stepping,
+    resetting and drawing.
+    """
 
     def __init__(self) -> None:
         self.init = compiled(self._init)
@@ -115,9 +123,11 @@ class Steps(abc.ABC):
 
     @abc.abstractmethod
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env. What comes has the flags of an end, whether the batch has them or not.
+        """Take one action in every env. What comes has the flags of an end, whether the batch has
+        them or not.
 
-        An episode that has ended stays as it is: state, counts and both flags, with the reward 0, and its random key.
+        An episode that has ended stays as it is: state, counts and both flags, with the reward 0,
+        and its random key.
         """
 
     @abc.abstractmethod
@@ -132,8 +142,8 @@ class Steps(abc.ABC):
         """Step, begin anew where an episode ended, then draw once.
 
         Returns:
-            The batch to go on with, the batch before the resets (its ended rows are the final states), what the step
-            gave, and the frames of the first.
+            The batch to go on with, the batch before the resets (its ended rows are the final
+            states), what the step gave, and the frames of the first.
         """
         stepped, outcome = self._step(batch, action)
         root = self._reset_where(stepped, outcome.done)
@@ -157,7 +167,8 @@ class BatchedGame(Steps, Generic[State]):
         game: The game to batch.
 
     Raises:
-        ValueError: It is not one of this package and does not keep the contract; see ``check_game``.
+        ValueError: It is not one of this package and does not keep the contract; see
+            ``check_game``.
     """
 
     def __init__(self, game: Game[State]) -> None:
@@ -199,7 +210,9 @@ class BatchedGame(Steps, Generic[State]):
     def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
         """See :meth:`Steps.with_ends`."""
         if keeps_ends(batch.state):
-            return batch._replace(state=batch.state._replace(terminated=terminated, truncated=truncated))
+            return batch._replace(
+                state=batch.state._replace(terminated=terminated, truncated=truncated)
+            )
         return batch._replace(terminated=terminated, truncated=truncated)
 
     def ends(self, batch: Batch) -> tuple[Array, Array]:
@@ -211,7 +224,9 @@ class BatchedGame(Steps, Generic[State]):
         key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros(keys.shape[0], jnp.int32)
-        return with_flags(Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32)))
+        return with_flags(
+            Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
+        )
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
         action = jnp.asarray(action, jnp.int32)
@@ -242,7 +257,9 @@ class BatchedGame(Steps, Generic[State]):
         key, first = _split(batch.key)
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros_like(batch.step_count)
-        fresh = Batch(key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32))
+        fresh = Batch(
+            key, state, batch.partial, batch.last_action, zeros, zeros.astype(jnp.float32)
+        )
         if has_ends(batch):
             return Batch(*choose_rows(mask, with_flags(fresh), with_flags(batch)))
         return Batch(*choose_rows(mask, self.without_ends(fresh), self.without_ends(batch)))
@@ -252,13 +269,17 @@ class BatchedGame(Steps, Generic[State]):
 
 
 def with_flags(batch: Batch) -> Batch:
-    """The batch with the flags of an end where they belong: in the state if that keeps them, else in the batch."""
+    """The batch with the flags of an end, false where it has none.
+
+    They belong in the state if that keeps them, else in the batch.
+    """
     no = jnp.zeros(batch.step_count.shape, bool)
     keeper = _keeper(batch)
     flags = {name: no for name in ENDS if getattr(keeper, name) is UNSET}
-    if keeper is batch:
+    if not keeps_ends(batch.state):
         return batch._replace(**flags)
-    return batch._replace(state=batch.state._replace(**flags), terminated=UNSET, truncated=UNSET)
+    state = batch.state._replace(**flags)
+    return batch._replace(state=state, terminated=UNSET, truncated=UNSET)
 
 
 def has_ends(batch: Batch) -> bool:

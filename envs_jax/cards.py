@@ -10,10 +10,12 @@ HEART, SPADE, CLUB, DIAMOND = range(len(SUIT_NAMES))
 
 
 def deal(key: Array, packs: int, cards: int, suits: int) -> Array:
-    """Shuffle packs that hold the suits as evenly as can be: card i of an unshuffled pack has suit i modulo ``suits``.
+    """Shuffle packs that hold the suits as evenly as can be: card i of an unshuffled pack has suit
+    i modulo ``suits``.
 
-    A card's sort key has 30 random bits above its suit, so one sort of plain integers shuffles and carries the suits
-    along; it is faster than a sort of indices, and for these sizes than ranks by comparison.
+    A card's sort key has 30 random bits above its suit, so one sort of plain integers shuffles and
+    carries the suits along; it is faster than a sort of indices, and for these sizes than ranks by
+    comparison.
 
     Args:
         key: uint32 [2].
@@ -38,6 +40,9 @@ def random_ranks(key: Array, count: int) -> Array:
 
     Ranks of random numbers by comparison, several times faster than a sort of so few.
     """
-    draw, index = jax.random.bits(key, (count,)), jnp.arange(count)
-    lower = (draw[None, :] < draw[:, None]) | ((draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None]))
+    draw = jax.random.bits(key, (count,))
+    index = jnp.arange(count)
+    lower = (draw[None, :] < draw[:, None]) | (
+        (draw[None, :] == draw[:, None]) & (index[None, :] < index[:, None])
+    )
     return lower.sum(1, dtype=jnp.int32)

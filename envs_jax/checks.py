@@ -1,4 +1,6 @@
-"""Whether a game keeps the contract of ``Game``: shapes, types and structure, found out without compiling anything."""
+"""Whether a game keeps the contract of ``Game``: shapes, types and structure, found out without
+compiling anything.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,16 +16,17 @@ _OURS = "arcade_torch.envs_jax."
 def check_game(game: Game[Any]) -> None:
     """Refuse a game whose functions do not fit together, or whose frames nobody could use.
 
-    Traces ``reset``, ``step`` and ``render`` once each, for shapes and types alone; that takes milliseconds. ``make``
-    and ``BatchedGame`` call it for every game that is not one of this package.
+    Traces ``reset``, ``step`` and ``render`` once each, for shapes and types alone; that takes
+    milliseconds. ``make`` and ``BatchedGame`` call it for every game that is not one of this
+    package.
 
     Args:
         game: The game.
 
     Raises:
-        ValueError: A function cannot be traced, gives something of a wrong shape or type, or ``step`` changes the
-            structure of the state; or an attribute is missing or of no use. One line: the game, what arrived, what is
-            wanted.
+        ValueError: A function cannot be traced, gives something of a wrong shape or type, or
+            ``step`` changes the structure of the state; or an attribute is missing or of no use.
+            One line: the game, what arrived, what is wanted.
 
     Example:
         >>> from arcade_torch.envs_jax import make
@@ -35,29 +38,42 @@ def check_game(game: Game[Any]) -> None:
     first = _traced(name, "reset", game.reset, key)
     stepped = _traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
     if not isinstance(stepped, tuple) or len(stepped) != 4:
-        got = f"{len(stepped)} values" if isinstance(stepped, tuple) else f"a {type(stepped).__name__}"
-        raise ValueError(f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated")
+        got = (
+            f"{len(stepped)} values"
+            if isinstance(stepped, tuple)
+            else f"a {type(stepped).__name__}"
+        )
+        raise ValueError(
+            f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated"
+        )
     _check_state(name, first, stepped[0])
     for what, value in zip(("reward", "terminated", "truncated"), stepped[1:], strict=True):
-        _check_array(name, f"step gives {what} as", value, (), "float32" if what == "reward" else "bool")
+        _check_array(
+            name, f"step gives {what} as", value, (), "float32" if what == "reward" else "bool"
+        )
     frame = _traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
     _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
 
 
 def check_made(game: Any, full_id: str, obs_size: int) -> None:
-    """Refuse what a factory made if it is not the game that was asked for, or does not keep the contract."""
+    """Refuse what a factory made if it is not the game that was asked for, or does not keep the
+    contract.
+    """
     if not isinstance(game, Game):
         raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
     if (game.id, game.obs_size) != (full_id, obs_size):
         made = f"{game.id!r} with obs_size {game.obs_size!r}"
         raise ValueError(
-            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: pass on both"
+            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: "
+            "pass on both"
         )
     check_foreign(game)
 
 
 def check_foreign(game: Game[Any]) -> None:
-    """``check_game`` for a game that is not one of this package, whose own are checked by its tests."""
+    """``check_game`` for a game that is not one of this package, whose own are checked by its
+    tests.
+    """
     if not type(game).__module__.startswith(_OURS):
         check_game(game)
 
@@ -66,7 +82,9 @@ def _check_attributes(game: Game[Any]) -> None:
     """Refuse a game that lacks what describes it."""
     name = getattr(game, "id", None)
     if not isinstance(name, str):
-        raise ValueError(f"{type(game).__name__}: id is {name!r}, wanted the versioned id, such as 'MineEasy-v0'")
+        raise ValueError(
+            f"{type(game).__name__}: id is {name!r}, wanted the versioned id, such as 'MineEasy-v0'"
+        )
     for what in ("obs_size", "max_steps"):
         value = getattr(game, what, None)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -75,7 +93,10 @@ def _check_attributes(game: Game[Any]) -> None:
     if not isinstance(limits, tuple) or len(limits) != 2 or not limits[0] <= limits[1]:
         raise ValueError(f"{name}: return_range is {limits!r}, wanted (lowest, highest)")
     if game.num_actions != NUM_ACTIONS:
-        raise ValueError(f"{name}: num_actions is {game.num_actions!r}, wanted {NUM_ACTIONS}, the same in every game")
+        raise ValueError(
+            f"{name}: num_actions is {game.num_actions!r}, wanted {NUM_ACTIONS}, the same in every "
+            "game"
+        )
 
 
 def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
@@ -84,7 +105,11 @@ def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> A
         return jax.eval_shape(function, *args)
     except Exception as error:
         reason = str(error).strip().partition("\n")[0].rstrip(".")
-        hint = "; use jnp.where instead of if" if isinstance(error, jax.errors.TracerBoolConversionError) else ""
+        hint = (
+            "; use jnp.where instead of if"
+            if isinstance(error, jax.errors.TracerBoolConversionError)
+            else ""
+        )
         raise ValueError(
             f"{name}: {what} cannot be traced by JAX, wanted a pure function of arrays{hint} "
             f"({type(error).__name__}: {reason})"
@@ -96,22 +121,33 @@ def _check_array(name: str, what: str, value: Any, shape: tuple[int, ...], dtype
     if not hasattr(value, "shape"):
         raise ValueError(f"{name}: {what} a {type(value).__name__}, wanted {dtype} {list(shape)}")
     if tuple(value.shape) != shape or value.dtype != dtype:
-        raise ValueError(f"{name}: {what} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}")
+        raise ValueError(
+            f"{name}: {what} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}"
+        )
 
 
 def _check_state(name: str, first: Any, following: Any) -> None:
     """Refuse a step whose state has other leaves than that of reset."""
     ours, theirs = (_leaves(state) for state in (first, following))
     if not ours:
-        raise ValueError(f"{name}: reset gives a state without any array, wanted a named tuple of arrays")
+        raise ValueError(
+            f"{name}: reset gives a state without any array, wanted a named tuple of arrays"
+        )
     before: object = jax.tree.structure(first)
     if before != jax.tree.structure(following):
         raise ValueError(
-            f"{name}: step gives a state of another structure, with {', '.join(theirs) or 'nothing'}; wanted that of "
+            f"{name}: step gives a state of another structure, with "
+            f"{', '.join(theirs) or 'nothing'}; wanted that of "
             f"reset, a {type(first).__name__} with {', '.join(ours)}"
         )
     for leaf, wanted in ours.items():
-        _check_array(name, f"step gives state entry {leaf} as", theirs[leaf], tuple(wanted.shape), str(wanted.dtype))
+        _check_array(
+            name,
+            f"step gives state entry {leaf} as",
+            theirs[leaf],
+            tuple(wanted.shape),
+            str(wanted.dtype),
+        )
 
 
 def _leaves(state: Any) -> dict[str, Any]:

@@ -19,14 +19,15 @@ NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 ENDS = ("terminated", "truncated")  # the flags of an end
-UNSET: Any = None  # such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
+# such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
+UNSET: Any = None
 
 
 def keeps_ends(state: Any) -> bool:
     """Whether a state is to say by itself that its episode has ended.
 
-    It is if it is a named tuple with fields ``terminated`` and ``truncated`` that are bools, or None before a wrapped
-    ``reset`` or ``step`` of :class:`Game` has set them.
+    It is if it is a named tuple with fields ``terminated`` and ``truncated`` that are bools, or
+    None before a wrapped ``reset`` or ``step`` of :class:`Game` has set them.
     """
     if not set(ENDS) <= set(getattr(state, "_fields", ())):
         return False
@@ -41,7 +42,9 @@ def _with_flags(state: Any) -> Any:
 
 
 def stay(ended: Array, before: Any, after: Any) -> Any:
-    """The tree ``before`` where ``ended`` (a bool, or bools [N] for leaves [N, ...]) is true, elsewhere ``after``."""
+    """The tree ``before`` where ``ended`` (a bool, or bools [N] for leaves [N, ...]) is true,
+    elsewhere ``after``.
+    """
 
     def choose(old: Any, new: Any) -> Array:
         rest = (1,) * (jnp.ndim(new) - jnp.ndim(ended))
@@ -75,7 +78,9 @@ def _wrap_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
-    """A game's ``step`` under fixed settings, which changes nothing where the state has ended; see :class:`Game`."""
+    """A game's ``step`` under fixed settings, which changes nothing where the state has ended; see
+    :class:`Game`.
+    """
 
     @functools.wraps(step)
     def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
@@ -111,14 +116,16 @@ _WRAPPERS = {"reset": _wrap_reset, "step": _wrap_step, "render": _wrap_render}
 class Game(abc.ABC, Generic[State]):
     """One game at one difficulty, picture size and rule set.
 
-    The three methods are pure, can be compiled and vectorised over envs, and hold no state of their own. MDP and POMDP
-    twins are the same game: only ``render`` is told which of the two the player sees.
+    The three methods are pure, can be compiled and vectorised over envs, and hold no state of their
+    own. MDP and POMDP twins are the same game: only ``render`` is told which of the two the player
+    sees.
 
-    Whatever class is derived from this one, its three methods are wrapped, so that they give the same bits under all
-    settings of JAX (:mod:`arcade_torch.envs_jax.settings`), take keys of both styles, and give states whose leaves
-    share no memory. Where the state is a named tuple with fields ``terminated`` and ``truncated``, ``UNSET`` by
-    default, the wrapper sets them, and a step after an end changes nothing: state, frame and both flags stay, the
-    reward is 0. For states without such fields ``BatchedGame`` does the same.
+    Whatever class is derived from this one, its three methods are wrapped, so that they give the
+    same bits under all settings of JAX (:mod:`arcade_torch.envs_jax.settings`), take keys of both
+    styles, and give states whose leaves share no memory. Where the state is a named tuple with
+    fields ``terminated`` and ``truncated``, ``UNSET`` by default, the wrapper sets them, and a step
+    after an end changes nothing: state, frame and both flags stay, the reward is 0. For states
+    without such fields ``BatchedGame`` does the same.
 
     Attributes:
         id: Versioned identifier, such as ``"CartPoleEasy-v0"``.
@@ -127,8 +134,8 @@ class Game(abc.ABC, Generic[State]):
         max_steps: Time limit in steps; reaching it truncates the episode.
         return_range: Lowest and highest undiscounted return an episode can have.
         num_actions: Always 5: up, down, left, right, fire.
-        oracles: The scripted players there are, ``"state"``, ``"frames"`` or both: called with the game, each gives a
-            player, see :mod:`arcade_torch.envs_jax.oracles`.
+        oracles: The scripted players there are, ``"state"``, ``"frames"`` or both: called with the
+            game, each gives a player, see :mod:`arcade_torch.envs_jax.oracles`.
     """
 
     num_actions: ClassVar[int] = NUM_ACTIONS
@@ -167,8 +174,9 @@ class Game(abc.ABC, Generic[State]):
             action: int32 scalar in 0..4.
 
         Returns:
-            The new state, the reward (float32 scalar), whether the game itself ended (bool scalar), and whether the
-            time limit was reached (bool scalar). Both flags may be true at once. After an end they stay as they were.
+            The new state, the reward (float32 scalar), whether the game itself ended (bool scalar),
+            and whether the time limit was reached (bool scalar). Both flags may be true at once.
+            After an end they stay as they were.
         """
 
     @abc.abstractmethod
@@ -177,7 +185,8 @@ class Game(abc.ABC, Generic[State]):
 
         Args:
             state: The state to draw.
-            partial: bool scalar, may be traced: true draws what the POMDP twin shows, false the MDP twin.
+            partial: bool scalar, may be traced: true draws what the POMDP twin shows, false the MDP
+                twin.
 
         Returns:
             uint8 [S, S, 3], rows downwards, RGB.
@@ -187,7 +196,8 @@ class Game(abc.ABC, Generic[State]):
     def step_autoreset(
         self, key: Array, state: State, action: Array
     ) -> tuple[State, State, tuple[Array, Array, Array]]:
-        """Take one action in one env, and begin a new episode if that ended this one; ``vmap`` it for many envs.
+        """Take one action in one env, and begin a new episode if that ended this one; ``vmap`` it
+        for many envs.
 
         Args:
             key: uint32 [2], a JAX random key for this step alone.
@@ -195,8 +205,9 @@ class Game(abc.ABC, Generic[State]):
             action: int32 scalar in 0..4.
 
         Returns:
-            The state to go on with; the state that the action led to, which differs at an end alone and whose picture
-            is the final observation; and reward, terminated, truncated as ``step`` gives them.
+            The state to go on with; the state that the action led to, which differs at an end alone
+            and whose picture is the final observation; and reward, terminated, truncated as
+            ``step`` gives them.
         """
         now, fresh = jax.random.split(raw_key(key))
         stepped, reward, terminated, truncated = self.step(now, state, action)
@@ -216,7 +227,8 @@ class Screen(Protocol[Drawn]):
 
 
 class LevelGame(Game[State]):
-    """A game of this package; ``levels`` are the numbers of each difficulty by the bare name of its id.
+    """A game of this package; ``levels`` are the numbers of each difficulty by the bare name of its
+    id.
 
     Args:
         level: Numbers of the difficulty.
@@ -229,7 +241,10 @@ class LevelGame(Game[State]):
     screen: Screen[State]
 
     def __init__(self, level: Any, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.level, self.id, self.obs_size, self.rules = level, id, obs_size, rules
+        self.level = level
+        self.id = id
+        self.obs_size = obs_size
+        self.rules = rules
 
     def render(self, state: State, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""

@@ -1,4 +1,5 @@
-"""A game under gymnax's signatures, so that a training script written for gymnax takes it. Needs no gymnax.
+"""A game under gymnax's signatures, so that a training script written for gymnax takes it. Needs no
+gymnax.
 
 Example:
     >>> env, params = make("CartPoleEasy")
@@ -22,7 +23,9 @@ Stepped = tuple[Array, Any, Array, Array, dict[str, Array]]
 
 
 class EnvParams(NamedTuple):
-    """What may differ from call to call: a pytree to trace, and hashable as it stands, so that it may be static too."""
+    """What may differ from call to call: a pytree to trace, and hashable as it stands, so that it
+    may be static too.
+    """
 
     partial: Array | bool  # true shows the POMDP twin; vmap over it to have both twins in one batch
     max_steps_in_episode: int  # for scripts that read it: the game keeps its own time limit
@@ -43,7 +46,8 @@ class EnvParams(NamedTuple):
         limit = changes.get("max_steps_in_episode", self.max_steps_in_episode)
         if limit is not self.max_steps_in_episode and limit != self.max_steps_in_episode:
             raise ValueError(
-                f"max_steps_in_episode is {format_value(limit)}, allowed: {self.max_steps_in_episode}, the game's own "
+                f"max_steps_in_episode is {format_value(limit)}, allowed: "
+                f"{self.max_steps_in_episode}, the game's own "
                 "time limit; end episodes earlier by a wrapper"
             )
         return self._replace(**changes)
@@ -77,7 +81,9 @@ class Box(NamedTuple):
     @fixed
     def sample(self, key: Array) -> Array:
         """One of them, each as likely."""
-        return jax.random.randint(raw_key(key), self.shape, self.low, self.high + 1).astype(self.dtype)
+        return jax.random.randint(raw_key(key), self.shape, self.low, self.high + 1).astype(
+            self.dtype
+        )
 
     def contains(self, x: Any) -> Array:
         """Whether no element of ``x`` is outside: bool []."""
@@ -89,7 +95,8 @@ class GymnaxEnv:
 
     Args:
         game: What ``arcade_torch.envs_jax.make`` gave.
-        observability: Which twin ``default_params`` shows, ``"full"`` (MDP) or ``"partial"`` (POMDP).
+        observability: Which twin ``default_params`` shows, ``"full"`` (MDP) or ``"partial"``
+            (POMDP).
 
     Raises:
         ValueError: Another word.
@@ -97,7 +104,9 @@ class GymnaxEnv:
 
     def __init__(self, game: Game[Any], observability: str = "full") -> None:
         check_choice("observability", observability, ("full", "partial"))
-        self.game, self.name, self.num_actions = game, game.id, game.num_actions
+        self.game = game
+        self.name = game.id
+        self.num_actions = game.num_actions
         self.default_params = EnvParams(observability == "partial", game.max_steps)
 
     def action_space(self, params: EnvParams | None = None) -> Discrete:
@@ -127,8 +136,11 @@ class GymnaxEnv:
         return self.get_obs(state, params), state
 
     @fixed
-    def step(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
-        """Take one action; where that ends the episode, go on with the first observation of a new one.
+    def step(
+        self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None
+    ) -> Stepped:
+        """Take one action; where that ends the episode, go on with the first observation of a new
+        one.
 
         Args:
             key: uint32 [2], a JAX random key for this step alone.
@@ -137,14 +149,17 @@ class GymnaxEnv:
             params: ``default_params`` unless given.
 
         Returns:
-            Observation, state, reward (float32 []), done (bool []), and info: ``terminated`` and ``truncated`` (bool
-            []), and ``discount`` (float32 []), 0 where the game itself ended and 1 elsewhere, also at a time limit.
+            Observation, state, reward (float32 []), done (bool []), and info: ``terminated`` and
+            ``truncated`` (bool []), and ``discount`` (float32 []), 0 where the game itself ended
+            and 1 elsewhere, also at a time limit.
         """
         following, _, outcome = self.game.step_autoreset(key, state, jnp.asarray(action, jnp.int32))
         return self._stepped(following, outcome, params)
 
     @fixed
-    def step_env(self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None) -> Stepped:
+    def step_env(
+        self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None
+    ) -> Stepped:
         """``step`` without the new episode: an end shows the final observation."""
         following, *outcome = self.game.step(key, state, jnp.asarray(action, jnp.int32))
         return self._stepped(following, outcome, params)
@@ -161,7 +176,8 @@ def make(id: str, observability: str = "full", **options: Any) -> tuple[GymnaxEn
     Args:
         id: Id of the game, such as ``"CartPoleEasy"``.
         observability: ``"full"`` (MDP) or ``"partial"`` (POMDP).
-        **options: ``obs_size``, ``rules``, and options of the game; see ``arcade_torch.envs_jax.make``.
+        **options: ``obs_size``, ``rules``, and options of the game; see
+            ``arcade_torch.envs_jax.make``.
 
     Raises:
         ValueError: Unknown id, observability, size, rules or option value.

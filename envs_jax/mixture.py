@@ -1,7 +1,9 @@
-"""Several games in one batch: every env plays one of them, and all are stepped by one compiled call.
+"""Several games in one batch: every env plays one of them, and all are stepped by one compiled
+call.
 
-The envs of a game stand side by side, so that a step is one vectorised step a game and no game is computed for the envs
-of another. Frames, rewards and counts of all come out as if there were one game.
+The envs of a game stand side by side, so that a step is one vectorised step a game and no game is
+computed for the envs of another. Frames, rewards and counts of all come out as if there were one
+game.
 """
 
 from collections.abc import Sequence
@@ -71,19 +73,20 @@ class Mixture:
 class MixedGames(Steps):
     """Compiled functions over a batch in which every env plays one of several games.
 
-    Has the methods of ``BatchedGame`` with the same meaning, so that the bridge takes either. In the ``Batch`` only
-    ``state`` differs: a dictionary from versioned id to the states of the envs that play it, leaves [n, ...].
+    Has the methods of ``BatchedGame`` with the same meaning, so that the bridge takes either. In
+    the ``Batch`` only ``state`` differs: a dictionary from versioned id to the states of the envs
+    that play it, leaves [n, ...].
 
-    Env ``i`` plays the same game at every step and in every episode, and with the same key it walks the very path that
-    it walks in a batch of that game alone.
+    Env ``i`` plays the same game at every step and in every episode, and with the same key it walks
+    the very path that it walks in a batch of that game alone.
 
     Args:
         games: Different games with one picture size; the order is that of the task numbers.
         weights: How many shares of the envs each game gets; one each by default.
 
     Raises:
-        ValueError: No game, a game given twice, pictures of several sizes, or weights that are not positive whole
-            numbers, one a game.
+        ValueError: No game, a game given twice, pictures of several sizes, or weights that are not
+            positive whole numbers, one a game.
 
     Example:
         >>> from arcade_torch.envs_jax import make
@@ -102,7 +105,8 @@ class MixedGames(Steps):
         self.narrow = compiled(self._narrow)
 
     def rows(self, num_envs: int) -> tuple[slice, ...]:
-        """The envs of each game: contiguous, as the weights say, what is left over going to the earlier games.
+        """The envs of each game: contiguous, as the weights say, what is left over going to the
+        earlier games.
 
         Args:
             num_envs: Envs in the batch.
@@ -119,14 +123,17 @@ class MixedGames(Steps):
         for game, part in zip(self.game.games, rows, strict=True):
             if part.start == part.stop:
                 raise ValueError(
-                    f"num_envs is {num_envs}, too few for {self.game.id}: {game.id} would get no env, "
+                    f"num_envs is {num_envs}, too few for {self.game.id}: {game.id} would get no "
+                    "env, "
                     f"{total} are enough"
                 )
         return rows
 
     def task(self, num_envs: int) -> npt.NDArray[np.int64]:
         """The index of the game that each env plays, int64 [num_envs]."""
-        return np.repeat(np.arange(len(self.groups)), [part.stop - part.start for part in self.rows(num_envs)])
+        return np.repeat(
+            np.arange(len(self.groups)), [part.stop - part.start for part in self.rows(num_envs)]
+        )
 
     def states(self, state: Any) -> tuple[Any, ...]:
         """The states of each game's own envs, in the order of the games."""
@@ -135,7 +142,10 @@ class MixedGames(Steps):
     def without_ends(self, batch: Batch) -> Batch:
         """See :meth:`Steps.without_ends`."""
         return self._join(
-            [group.without_ends(part) for group, part in zip(self.groups, self._parts(batch), strict=True)]
+            [
+                group.without_ends(part)
+                for group, part in zip(self.groups, self._parts(batch), strict=True)
+            ]
         )
 
     def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
@@ -153,23 +163,33 @@ class MixedGames(Steps):
     def _init(self, keys: Array, partial: Array) -> Batch:
         keys = raw_key(keys, ndim=2)
         pairs = zip(self.groups, self.rows(len(keys)), strict=True)
-        return self._join([group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs])
+        return self._join(
+            [group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs]
+        )
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
         parts = self._split(batch, action)
         stepped = [group.step(*part) for group, part in zip(self.groups, parts, strict=True)]
-        return self._join([one for one, _ in stepped]), _concatenate([outcome for _, outcome in stepped])
+        return self._join([one for one, _ in stepped]), _concatenate(
+            [outcome for _, outcome in stepped]
+        )
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
         parts = self._split(batch, jnp.asarray(mask))
-        return self._join([group.reset_where(*part) for group, part in zip(self.groups, parts, strict=True)])
+        return self._join(
+            [group.reset_where(*part) for group, part in zip(self.groups, parts, strict=True)]
+        )
 
     def _render(self, batch: Batch) -> Array:
         parts = self._split(batch, batch.partial)
-        return jnp.concatenate([group.render(part) for group, (part, _) in zip(self.groups, parts, strict=True)])
+        return jnp.concatenate(
+            [group.render(part) for group, (part, _) in zip(self.groups, parts, strict=True)]
+        )
 
     def _wide(self, batch: Batch) -> Batch:
-        """The batch with all leaves [N, ...]: states of a game are zero in the envs that play another."""
+        """The batch with all leaves [N, ...]: states of a game are zero in the envs that play
+        another.
+        """
         size = len(batch.step_count)
         state = {}
         for game, rows in zip(self.game.games, self.rows(size), strict=True):
@@ -183,7 +203,9 @@ class MixedGames(Steps):
     def _narrow(self, batch: Batch) -> Batch:
         """The inverse of ``wide``."""
         pairs = zip(self.game.games, self.rows(len(batch.step_count)), strict=True)
-        return batch._replace(state={game.id: _rows_of(batch.state[game.id], rows) for game, rows in pairs})
+        return batch._replace(
+            state={game.id: _rows_of(batch.state[game.id], rows) for game, rows in pairs}
+        )
 
     def _split(self, batch: Batch, other: Array) -> list[tuple[Batch, Array]]:
         """The batch of each game, with its part of another array [N]."""
@@ -199,7 +221,9 @@ class MixedGames(Steps):
     def _join(self, batches: Sequence[Batch]) -> Batch:
         """The batch of all games from that of each."""
         shared: Batch = _concatenate(_without_states(batches))
-        states = {game.id: batch.state for game, batch in zip(self.game.games, batches, strict=True)}
+        states = {
+            game.id: batch.state for game, batch in zip(self.game.games, batches, strict=True)
+        }
         return shared._replace(state=states)
 
 
@@ -207,7 +231,9 @@ Batched = BatchedGame[Any] | MixedGames
 
 
 def _without_states(batches: Sequence[Batch]) -> list[Batch]:
-    """Batches without their states, all with flags of an end or none of them: one a game needs them, no other reads."""
+    """Batches without their states, all with flags of an end or none of them: one a game needs
+    them, no other reads.
+    """
     if all(batch.terminated is UNSET for batch in batches):
         return [batch._replace(state=None) for batch in batches]
     return [with_flags(batch._replace(state=None)) for batch in batches]
@@ -237,5 +263,9 @@ def _check(games: Sequence[Game[Any]], weights: tuple[int, ...]) -> None:
             f"games of one batch need one picture size, these have obs_size "
             f"{', '.join(f'{game.obs_size} ({game.id})' for game in games)}"
         )
-    if len(weights) != len(games) or any(isinstance(w, bool) or not isinstance(w, int) or w < 1 for w in weights):
-        raise ValueError(f"weights are {weights!r}, expected {len(games)} whole numbers of 1 or more, one a game")
+    if len(weights) != len(games) or any(
+        isinstance(w, bool) or not isinstance(w, int) or w < 1 for w in weights
+    ):
+        raise ValueError(
+            f"weights are {weights!r}, expected {len(games)} whole numbers of 1 or more, one a game"
+        )

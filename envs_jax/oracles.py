@@ -1,7 +1,8 @@
 """Scripted players: upper baselines for reports, and proofs that the tasks can be solved.
 
-A *state* oracle sees the game's state; it pins the return that is reachable. A *frames* oracle sees only what the
-POMDP's frames have shown so far, and remembers it; it shows how much of that return memory can recover.
+A *state* oracle sees the game's state; it pins the return that is reachable. A *frames* oracle sees
+only what the POMDP's frames have shown so far, and remembers it; it shows how much of that return
+memory can recover.
 """
 
 import math
@@ -24,8 +25,9 @@ Actions = npt.NDArray[np.int32]
 class Player(Protocol):
     """Somebody who plays N episodes at once.
 
-    ``act`` gets what the player may see (for a state oracle the game's state with numpy leaves [N, ...], for a frames
-    oracle uint8 [N, S, S, 3]) and bool [N], true where this is the first sight of an episode; it returns int32 [N].
+    ``act`` gets what the player may see (for a state oracle the game's state with numpy leaves [N,
+    ...], for a frames oracle uint8 [N, S, S, 3]) and bool [N], true where this is the first sight
+    of an episode; it returns int32 [N].
     """
 
     def act(self, seen: Any, is_init: npt.NDArray[np.bool_]) -> Actions:
@@ -62,7 +64,9 @@ def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
     """
     check_choice("kind", kind, ("state", "frames"))
     if kind not in game.oracles:
-        raise ValueError(f"{game.id} has no {kind} oracle: name one in {type(game).__name__}.oracles")
+        raise ValueError(
+            f"{game.id} has no {kind} oracle: name one in {type(game).__name__}.oracles"
+        )
     player: Player = game.oracles[kind](game)
     return player
 
@@ -85,8 +89,10 @@ def play(
         episodes: How many envs, one episode each.
         seed: Seed of the envs.
         frames: Show the player the frames of the POMDP twin; otherwise the states.
-        block: Envs played at once; bounds the memory, and does not change any result of a player that is deterministic.
-        seconds: No block is begun when this time has passed; the first one is always played, and all to the end.
+        block: Envs played at once; bounds the memory, and does not change any result of a player
+            that is deterministic.
+        seconds: No block is begun when this time has passed; the first one is always played, and
+            all to the end.
 
     Returns:
         Returns and lengths.
@@ -97,7 +103,8 @@ def play(
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}, expected at least 1")
     block = min(block, episodes)
-    batched, started = BatchedGame(game), time.monotonic()
+    batched = BatchedGame(game)
+    started = time.monotonic()
     parts: list[Episodes] = []
     for first in range(0, episodes, block):
         if parts and time.monotonic() - started > seconds:
@@ -106,14 +113,20 @@ def play(
     return Episodes(*(np.concatenate(field)[:episodes] for field in zip(*parts, strict=True)))
 
 
-def _play_block(batched: BatchedGame[Any], player: Player, keys: jax.Array, frames: bool) -> Episodes:
+def _play_block(
+    batched: BatchedGame[Any], player: Player, keys: jax.Array, frames: bool
+) -> Episodes:
     """One episode in each env; envs that are finished idle at their end."""
     size = len(keys)
     batch: Batch = batched.init(keys, jnp.full(size, frames))
-    returns, lengths = np.zeros(size, np.float32), np.zeros(size, np.int32)
-    running, is_init = np.ones(size, bool), np.ones(size, bool)
+    returns = np.zeros(size, np.float32)
+    lengths = np.zeros(size, np.int32)
+    running = np.ones(size, bool)
+    is_init = np.ones(size, bool)
     while running.any():
-        seen = np.asarray(batched.render(batch)) if frames else jax.tree.map(np.asarray, batch.state)
+        seen = (
+            np.asarray(batched.render(batch)) if frames else jax.tree.map(np.asarray, batch.state)
+        )
         batch, outcome = batched.step(batch, player.act(seen, is_init).astype(np.int32))
         returns += np.asarray(outcome.reward) * running
         lengths += running

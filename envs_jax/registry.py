@@ -1,4 +1,6 @@
-"""The one table of games: versioned ids, aliases, and how to make each. Loads no JAX before a game is made."""
+"""The one table of games: versioned ids, aliases, and how to make each. Loads no JAX before a game
+is made.
+"""
 
 import difflib
 import inspect
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
 Factory = Callable[..., "Game[Any]"]
 OBS_SIZES = (128, 256)
 DIFFICULTIES = ("Easy", "Medium", "Hard")
-# A game of this package is one line: where its class is. The class knows its difficulties (``levels``) and oracles.
+# A game of this package is one line: where its class is. The class knows its difficulties
+# (``levels``) and oracles.
 GAMES = {
     "AutoEncode": "autoencode:AutoEncode",
     "BattleShip": "battleship:BattleShip",
@@ -43,16 +46,20 @@ _LISTENERS: list[Callable[[str], object]] = []
 _VERSIONED = re.compile(r"^(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>\d+)$")
 
 
-def register(id: str, factory: Factory | str, aliases: Iterable[str] = (), *, probe: bool = False) -> None:
+def register(
+    id: str, factory: Factory | str, aliases: Iterable[str] = (), *, probe: bool = False
+) -> None:
     """Add a game: ``make``, Gymnasium, the command line and all tools know it from then on.
 
     Args:
-        id: Versioned id, ``"NameDifficulty-vN"``. The bare name comes to mean the highest version registered.
-        factory: Called as ``factory(id=..., obs_size=..., rules=..., **options)``; returns the game, which ``make``
-            checks. Mostly the game's class. Its further keyword arguments are the options that ``make`` accepts.
+        id: Versioned id, ``"NameDifficulty-vN"``. The bare name comes to mean the highest version
+            registered.
+        factory: Called as ``factory(id=..., obs_size=..., rules=..., **options)``; returns the
+            game, which ``make`` checks. Mostly the game's class. Its further keyword arguments are
+            the options that ``make`` accepts.
         aliases: Other bare names for the same game.
-        probe: Whether this is a small task for looking at agents, listed by :func:`probe_ids`, and not one of the
-            benchmark's, listed by :func:`registered_ids` and known to Gymnasium.
+        probe: Whether this is a small task for looking at agents, listed by :func:`probe_ids`, and
+            not one of the benchmark's, listed by :func:`registered_ids` and known to Gymnasium.
 
     Raises:
         ValueError: The id has no version or is taken, or one of the names is another game's.
@@ -61,11 +68,15 @@ def register(id: str, factory: Factory | str, aliases: Iterable[str] = (), *, pr
     if match is None:
         raise ValueError(f"id {id!r} has no version: write it as 'NameDifficulty-v0'")
     if id in _ENTRIES:
-        raise ValueError(f"id {id!r} is registered already: raise its version or choose another name")
+        raise ValueError(
+            f"id {id!r} is registered already: raise its version or choose another name"
+        )
     names = dict.fromkeys((match["name"], *aliases), match["name"])
     for each, name in names.items():
         if (owner := _ALIASES.get(each.partition("-v")[0], name)) != name:
-            raise ValueError(f"the name {each!r} belongs to the game {owner!r} already: choose another")
+            raise ValueError(
+                f"the name {each!r} belongs to the game {owner!r} already: choose another"
+            )
     _ENTRIES[id] = _Entry(factory, probe)
     _ALIASES.update(names)
     for listener in () if probe else _LISTENERS:
@@ -73,7 +84,9 @@ def register(id: str, factory: Factory | str, aliases: Iterable[str] = (), *, pr
 
 
 def on_register(listener: Callable[[str], object]) -> None:
-    """Call a function with every id that ``registered_ids`` gives now, and with each that is registered later."""
+    """Call a function with every id that ``registered_ids`` gives now, and with each that is
+    registered later.
+    """
     _LISTENERS.append(listener)
     for id in registered_ids():
         listener(id)
@@ -117,7 +130,9 @@ def resolve_id(id: str) -> str:
         'NoisyCartPoleEasy-v0'
     """
     if not isinstance(id, str):
-        raise TypeError(f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'")
+        raise TypeError(
+            f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'"
+        )
     match = _VERSIONED.match(id)
     name = match["name"] if match else id
     name = _ALIASES.get(name, name)
@@ -126,19 +141,24 @@ def resolve_id(id: str) -> str:
     if wanted in _ENTRIES:
         return wanted
     if name in newest:
-        raise ValueError(f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}")
+        raise ValueError(
+            f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}"
+        )
     known = {known.lower(): known for known in _ALIASES}
     near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
     hint = f"did you mean {known[near[0]]!r}? " if near else ""
     raise ValueError(
-        f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or 'arcade-torch list'; a "
+        f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or "
+        "'arcade-torch list'; a "
         "game of your own has to be registered first, on the command line with --import"
     )
 
 
 def _newest() -> dict[str, str]:
     """The newest id of each bare name."""
-    versions = sorted((int(version), name) for name, version in (id.rsplit("-v", 1) for id in _ENTRIES))
+    versions = sorted(
+        (int(version), name) for name, version in (id.rsplit("-v", 1) for id in _ENTRIES)
+    )
     return {name: f"{name}-v{version}" for version, name in versions}
 
 
@@ -146,19 +166,19 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     """Make a game.
 
     Args:
-        id: A registered id (``"CartPoleEasy-v0"``), its bare name (``"CartPoleEasy"``, the newest version), or an
-            alias.
+        id: A registered id (``"CartPoleEasy-v0"``), its bare name (``"CartPoleEasy"``, the newest
+            version), or an alias.
         obs_size: Side of the picture in pixels, 128 or 256.
-        rules: ``"default"`` for the corrected rules, ``"reference"`` for those of the published numbers (late endings
-            included).
+        rules: ``"default"`` for the corrected rules, ``"reference"`` for those of the published
+            numbers (late endings included).
         **options: Options of this game; an unknown one is refused with the list of those it has.
 
     Returns:
         The game.
 
     Raises:
-        ValueError: Unknown id, size, rules or option value; or a game of one's own that does not keep the contract,
-            see ``check_game``.
+        ValueError: Unknown id, size, rules or option value; or a game of one's own that does not
+            keep the contract, see ``check_game``.
         TypeError: Unknown option.
 
     Example:
@@ -175,7 +195,10 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
     if unknown:
         has = f"its options are {', '.join(allowed)}" if allowed else "it has none of its own"
         # TorchRL's GymEnv passes a frameskip, and does without it where it reads these words.
-        raise TypeError(f"{full_id} has no option {unknown[0]!r}: {has} (unexpected keyword argument {unknown[0]!r})")
+        raise TypeError(
+            f"{full_id} has no option {unknown[0]!r}: {has} (unexpected keyword argument "
+            f"{unknown[0]!r})"
+        )
     from arcade_torch.envs_jax.checks import check_made
 
     game = _factory(full_id)(id=full_id, obs_size=obs_size, rules=rules, **options)

@@ -1,14 +1,16 @@
-"""The settings of JAX that games compute under, whatever the shell, the process or the caller has set.
+"""The settings of JAX that games compute under, whatever the shell, the process or the caller has
+set.
 
-Some settings of JAX change which numbers a function gives: x64, the kind of random key, how threefry counts, and more.
-JAX reads them while it traces. :func:`fixed` therefore enters one context around a function, in which every such
-setting has the value that the games are made for, and leaves it when the function returns. Under a ``jit`` that happens
-while the function is traced, and compiled steps pay nothing.
+Some settings of JAX change which numbers a function gives: x64, the kind of random key, how
+threefry counts, and more. JAX reads them while it traces. :func:`fixed` therefore enters one
+context around a function, in which every such setting has the value that the games are made for,
+and leaves it when the function returns. Under a ``jit`` that happens while the function is traced,
+and compiled steps pay nothing.
 
-``Game`` puts it around ``reset``, ``step`` and ``render`` of every class that is derived from it, so that it holds
-under any ``jit``, ``vmap`` or ``scan`` of the caller, and for a game of one's own. The functions of a batch, and those
-that make random keys, have it too. :func:`compiled` also compiles where ``JAX_DISABLE_JIT`` says otherwise, since the
-last bits of floats depend on that.
+``Game`` puts it around ``reset``, ``step`` and ``render`` of every class that is derived from it,
+so that it holds under any ``jit``, ``vmap`` or ``scan`` of the caller, and for a game of one's own.
+The functions of a batch, and those that make random keys, have it too. :func:`compiled` also
+compiles where ``JAX_DISABLE_JIT`` says otherwise, since the last bits of floats depend on that.
 """
 
 import functools
@@ -63,7 +65,8 @@ def fixed(function: Function) -> Function:
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """``jax.jit`` of a function under the settings of the games; it compiles whatever ``JAX_DISABLE_JIT`` says.
+    """``jax.jit`` of a function under the settings of the games; it compiles whatever
+    ``JAX_DISABLE_JIT`` says.
 
     Args:
         function: What to compile.

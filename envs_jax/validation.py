@@ -31,7 +31,9 @@ def plain(value: Any) -> Any:
 
 
 def check_penalty(what: str, value: Any) -> None:
-    """Raise TypeError unless the option ``what`` is an int or a float, and ValueError unless it is from -1 to 0."""
+    """Raise TypeError unless the option ``what`` is an int or a float, and ValueError unless it is
+    from -1 to 0.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{what} is {format_value(value)}, expected a number from -1 to 0")
     if not -1 <= value <= 0:
@@ -51,11 +53,15 @@ def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
     kinds = tuple({type(one) for one in allowed})
     if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
-        raise ValueError(f"{what} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}")
+        raise ValueError(
+            f"{what} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}"
+        )
 
 
 MOST_ENVS = 2**20
-"""The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed allocation."""
+"""The largest batch: its frames are 52 GB at 128 pixels. More is a slip, and would end in a failed
+allocation.
+"""
 
 
 def check_num_envs(num_envs: Any) -> int:

@@ -1,13 +1,15 @@
 """A2C with a memory, by hand: TorchRL's ``Collector``, its ``GAE``, and a loss of three lines.
 
-Written out so that every place is seen where a recurrent agent differs from any other: the primer in the environment,
-and recurrent mode around whatever reads a window. The collector stores full frames twice, as root and as next;
-``arcade_torch.ArcadeCollector`` in its place gives the same data without that, several times as fast.
+Written out so that every place is seen where a recurrent agent differs from any other: the primer
+in the environment, and recurrent mode around whatever reads a window. The collector stores full
+frames twice, as root and as next; ``arcade_torch.ArcadeCollector`` in its place gives the same data
+without that, several times as fast.
 
     python examples/a2c_loop.py --memory mingru --frames 100000
 
-prints returns of 0.31 after 10,368 frames (without memory 0.25 is the most that can be expected), 0.48 after 51,328 and
-0.98 after 92,288, and that replay differs from rollout by at most 4.8e-07; 84 s of one CPU core.
+prints returns of 0.31 after 10,368 frames (without memory 0.25 is the most that can be expected),
+0.48 after 51,328 and 0.98 after 92,288, and that replay differs from rollout by at most 4.8e-07; 84
+s of one CPU core.
 """
 
 import argparse
@@ -56,14 +58,22 @@ def main(frames: int = 100_000, memory: str = "mingru") -> Result:
         distribution_class=torch.distributions.Categorical,
         return_log_prob=True,
     )
-    critic = TensorDictSequential(body, TensorDictModule(nn.Linear(WIDTH, 1), ["remembered"], ["state_value"]))
-    parameters = list({id(p): p for module in (policy, critic) for p in module.parameters()}.values())
+    critic = TensorDictSequential(
+        body, TensorDictModule(nn.Linear(WIDTH, 1), ["remembered"], ["state_value"])
+    )
+    parameters = list(
+        {id(p): p for module in (policy, critic) for p in module.parameters()}.values()
+    )
     optimizer = torch.optim.Adam(parameters, lr=1e-3)
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
 
     env = arcade_torch.make("SignpostEasy", num_envs=NUM_ENVS, observability="partial", seed=0)
-    primed = TransformedEnv(env, get_primers_from_module(policy))  # memory is empty where an episode begins
-    collector = Collector(primed, policy, frames_per_batch=NUM_ENVS * NUM_STEPS, total_frames=frames)
+    primed = TransformedEnv(
+        env, get_primers_from_module(policy)
+    )  # memory is empty where an episode begins
+    collector = Collector(
+        primed, policy, frames_per_batch=NUM_ENVS * NUM_STEPS, total_frames=frames
+    )
     worst, returns = 0.0, []
     for window, batch in enumerate(collector):
         with set_recurrent_mode(True):  # the last dimension of the batch is time
@@ -83,14 +93,19 @@ def main(frames: int = 100_000, memory: str = "mingru") -> Result:
 
         returns.append(float(batch["next", "episode_reward"][batch["next", "done"]].mean()))
         if window % 80 == 0:
-            print(f"{(window + 1) * batch.numel():>8,} frames, return {returns[-1]:6.3f}, entropy {entropy.item():.2f}")
+            print(
+                f"{(window + 1) * batch.numel():>8,} frames, return {returns[-1]:6.3f}, entropy "
+                f"{entropy.item():.2f}"
+            )
     collector.shutdown()
     print(f"replay differs from rollout by at most {worst:.1e}")
     return Result(worst, returns)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--memory", default="mingru")
     main(**vars(parser.parse_args()))

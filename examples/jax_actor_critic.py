@@ -1,11 +1,12 @@
-"""An actor-critic in pure JAX, written for environments with gymnax's signatures: the loop is one compiled call.
+"""An actor-critic in pure JAX, written for environments with gymnax's signatures: the loop is one
+compiled call.
 
     python examples/jax_actor_critic.py
 
-Nothing in ``train`` knows these games: it takes any pair ``env, env_params`` as ``gymnax.make`` gives it, vmaps
-``reset`` and ``step`` (which begins new episodes by itself), and reads statistics of a ``LogWrapper``. The network is
-one hidden layer over a thumbnail of the frame; in a few seconds it learns to walk straight to the gate of Signpost,
-from a mean return of -0.6 at random to 0.25.
+Nothing in ``train`` knows these games: it takes any pair ``env, env_params`` as ``gymnax.make``
+gives it, vmaps ``reset`` and ``step`` (which begins new episodes by itself), and reads statistics
+of a ``LogWrapper``. The network is one hidden layer over a thumbnail of the frame; in a few seconds
+it learns to walk straight to the gate of Signpost, from a mean return of -0.6 at random to 0.25.
 """
 
 import math
@@ -48,13 +49,17 @@ class LogWrapper:
         return obs, LogState(env_state, jnp.float32(0), jnp.int32(0), jnp.float32(0), jnp.int32(0))
 
     @partial(jax.jit, static_argnums=(0,))
-    def step(self, key: jax.Array, state: LogState, action: jax.Array, params: Any = None) -> tuple[Any, ...]:
+    def step(
+        self, key: jax.Array, state: LogState, action: jax.Array, params: Any = None
+    ) -> tuple[Any, ...]:
         """Step, and keep the sums."""
         obs, env_state, reward, done, info = self._env.step(key, state.env_state, action, params)
         total, length = state.episode_return + reward, state.episode_length + 1
         last_return = jnp.where(done, total, state.last_return)
         last_length = jnp.where(done, length, state.last_length)
-        state = LogState(env_state, total * (1 - done), length * (1 - done), last_return, last_length)
+        state = LogState(
+            env_state, total * (1 - done), length * (1 - done), last_return, last_length
+        )
         info = {**info, "returned_episode": done, "returned_episode_returns": last_return}
         return obs, state, reward, done, {**info, "returned_episode_lengths": last_length}
 
@@ -92,7 +97,9 @@ def apply(params: dict[str, jax.Array], obs: jax.Array) -> tuple[jax.Array, jax.
 def advantages(batch: Transition, last_value: jax.Array) -> jax.Array:
     """Generalised advantage estimates, [T, N]."""
 
-    def back(carry: tuple[jax.Array, jax.Array], step: Transition) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    def back(
+        carry: tuple[jax.Array, jax.Array], step: Transition
+    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         advantage, following = carry
         goes_on = 1.0 - step.done
         error = step.reward + GAMMA * following * goes_on - step.value
@@ -113,14 +120,18 @@ def loss(params: dict[str, jax.Array], batch: Transition, advantage: jax.Array) 
     return -(chosen * weight).mean() + 0.5 * (error**2).mean() - ENTROPY_COEFF * entropy
 
 
-def adam(step: jax.Array, grad: jax.Array, moments: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
+def adam(
+    step: jax.Array, grad: jax.Array, moments: tuple[jax.Array, jax.Array]
+) -> tuple[Any, jax.Array]:
     """One update of Adam for one array."""
     mean, square = 0.9 * moments[0] + 0.1 * grad, 0.999 * moments[1] + 0.001 * grad**2
     change = (mean / (1 - 0.9**step)) / (jnp.sqrt(square / (1 - 0.999**step)) + 1e-8)
     return (mean, square), -LEARNING_RATE * change
 
 
-def train(env: Any, env_params: Any, key: jax.Array, updates: int = UPDATES) -> dict[str, jax.Array]:
+def train(
+    env: Any, env_params: Any, key: jax.Array, updates: int = UPDATES
+) -> dict[str, jax.Array]:
     """Train from scratch; pure, so ``jax.jit`` takes all of it.
 
     Args:
@@ -134,9 +145,13 @@ def train(env: Any, env_params: Any, key: jax.Array, updates: int = UPDATES) -> 
     """
     env = LogWrapper(env)
     key, to_init, to_reset = jax.random.split(key, 3)
-    obs, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(to_reset, NUM_ENVS), env_params)
+    obs, state = jax.vmap(env.reset, in_axes=(0, None))(
+        jax.random.split(to_reset, NUM_ENVS), env_params
+    )
     params = init(to_init, thumbnail(obs).shape[1], env.action_space(env_params).n)
-    moments = {name: (jnp.zeros_like(array), jnp.zeros_like(array)) for name, array in params.items()}
+    moments = {
+        name: (jnp.zeros_like(array), jnp.zeros_like(array)) for name, array in params.items()
+    }
 
     def act(carry: Any, key: jax.Array) -> tuple[Any, Transition]:
         params, obs, state = carry
@@ -145,13 +160,17 @@ def train(env: Any, env_params: Any, key: jax.Array, updates: int = UPDATES) -> 
         logits, value = apply(params, seen)
         action = jax.random.categorical(to_act, logits)
         keys = jax.random.split(to_step, NUM_ENVS)
-        obs, state, reward, done, info = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, state, action, env_params)
+        obs, state, reward, done, info = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
+            keys, state, action, env_params
+        )
         return (params, obs, state), Transition(seen, action, value, reward, done, info)
 
     def update(carry: Any, step: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         params, moments, obs, state, key = carry
         key, to_act = jax.random.split(key)
-        (_, obs, state), batch = jax.lax.scan(act, (params, obs, state), jax.random.split(to_act, NUM_STEPS))
+        (_, obs, state), batch = jax.lax.scan(
+            act, (params, obs, state), jax.random.split(to_act, NUM_STEPS)
+        )
         grads = jax.grad(loss)(params, batch, advantages(batch, apply(params, thumbnail(obs))[1]))
         changed = {name: adam(step, grads[name], moments[name]) for name in params}
         moments = {name: new for name, (new, _) in changed.items()}
@@ -162,13 +181,20 @@ def train(env: Any, env_params: Any, key: jax.Array, updates: int = UPDATES) -> 
 
 
 def main(updates: int = UPDATES, observability: str = "full", seed: int = 0) -> tuple[float, float]:
-    """Train on Signpost and print the mean return of the first and of the last tenth of the episodes."""
+    """Train on Signpost and print the mean return of the first and of the last tenth of the
+    episodes.
+    """
     env, env_params = gymnax.make("SignpostEasy", observability)
     infos = jax.jit(partial(train, env, env_params, updates=updates))(jax.random.PRNGKey(seed))
-    returns = infos["returned_episode_returns"][infos["returned_episode"]]  # in the order in which they ended
+    returns = infos["returned_episode_returns"][
+        infos["returned_episode"]
+    ]  # in the order in which they ended
     tenth = len(returns) // 10
     first, last = float(returns[:tenth].mean()), float(returns[-tenth:].mean())
-    print(f"{env.name}, {observability}: {len(returns)} episodes, mean return {first:.2f} at first, {last:.2f} at last")
+    print(
+        f"{env.name}, {observability}: {len(returns)} episodes, mean return {first:.2f} at first, "
+        f"{last:.2f} at last"
+    )
     return first, last
 
 

@@ -1,9 +1,11 @@
-"""A thousand steps of many envs in one compiled call: pure JAX, and nothing leaves the device before the end.
+"""A thousand steps of many envs in one compiled call: pure JAX, and nothing leaves the device
+before the end.
 
     python examples/jax_scan.py
 
-Half of the envs show the MDP twin and half the POMDP twin of the same game. Actions are random; every frame is drawn
-and read (its mean goes into the result), so that the compiler cannot leave one out.
+Half of the envs show the MDP twin and half the POMDP twin of the same game. Actions are random;
+every frame is drawn and read (its mean goes into the result), so that the compiler cannot leave one
+out.
 """
 
 import sys

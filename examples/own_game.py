@@ -1,13 +1,15 @@
 """A game of your own in one file: Pairs, the card game, as a pair of MDP and POMDP.
 
-Sixteen cards lie face down on a 4 x 4 board, eight faces twice each. Actions 0 to 3 move the cursor, 4 turns the card
-under it. Two equal cards turned one after the other stay up and pay 1/8; others are turned back by the next action.
-The MDP twin shows the faces of all cards, the POMDP twin those that are up: there the player has to remember.
+Sixteen cards lie face down on a 4 x 4 board, eight faces twice each. Actions 0 to 3 move the
+cursor, 4 turns the card under it. Two equal cards turned one after the other stay up and pay 1/8;
+others are turned back by the next action. The MDP twin shows the faces of all cards, the POMDP twin
+those that are up: there the player has to remember.
 
-Importing this file registers the game, and every tool knows it; run as a script it is ``arcade-torch train`` itself:
+Importing this file registers the game, and every tool knows it; run as a script it is
+``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy --total-frames 1e5
-    python examples/own_game.py --preset small --observability partial
+    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy --total-frames
+    1e5 python examples/own_game.py --preset small --observability partial
 """
 
 import sys
@@ -21,11 +23,27 @@ from arcade_torch.envs_jax import render as draw
 from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import BLACK, GREY, MIST, NAVY, ORANGE, SILVER, WHITE, Colour
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    GREY,
+    MIST,
+    NAVY,
+    ORANGE,
+    SILVER,
+    WHITE,
+    Colour,
+)
 
 SIDE, FACES = 4, 8
-DOWN, KNOWN, UP = 0, 1, 1 + FACES  # tile codes: a card face down, face down and shown by the MDP twin, face up
-LOOKS: list[tuple[Colour, int | None]] = [(NAVY, None), *((c, face) for c in (SILVER, WHITE) for face in range(FACES))]
+DOWN, KNOWN, UP = (
+    0,
+    1,
+    1 + FACES,
+)  # tile codes: a card face down, face down and shown by the MDP twin, face up
+LOOKS: list[tuple[Colour, int | None]] = [
+    (NAVY, None),
+    *((c, face) for c in (SILVER, WHITE) for face in range(FACES)),
+]
 
 
 class PairsState(NamedTuple):
@@ -45,7 +63,11 @@ def card(side: int, colour: Colour, face: int | None, cursor: bool) -> Picture:
     draw.rectangle(picture, 2, 2, side - 2, side - 2, colour)
     scale = (side - 4) // draw.PATTERN
     start = draw.centred(side, draw.PATTERN * scale)
-    return picture if face is None else draw.bitmap(picture, draw.DIGITS[face], start, start, scale, scale, BLACK)
+    return (
+        picture
+        if face is None
+        else draw.bitmap(picture, draw.DIGITS[face], start, start, scale, scale, BLACK)
+    )
 
 
 class Pairs(Game[PairsState]):
@@ -55,8 +77,15 @@ class Pairs(Game[PairsState]):
 
     def __init__(self, *, id: str, obs_size: int, rules: Rules) -> None:
         self.id, self.obs_size, self.rules = id, obs_size, rules
-        layout, background = draw.grid_layout(obs_size, SIDE), draw.titled_background(obs_size, "PAIRS", MIST, NAVY)
-        tiles = [card(layout.tile, colour, face, cursor) for cursor in (False, True) for colour, face in LOOKS]
+        layout, background = (
+            draw.grid_layout(obs_size, SIDE),
+            draw.titled_background(obs_size, "PAIRS", MIST, NAVY),
+        )
+        tiles = [
+            card(layout.tile, colour, face, cursor)
+            for cursor in (False, True)
+            for colour, face in LOOKS
+        ]
         background, self.board = draw.lined_board(background, layout, tiles, GREY)
         self.score = draw.number_slot(obs_size, FACES, MIST, NAVY)
         self.layers = draw.Layers(background, self.score, self.board)
@@ -65,9 +94,13 @@ class Pairs(Game[PairsState]):
         """Shuffle the cards; the cursor begins in the upper left corner."""
         zero, size = jnp.int32(0), SIDE * SIDE
         cards = jax.random.permutation(key, jnp.arange(size, dtype=jnp.int32) % FACES)
-        return PairsState(cards, jnp.zeros(size, bool), jnp.full(2, -1, jnp.int32), zero, zero, zero)
+        return PairsState(
+            cards, jnp.zeros(size, bool), jnp.full(2, -1, jnp.int32), zero, zero, zero
+        )
 
-    def step(self, key: Array, state: PairsState, action: Array) -> tuple[PairsState, Array, Array, Array]:
+    def step(
+        self, key: Array, state: PairsState, action: Array
+    ) -> tuple[PairsState, Array, Array, Array]:
         """Turn back what did not match, then move or turn."""
         first = jnp.where(state.turned[1] >= 0, -1, state.turned[0])
         x, y = move_cursor(state.x, state.y, action, SIDE)
@@ -81,7 +114,9 @@ class Pairs(Game[PairsState]):
         return new, pair / jnp.float32(FACES), found.all(), new.time >= self.max_steps
 
     def render(self, state: PairsState, partial: Array | bool) -> Array:
-        """Faces that are up, or all; a card face down in the MDP twin looks different from one that is up."""
+        """Faces that are up, or all; a card face down in the MDP twin looks different from one that
+        is up.
+        """
         up = state.found | jnp.isin(jnp.arange(SIDE * SIDE), state.turned)
         codes = jnp.where(up, UP + state.cards, jnp.where(partial, DOWN, KNOWN + state.cards))
         cursor = cell_mask(state.x, state.y, SIDE).T  # boards are [x, y], pictures [row, column]

@@ -1,14 +1,15 @@
 """A memory model of your own in one file: ``torch.nn.LSTM``, brought in by two methods and a name.
 
-``forward`` reads a chunk of steps [B, T, D] from a given state and acting is the same call with T = 1; a step whose
-``is_init`` is set opens an episode, so what came before it must be forgotten *before* it is read. ``torch.nn.LSTM``
-knows no such flag. Here the chunk is cut wherever some row of the batch begins, and the rows that do get zeros.
+``forward`` reads a chunk of steps [B, T, D] from a given state and acting is the same call with T =
+1; a step whose ``is_init`` is set opens an episode, so what came before it must be forgotten
+*before* it is read. ``torch.nn.LSTM`` knows no such flag. Here the chunk is cut wherever some row
+of the batch begins, and the rows that do get zeros.
 
-Importing this file registers the model, and every tool knows it; run as a script it first checks the laws that a
-memory has to keep and then is ``arcade-torch train`` itself:
+Importing this file registers the model, and every tool knows it; run as a script it first checks
+the laws that a memory has to keep and then is ``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_memory.py --memory lstm --preset small --total-frames 1e5
-    python examples/own_memory.py --preset small --env SignpostEasy --observability partial
+    arcade-torch train --import examples/own_memory.py --memory lstm --preset small --total-frames
+    1e5 python examples/own_memory.py --preset small --env SignpostEasy --observability partial
 """
 
 import sys

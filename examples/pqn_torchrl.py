@@ -1,10 +1,13 @@
-"""PQN with a memory from stock TorchRL parts: its ``Collector``, our ``MemoryModule`` and ``PQNLoss``, and a loop.
+"""PQN with a memory from stock TorchRL parts: its ``Collector``, our ``MemoryModule`` and
+``PQNLoss``, and a loop.
 
-The sign of SignpostEasy is shown once and asked for four steps later: without memory no more than 0.25 can be expected.
+The sign of SignpostEasy is shown once and asked for four steps later: without memory no more than
+0.25 can be expected.
 
     python examples/pqn_torchrl.py --memory gru
 
-prints returns of 0.36 after 41,472 frames, 0.91 after 61,952, and a greedy return of 1.00; 69 s of one CPU core.
+prints returns of 0.36 after 41,472 frames, 0.91 after 61,952, and a greedy return of 1.00; 69 s of
+one CPU core.
 """
 
 import argparse
@@ -45,19 +48,27 @@ def main(frames: int = 120_000, memory: str = "gru") -> float:
     encoder = SmallEncoder()
     greedy = TensorDictSequential(
         TensorDictModule(encoder, ["pixels"], ["features"]),
-        MemoryModule(make_memory(memory, 128, WIDTH), in_key="features", out_key="remembered", store="step"),
+        MemoryModule(
+            make_memory(memory, 128, WIDTH), in_key="features", out_key="remembered", store="step"
+        ),
         TensorDictModule(nn.Linear(WIDTH, 5), ["remembered"], ["action_value"]),
         QValueModule(action_space="categorical"),
     )
     env = make_env(greedy, seed=0)
-    encoder.calibrate(env.rollout(20, break_when_any_done=False)["pixels"])  # scale frames as random play shows them
-    explore = EGreedyModule(env.action_spec_unbatched, eps_init=1.0, eps_end=0.05, annealing_num_steps=frames // 2)
+    encoder.calibrate(
+        env.rollout(20, break_when_any_done=False)["pixels"]
+    )  # scale frames as random play shows them
+    explore = EGreedyModule(
+        env.action_spec_unbatched, eps_init=1.0, eps_end=0.05, annealing_num_steps=frames // 2
+    )
     policy = TensorDictSequential(*greedy, explore)
 
     loss = PQNLoss(greedy)  # any TensorDict module that writes "action_value" will do
     loss.make_value_estimator(gamma=0.99, lmbda=0.8)
     optimizer = torch.optim.RAdam(loss.parameters(), lr=1e-3)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, total_iters=frames // (NUM_ENVS * NUM_STEPS))
+    schedule = torch.optim.lr_scheduler.LinearLR(
+        optimizer, 1.0, 0.05, total_iters=frames // (NUM_ENVS * NUM_STEPS)
+    )
 
     collector = Collector(env, policy, frames_per_batch=NUM_ENVS * NUM_STEPS, total_frames=frames)
     for window, batch in enumerate(collector):  # [NUM_ENVS, NUM_STEPS]
@@ -73,7 +84,10 @@ def main(frames: int = 120_000, memory: str = "gru") -> float:
         explore.step(batch.numel())
         if window % 40 == 0:
             earned = batch["next", "episode_reward"][batch["next", "done"]].mean()
-            print(f"{(window + 1) * batch.numel():>7,} frames, return {earned:6.3f}, epsilon {explore.eps:.2f}")
+            print(
+                f"{(window + 1) * batch.numel():>7,} frames, return {earned:6.3f}, epsilon "
+                f"{explore.eps:.2f}"
+            )
     collector.shutdown()
 
     with torch.no_grad():
@@ -84,7 +98,9 @@ def main(frames: int = 120_000, memory: str = "gru") -> float:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=120_000)
     parser.add_argument("--memory", default="gru")
     main(**vars(parser.parse_args()))

@@ -1,12 +1,14 @@
 """Can a small encoder read the board at all?
 
-For every Easy game an encoder is taught, from single frames of the MDP, what the scripted player would do and the facts
-of the state (cells, cards, positions). What cannot be learned with labels cannot be learned from rewards.
+For every Easy game an encoder is taught, from single frames of the MDP, what the scripted player
+would do and the facts of the state (cells, cards, positions). What cannot be learned with labels
+cannot be learned from rewards.
 
     python examples/probe_encoders.py --games NavigatorEasy CountRecallEasy --out probe.csv
 
-Writes one line a game, encoder and fact: accuracy on frames of other episodes, that of the most common answer, the
-share of what guessing misses that was learned, and the frames an encoder trains on in a second (batches of 132).
+Writes one line a game, encoder and fact: accuracy on frames of other episodes, that of the most
+common answer, the share of what guessing misses that was learned, and the frames an encoder trains
+on in a second (batches of 132).
 """
 
 import argparse
@@ -24,15 +26,27 @@ from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.batch import BatchedGame, env_keys
 from arcade_torch.envs_jax.oracles import make_oracle
 
-GAMES = ("AutoEncode", "BattleShip", "Breakout", "CartPole", "CountRecall", "MineSweeper", "Navigator")
+GAMES = (
+    "AutoEncode",
+    "BattleShip",
+    "Breakout",
+    "CartPole",
+    "CountRecall",
+    "MineSweeper",
+    "Navigator",
+)
 GAMES = tuple(f"{name}Easy" for name in (*GAMES, "NoisyCartPole", "Skittles", "Tetris"))
 BATCH = 132
 
 
 class Gated(nn.Module):
-    """Two halves of a convolution multiplied, then the maximum of windows (Hadamax, arXiv 2505.15345)."""
+    """Two halves of a convolution multiplied, then the maximum of windows (Hadamax, arXiv
+    2505.15345).
+    """
 
-    def __init__(self, channels: int, out: int, kernel: int, stride: int = 1, pool: int = 1) -> None:
+    def __init__(
+        self, channels: int, out: int, kernel: int, stride: int = 1, pool: int = 1
+    ) -> None:
         super().__init__()
         self.conv, self.pool = nn.Conv2d(channels, 2 * out, kernel, stride), pool
 
@@ -48,7 +62,9 @@ def stack(*layers: nn.Module) -> nn.Sequential:
     parts: list[nn.Module] = []
     for layer in layers:
         parts += [layer, nn.LeakyReLU(inplace=True)] if isinstance(layer, nn.Conv2d) else [layer]
-    return nn.Sequential(*parts, nn.Flatten(), nn.LazyLinear(128), nn.LayerNorm(128), nn.LeakyReLU())
+    return nn.Sequential(
+        *parts, nn.Flatten(), nn.LazyLinear(128), nn.LayerNorm(128), nn.LeakyReLU()
+    )
 
 
 def encoders() -> dict[str, tuple[int, nn.Sequential]]:
@@ -59,8 +75,14 @@ def encoders() -> dict[str, tuple[int, nn.Sequential]]:
         "64": (64, stack(conv(3, 32, 4, 4), conv(32, 32, 3, 2), conv(32, 32, 3))),
         "64 narrow": (64, stack(conv(3, 16, 4, 4), conv(16, 32, 3, 2), conv(32, 32, 3))),
         "64 wide patches": (64, stack(conv(3, 64, 8, 8), conv(64, 32, 3))),
-        "64 overlapping patches": (64, stack(conv(3, 32, 8, 4), conv(32, 32, 3, 2), conv(32, 32, 3))),
-        "64 max pool": (64, stack(conv(3, 32, 4, 4), conv(32, 32, 3), nn.MaxPool2d(2), conv(32, 32, 3))),
+        "64 overlapping patches": (
+            64,
+            stack(conv(3, 32, 8, 4), conv(32, 32, 3, 2), conv(32, 32, 3)),
+        ),
+        "64 max pool": (
+            64,
+            stack(conv(3, 32, 4, 4), conv(32, 32, 3), nn.MaxPool2d(2), conv(32, 32, 3)),
+        ),
         "64 gated": (64, stack(Gated(3, 32, 4, 4, pool=2), Gated(32, 32, 3))),
         "64 average": (
             64,
@@ -70,11 +92,16 @@ def encoders() -> dict[str, tuple[int, nn.Sequential]]:
 
 
 def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
-    """Frames uint8 [T, 64, 64, 3] of 64 games in which half of the moves are random, and numbers [T, cells] by name."""
+    """Frames uint8 [T, 64, 64, 3] of 64 games in which half of the moves are random, and numbers
+    [T, cells] by name.
+    """
     num_envs, rng = 64, np.random.default_rng(seed)
     batched = BatchedGame(make(name))
     oracle = make_oracle(batched.game)
-    batch, is_init = batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool)), np.ones(num_envs, bool)
+    batch, is_init = (
+        batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool)),
+        np.ones(num_envs, bool),
+    )
     pixels, seen = batched.render(batch), []
     answers: dict[str, list[np.ndarray]] = {}
     for t in range(4 * frames // num_envs):
@@ -86,13 +113,17 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
             answers.setdefault("action", []).append(action[:, None])
             for path, leaf in jax.tree_util.tree_leaves_with_path(state):
                 fact, cells = jax.tree_util.keystr(path).strip("."), leaf.reshape(num_envs, -1)
-                if cells.shape[1] <= 128 and not any(word in fact for word in ("time", "key", "step")):
+                if cells.shape[1] <= 128 and not any(
+                    word in fact for word in ("time", "key", "step")
+                ):
                     answers.setdefault(fact, []).append(cells)
         explores = rng.random(num_envs) < 0.5
         action = np.where(explores, rng.integers(0, 5, num_envs), action).astype(np.int32)
         batch, _, outcome, pixels = batched.step_auto(batch, action)
         is_init = np.asarray(outcome.done)
-    return torch.cat(seen), {fact: torch.from_numpy(np.concatenate(rows)) for fact, rows in answers.items()}
+    return torch.cat(seen), {
+        fact: torch.from_numpy(np.concatenate(rows)) for fact, rows in answers.items()
+    }
 
 
 def classes(values: Tensor, like: Tensor) -> Tensor:
@@ -103,11 +134,20 @@ def classes(values: Tensor, like: Tensor) -> Tensor:
     return values.long() - int(like.min())
 
 
-def teach(name: str, side: int, encoder: nn.Sequential, data: list[tuple[Tensor, dict[str, Tensor]]], passes: int):
+def teach(
+    name: str,
+    side: int,
+    encoder: nn.Sequential,
+    data: list[tuple[Tensor, dict[str, Tensor]]],
+    passes: int,
+):
     """Rows of the table, one a fact: train on the first of ``data``, measure on the second."""
     (pixels, facts), (others, other_facts) = data
     if side == 32:
-        pixels, others = (x.view(-1, 32, 2, 32, 2, 3).float().mean((2, 4)).to(torch.uint8) for x in (pixels, others))
+        pixels, others = (
+            x.view(-1, 32, 2, 32, 2, 3).float().mean((2, 4)).to(torch.uint8)
+            for x in (pixels, others)
+        )
     shift = pixels.float().mean(0)
     scale = (pixels[:2000].float() - shift).square().mean().sqrt().clamp_min(1)
 
@@ -115,10 +155,16 @@ def teach(name: str, side: int, encoder: nn.Sequential, data: list[tuple[Tensor,
         return ((frames - shift) / scale).permute(0, 3, 1, 2)
 
     answers = {fact: classes(values, values) for fact, values in facts.items()}
-    answers = {fact: values for fact, values in answers.items() if (values != values[:1]).any() and values.max() < 512}
+    answers = {
+        fact: values
+        for fact, values in answers.items()
+        if (values != values[:1]).any() and values.max() < 512
+    }
     sizes = {fact: int(values.max()) + 1 for fact, values in answers.items()}
     encoder(scaled(pixels[:2]))  # the lazy layer
-    heads = nn.ModuleDict({f.replace(".", "_"): nn.Linear(128, answers[f].shape[1] * n) for f, n in sizes.items()})
+    heads = nn.ModuleDict(
+        {f.replace(".", "_"): nn.Linear(128, answers[f].shape[1] * n) for f, n in sizes.items()}
+    )
     parameters = [*encoder.parameters(), *heads.parameters()]
     steps = passes * (len(pixels) // BATCH)
     optimizer = torch.optim.Adam(parameters, fused=True)
@@ -135,7 +181,8 @@ def teach(name: str, side: int, encoder: nn.Sequential, data: list[tuple[Tensor,
                 features = encoder(scaled(pixels[rows]))
                 gradient = features.detach().requires_grad_()
                 loss = sum(
-                    F.cross_entropy(logits(f, gradient).flatten(0, 1), answers[f][rows].flatten()) for f in sizes
+                    F.cross_entropy(logits(f, gradient).flatten(0, 1), answers[f][rows].flatten())
+                    for f in sizes
                 )
                 optimizer.zero_grad()
                 heads_began = time.perf_counter()
@@ -154,7 +201,14 @@ def teach(name: str, side: int, encoder: nn.Sequential, data: list[tuple[Tensor,
             guess = float((answers[fact].mode(0).values == truth).float().mean())
             learned = (right - guess) / max(1 - guess, 1e-9)
             rows.append(
-                dict(game=name, fact=fact, accuracy=right, guess=guess, learned=learned, frames_per_second=speed)
+                dict(
+                    game=name,
+                    fact=fact,
+                    accuracy=right,
+                    guess=guess,
+                    learned=learned,
+                    frames_per_second=speed,
+                )
             )
     return rows
 
@@ -175,8 +229,15 @@ def main() -> None:
         for name in args.encoders:
             torch.manual_seed(0)
             side, encoder = encoders()[name]
-            found = [{"encoder": name} | row for row in teach(game, side, encoder, data, args.passes)]
-            print(game, name, ", ".join(f"{row['fact']} {row['learned']:.2f}" for row in found), flush=True)
+            found = [
+                {"encoder": name} | row for row in teach(game, side, encoder, data, args.passes)
+            ]
+            print(
+                game,
+                name,
+                ", ".join(f"{row['fact']} {row['learned']:.2f}" for row in found),
+                flush=True,
+            )
             rows += found
             with args.out.open("w", newline="") as file:
                 table = csv.DictWriter(file, rows[0])

@@ -1,13 +1,15 @@
-"""Feed-forward PPO for pixels from TorchRL's parts alone: one line makes our environment instead of theirs.
+"""Feed-forward PPO for pixels from TorchRL's parts alone: one line makes our environment instead of
+theirs.
 
-    env = GymEnv("CartPole-v1", from_pixels=True, pixels_only=True, categorical_action_encoding=True)
-    env = arcade_torch.make("SignpostEasy", num_envs=32)
+    env = GymEnv("CartPole-v1", from_pixels=True, pixels_only=True,
+    categorical_action_encoding=True) env = arcade_torch.make("SignpostEasy", num_envs=32)
 
-Everything else stays: networks (which take their sizes from the first frame), collector, buffer, loss. Frames stay
-uint8 until the network, a quarter of the memory that ``ToTensorImage`` in the environment would take.
+Everything else stays: networks (which take their sizes from the first frame), collector, buffer,
+loss. Frames stay uint8 until the network, a quarter of the memory that ``ToTensorImage`` in the
+environment would take.
 
-    python examples/stock_pixels_ppo.py --frames 20000   # prints returns of -0.58, then 0.99 after 16,000 frames
-    python examples/stock_pixels_ppo.py --theirs --frames 10000
+    python examples/stock_pixels_ppo.py --frames 20000   # prints returns of -0.58, then 0.99 after
+    16,000 frames python examples/stock_pixels_ppo.py --theirs --frames 10000
 """
 
 import argparse
@@ -29,9 +31,13 @@ WINDOW, MINIBATCH, EPOCHS = 640, 160, 3
 
 
 def make_env(theirs: bool) -> EnvBase:
-    """Either environment; ``reward``, ``done`` and ``pixels`` uint8 [..., height, width, 3] are the same in both."""
+    """Either environment; ``reward``, ``done`` and ``pixels`` uint8 [..., height, width, 3] are the
+    same in both.
+    """
     if theirs:
-        return GymEnv("CartPole-v1", from_pixels=True, pixels_only=True, categorical_action_encoding=True)
+        return GymEnv(
+            "CartPole-v1", from_pixels=True, pixels_only=True, categorical_action_encoding=True
+        )
     return arcade_torch.make("SignpostEasy", num_envs=32, seed=0)
 
 
@@ -86,11 +92,15 @@ def main(frames: int = 20_000, theirs: bool = False) -> list[float]:
     returns: list[float] = []
     for window, batch in enumerate(collector):
         for _ in range(EPOCHS):
-            buffer.extend(advantage(batch.exclude("state_value", ("next", "state_value"))).reshape(-1))
+            buffer.extend(
+                advantage(batch.exclude("state_value", ("next", "state_value"))).reshape(-1)
+            )
             for minibatch in buffer:
                 losses = loss(minibatch)
                 optimizer.zero_grad()
-                sum(losses[name] for name in ("loss_objective", "loss_critic", "loss_entropy")).backward()
+                sum(
+                    losses[name] for name in ("loss_objective", "loss_critic", "loss_entropy")
+                ).backward()
                 nn.utils.clip_grad_norm_(loss.parameters(), 0.5)
                 optimizer.step()
         returns.append(float(batch["next", "episode_reward"][batch["next", "done"]].mean()))
@@ -102,7 +112,9 @@ def main(frames: int = 20_000, theirs: bool = False) -> list[float]:
 
 if __name__ == "__main__":
     warnings.filterwarnings("ignore", module="torchrl")
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--theirs", action="store_true")
     main(**vars(parser.parse_args()))

@@ -1,18 +1,22 @@
-"""TorchRL's own ``PPOTrainer`` with a memory: five ways to train on garbage in silence, and how each is closed.
+"""TorchRL's own ``PPOTrainer`` with a memory: five ways to train on garbage in silence, and how
+each is closed.
 
-1. Steps shuffled one by one: memory and experience no longer belong together. Sample slices of episodes.
+1. Steps shuffled one by one: memory and experience no longer belong together. Sample slices of
+   episodes.
 2. A ``ReplayBuffer`` does not mark where a slice begins; a ``TensorDictReplayBuffer`` does.
-3. ``GAE`` does not switch to recurrent mode by itself, losses do; and it must not find values of the last epoch.
-4. Recurrent states need a primer: ``MemoryModule`` has one, ``ArcadeCollector`` finds it (with TorchRL's own collector:
-   ``TransformedEnv(env, get_primers_from_module(policy))``).
+3. ``GAE`` does not switch to recurrent mode by itself, losses do; and it must not find values of
+   the last epoch.
+4. Recurrent states need a primer: ``MemoryModule`` has one, ``ArcadeCollector`` finds it (with
+   TorchRL's own collector: ``TransformedEnv(env, get_primers_from_module(policy))``).
 5. ``is_init`` says where episodes begin: our environments show it, others need ``InitTracker()``.
 
-Whether all are closed is one number: before the first update the replayed log-probabilities are those of the rollout.
+Whether all are closed is one number: before the first update the replayed log-probabilities are
+those of the rollout.
 
     python examples/torchrl_ppo_trainer.py --memory mingru --frames 60000
 
-prints a difference of 0.0e+00 and returns of 0.83 after 21,760 frames (without memory 0.25 is the most that can be
-expected), 0.98 after 32,000 and 0.99 after 52,480; 83 s of one CPU core.
+prints a difference of 0.0e+00 and returns of 0.83 after 21,760 frames (without memory 0.25 is the
+most that can be expected), 0.98 after 32,000 and 0.99 after 52,480; 83 s of one CPU core.
 """
 
 import argparse
@@ -24,7 +28,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.data import LazyTensorStorage, SliceSamplerWithoutReplacement, TensorDictReplayBuffer
-from torchrl.modules import ActorValueOperator, ProbabilisticActor, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    ActorValueOperator,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from torchrl.trainers.algorithms import PPOTrainer
@@ -57,7 +66,9 @@ def make_agent(memory: str, encoder: SmallEncoder) -> ActorValueOperator:
         distribution_class=torch.distributions.Categorical,
         return_log_prob=True,
     )
-    return ActorValueOperator(common, policy, ValueOperator(nn.Linear(WIDTH, 1), in_keys=["remembered"]))
+    return ActorValueOperator(
+        common, policy, ValueOperator(nn.Linear(WIDTH, 1), in_keys=["remembered"])
+    )
 
 
 def make_trainer(memory: str, frames: int) -> PPOTrainer:
@@ -76,7 +87,9 @@ def make_trainer(memory: str, frames: int) -> PPOTrainer:
         with set_recurrent_mode(True):
             return gae(batch.exclude(*OLD_VALUES))
 
-    sampler = SliceSamplerWithoutReplacement(slice_len=SLICE, traj_key=("collector", "traj_ids"), strict_length=False)
+    sampler = SliceSamplerWithoutReplacement(
+        slice_len=SLICE, traj_key=("collector", "traj_ids"), strict_length=False
+    )
     storage = LazyTensorStorage(NUM_ENVS * NUM_STEPS)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     windows = -(-frames // (NUM_ENVS * NUM_STEPS))
@@ -91,14 +104,18 @@ def make_trainer(memory: str, frames: int) -> PPOTrainer:
         lr_scheduler=torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, total_iters=windows),
         clip_norm=0.5,
         gae=advantages,
-        replay_buffer=TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=MINIBATCH),
+        replay_buffer=TensorDictReplayBuffer(
+            storage=storage, sampler=sampler, batch_size=MINIBATCH
+        ),
         progress_bar=False,
         seed=0,
     )
 
 
 def largest_log_ratio(policy: TensorDictSequential, batch: TensorDictBase) -> float:
-    """Run the policy again over what it did: the largest difference in log-probability, 0 up to rounding."""
+    """Run the policy again over what it did: the largest difference in log-probability, 0 up to
+    rounding.
+    """
     with torch.no_grad(), set_recurrent_mode(True):
         again = policy.get_dist(batch.select(*policy.in_keys)).log_prob(batch["action"])
     return float((again - batch["action_log_prob"]).abs().max())
@@ -137,7 +154,9 @@ def main(frames: int = 60_000, memory: str = "mingru") -> Result:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=60_000)
     parser.add_argument("--memory", default="mingru")
     main(**vars(parser.parse_args()))

@@ -1,22 +1,26 @@
 """Memory models in torch: cells, networks around them, and their place in TorchRL.
 
-A memory model is an ``nn.Module`` with two methods: ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H],
-state)`` and ``initial_state(batch_size)``. Acting is the same call with T = 1; the state is a TensorDict of fixed-shape
-tensors; ``is_init`` marks the steps that open an episode, before which everything is forgotten.
+A memory model is an ``nn.Module`` with two methods: ``forward(x [B, T, D], state, is_init [B, T])
+-> (y [B, T, H], state)`` and ``initial_state(batch_size)``. Acting is the same call with T = 1; the
+state is a TensorDict of fixed-shape tensors; ``is_init`` marks the steps that open an episode,
+before which everything is forgotten.
 
-* :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru gru mlp
-  linear_transformer attention gdn ttt``).
-* :func:`check_memory`: check that a module, ours or yours, is a correct memory model; :class:`MemoryLawError` says what
-  is wrong with it.
-* :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of ``LSTMModule``.
+* :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru
+  gru mlp linear_transformer attention gdn ttt``).
+* :func:`check_memory`: check that a module, ours or yours, is a correct memory model;
+  :class:`MemoryLawError` says what is wrong with it.
+* :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of
+  ``LSTMModule``.
 * :func:`make_network`, :class:`MemoryNetwork`: pixels to Q-values, presets "paper" and "small".
-* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, by two networks ("paper") or by
-  one for both ("small"). All these networks are TensorDict modules.
+* :func:`make_actor_critic`, :class:`ActorCriticNetwork`: pixels to logits and a value, by two
+  networks ("paper") or by one for both ("small"). All these networks are TensorDict modules.
 * :class:`MemoryBlock`: the stack of cells between encoder and head.
-* :func:`linear_scan`: the recurrence h_t = a_t h_{t-1} + b_t as a torch operator; :func:`matrix_scan`: the delta rule
-  S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T in chunks.
+* :func:`linear_scan`: the recurrence h_t = a_t h_{t-1} + b_t as a torch operator;
+  :func:`matrix_scan`: the delta rule S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T in
+  chunks.
 
-Nothing here knows an environment or JAX. TorchRL is imported only when a TensorDict module runs or makes its primer.
+Nothing here knows an environment or JAX. TorchRL is imported only when a TensorDict module runs or
+makes its primer.
 
 Example:
     >>> import torch

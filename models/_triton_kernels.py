@@ -1,12 +1,15 @@
-"""Triton kernels of the linear scan; ``scan_triton`` launches them, and says how much they move. Imports triton.
+"""Triton kernels of the linear scan; ``scan_triton`` launches them, and says how much they move.
+Imports triton.
 
-One program owns one batch row and a block of features and walks through time in chunks: a chunk [CHUNK, LANES] is
-scanned in parallel (``tl.associative_scan``), and the state behind it is carried to the next in registers. What is
-scanned are the maps h -> a h + b, each with a flag: what stands before a start is selected away, never multiplied by
-zero, so that a NaN or infinity does not come through and the rounding of one episode has no part in the next.
+One program owns one batch row and a block of features and walks through time in chunks: a chunk
+[CHUNK, LANES] is scanned in parallel (``tl.associative_scan``), and the state behind it is carried
+to the next in registers. What is scanned are the maps h -> a h + b, each with a flag: what stands
+before a start is selected away, never multiplied by zero, so that a NaN or infinity does not come
+through and the rounding of one episode has no part in the next.
 
-The backward pass walks from the last step to the first, rows of a chunk in that order: the same forward scan, over
-conj(a_{t+1}) and the flag of step t + 1. Complex numbers are pairs of reals, the real part first.
+The backward pass walks from the last step to the first, rows of a chunk in that order: the same
+forward scan, over conj(a_{t+1}) and the flag of step t + 1. Complex numbers are pairs of reals, the
+real part first.
 
 Source: Blelloch (1990), "Prefix sums and their applications", section 1.5 (segmented scans).
 """
@@ -44,15 +47,23 @@ def _offsets(row, step, lane, strides):
 
 @triton.jit
 def _load_pairs(at, inside):
-    """(real, imaginary parts), zero outside; both in one load, so that neighbours in memory are read together."""
-    x = tl.load(tl.expand_dims(at, -1) + tl.arange(0, 2), mask=tl.expand_dims(inside, -1), other=0.0)
+    """(real, imaginary parts), zero outside; both in one load, so that neighbours in memory are
+    read together.
+    """
+    x = tl.load(
+        tl.expand_dims(at, -1) + tl.arange(0, 2), mask=tl.expand_dims(inside, -1), other=0.0
+    )
     return tl.split(x)
 
 
 @triton.jit
 def _store_pairs(at, real, imaginary, inside):
     """The reverse of :func:`_load_pairs`."""
-    tl.store(tl.expand_dims(at, -1) + tl.arange(0, 2), tl.join(real, imaginary), mask=tl.expand_dims(inside, -1))
+    tl.store(
+        tl.expand_dims(at, -1) + tl.arange(0, 2),
+        tl.join(real, imaginary),
+        mask=tl.expand_dims(inside, -1),
+    )
 
 
 @triton.jit
@@ -70,16 +81,36 @@ def _last_row(x, CHUNK: tl.constexpr):
 
 @triton.jit
 def _place(F, CHUNK: tl.constexpr, LANES: tl.constexpr):
-    """Which batch row this program has, which features, which of them exist, and the rows of a chunk."""
+    """Which batch row this program has, which features, which of them exist, and the rows of a
+    chunk.
+    """
     blocks = tl.cdiv(F, LANES)
     program = tl.program_id(0)
     lane = (program % blocks) * LANES + tl.arange(0, LANES)
-    return (program // blocks).to(tl.int64), lane.to(tl.int64), lane < F, tl.arange(0, CHUNK).to(tl.int64)
+    return (
+        (program // blocks).to(tl.int64),
+        lane.to(tl.int64),
+        lane < F,
+        tl.arange(0, CHUNK).to(tl.int64),
+    )
 
 
 @triton.jit
 def forward_real(
-    a, b, start, h0, out, T, F, a_by, b_by, start_by, h0_by, out_by, CHUNK: tl.constexpr, LANES: tl.constexpr
+    a,
+    b,
+    start,
+    h0,
+    out,
+    T,
+    F,
+    a_by,
+    b_by,
+    start_by,
+    h0_by,
+    out_by,
+    CHUNK: tl.constexpr,
+    LANES: tl.constexpr,
 ):
     """``scan.scan``: reads a, b, start and h0, writes out; ``x_by`` are the strides of x."""
     row, lane, used, index = _place(F, CHUNK, LANES)
@@ -102,15 +133,22 @@ def backward_real(
     a, start, h0, h, grad, grad_a, grad_b, T, F, a_by, start_by, h0_by, h_by, grad_by, out_by,
     CHUNK: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """``scan.scan_backward``: reads a, start, h0, h and grad, writes grad_a and grad_b (strides ``out_by``)."""
+    """``scan.scan_backward``: reads a, start, h0, h and grad, writes grad_a and grad_b (strides
+    ``out_by``).
+    """
     row, lane, used, index = _place(F, CHUNK, LANES)
     initial = tl.load(h0 + row * h0_by[0] + lane * h0_by[1], mask=used, other=0.0)
     state = tl.zeros_like(initial)
     for begin in range(0, T, CHUNK):
         step = T - 1 - begin - index
-        exists, followed = step >= 0, (step >= 0) & (step < T - 1)
+        exists = step >= 0
+        followed = (step >= 0) & (step < T - 1)
         inside = exists[:, None] & used[None, :]
-        factor = tl.load(a + _offsets(row, step + 1, lane, a_by), mask=followed[:, None] & used[None, :], other=0.0)
+        factor = tl.load(
+            a + _offsets(row, step + 1, lane, a_by),
+            mask=followed[:, None] & used[None, :],
+            other=0.0,
+        )
         g = tl.load(grad + _offsets(row, step, lane, grad_by), mask=inside, other=0.0)
         flag = _flags(start, row, step + 1, followed, start_by, LANES)
         enters = (index == 0)[:, None] & (flag == 0)
@@ -119,17 +157,40 @@ def backward_real(
         tl.store(grad_b + _offsets(row, step, lane, out_by), g, mask=inside)
         state = _last_row(g, CHUNK)
 
-        before = tl.load(h + _offsets(row, step - 1, lane, h_by), mask=(step > 0)[:, None] & used[None, :], other=0.0)
+        before = tl.load(
+            h + _offsets(row, step - 1, lane, h_by),
+            mask=(step > 0)[:, None] & used[None, :],
+            other=0.0,
+        )
         before = tl.where((step == 0)[:, None], initial[None, :], before)
         begins = _flags(start, row, step, exists, start_by, LANES) != 0
-        tl.store(grad_a + _offsets(row, step, lane, out_by), tl.where(begins, 0.0, g * before), mask=inside)
+        tl.store(
+            grad_a + _offsets(row, step, lane, out_by),
+            tl.where(begins, 0.0, g * before),
+            mask=inside,
+        )
 
 
 @triton.jit
 def forward_complex(
-    a, b, start, h0, out, T, F, a_by, b_by, start_by, h0_by, out_by, CHUNK: tl.constexpr, LANES: tl.constexpr
+    a,
+    b,
+    start,
+    h0,
+    out,
+    T,
+    F,
+    a_by,
+    b_by,
+    start_by,
+    h0_by,
+    out_by,
+    CHUNK: tl.constexpr,
+    LANES: tl.constexpr,
 ):
-    """:func:`forward_real` on pairs: all but start have one more dimension, of 2 neighbours, not in ``x_by``."""
+    """:func:`forward_real` on pairs: all but start have one more dimension, of 2 neighbours, not in
+    ``x_by``.
+    """
     row, lane, used, index = _place(F, CHUNK, LANES)
     sr, si = _load_pairs(h0 + 2 * (row * h0_by[0] + lane * h0_by[1]), used)
     for begin in range(0, T, CHUNK):
@@ -143,7 +204,8 @@ def forward_complex(
         xi = tl.where(enters, ar * si[None, :] + ai * sr[None, :] + xi, xi)
         _, _, hr, hi, _ = tl.associative_scan((ar, ai, xr, xi, flag), 0, join_complex)
         _store_pairs(out + 2 * _offsets(row, step, lane, out_by), hr, hi, inside)
-        sr, si = _last_row(hr, CHUNK), _last_row(hi, CHUNK)
+        sr = _last_row(hr, CHUNK)
+        si = _last_row(hi, CHUNK)
 
 
 @triton.jit
@@ -154,12 +216,16 @@ def backward_complex(
     """:func:`backward_real` on pairs."""
     row, lane, used, index = _place(F, CHUNK, LANES)
     h0r, h0i = _load_pairs(h0 + 2 * (row * h0_by[0] + lane * h0_by[1]), used)
-    sr, si = tl.zeros_like(h0r), tl.zeros_like(h0i)
+    sr = tl.zeros_like(h0r)
+    si = tl.zeros_like(h0i)
     for begin in range(0, T, CHUNK):
         step = T - 1 - begin - index
-        exists, followed = step >= 0, (step >= 0) & (step < T - 1)
+        exists = step >= 0
+        followed = (step >= 0) & (step < T - 1)
         inside = exists[:, None] & used[None, :]
-        ar, ai = _load_pairs(a + 2 * _offsets(row, step + 1, lane, a_by), followed[:, None] & used[None, :])
+        ar, ai = _load_pairs(
+            a + 2 * _offsets(row, step + 1, lane, a_by), followed[:, None] & used[None, :]
+        )
         ai = -ai
         gr, gi = _load_pairs(grad + 2 * _offsets(row, step, lane, grad_by), inside)
         flag = _flags(start, row, step + 1, followed, start_by, LANES)
@@ -168,11 +234,20 @@ def backward_complex(
         gi = tl.where(enters, ar * si[None, :] + ai * sr[None, :] + gi, gi)
         _, _, gr, gi, _ = tl.associative_scan((ar, ai, gr, gi, flag), 0, join_complex)
         _store_pairs(grad_b + 2 * _offsets(row, step, lane, out_by), gr, gi, inside)
-        sr, si = _last_row(gr, CHUNK), _last_row(gi, CHUNK)
+        sr = _last_row(gr, CHUNK)
+        si = _last_row(gi, CHUNK)
 
-        hr, hi = _load_pairs(h + 2 * _offsets(row, step - 1, lane, h_by), (step > 0)[:, None] & used[None, :])
+        hr, hi = _load_pairs(
+            h + 2 * _offsets(row, step - 1, lane, h_by), (step > 0)[:, None] & used[None, :]
+        )
         is_first = (step == 0)[:, None]
-        hr, hi = tl.where(is_first, h0r[None, :], hr), tl.where(is_first, h0i[None, :], hi)
+        hr = tl.where(is_first, h0r[None, :], hr)
+        hi = tl.where(is_first, h0i[None, :], hi)
         begins = _flags(start, row, step, exists, start_by, LANES) != 0
         at = grad_a + 2 * _offsets(row, step, lane, out_by)
-        _store_pairs(at, tl.where(begins, 0.0, gr * hr + gi * hi), tl.where(begins, 0.0, gi * hr - gr * hi), inside)
+        _store_pairs(
+            at,
+            tl.where(begins, 0.0, gr * hr + gi * hi),
+            tl.where(begins, 0.0, gi * hr - gr * hi),
+            inside,
+        )

@@ -17,21 +17,26 @@ __all__ = ["ActorCriticNetwork", "make_actor_critic"]
 
 
 class ActorCriticNetwork(TensorDictModuleBase):
-    """Actor and critic as one TensorDict module, which writes ``logits`` [*, A] and ``state_value`` [*, 1].
+    """Actor and critic as one TensorDict module, which writes ``logits`` [*, A] and ``state_value``
+    [*, 1].
 
-    Either two networks that share nothing but the frames, as in the paper, or one for both at half the price, whose
-    last output is the value. The plain-tensor methods are those of :class:`MemoryNetwork`; their output is
-    [..., A + 1], the value last, and their state has an entry for each network.
+    Either two networks that share nothing but the frames, as in the paper, or one for both at half
+    the price, whose last output is the value. The plain-tensor methods are those of
+    :class:`MemoryNetwork`; their output is [..., A + 1], the value last, and their state has an
+    entry for each network.
 
     Args:
         actor: gives A logits; without a critic A + 1 outputs.
-        critic: gives one value; sees frames of the same size. Its output and state keys differ from the actor's.
+        critic: gives one value; sees frames of the same size. Its output and state keys differ from
+            the actor's.
 
     Attributes:
-        actor, critic: TensorDict modules for the terms of a loss; where one network serves both, the critic reads what
-            the actor has written (TorchRL's ``A2CLoss`` has to be given :attr:`estimator`, or it trains no critic).
+        actor, critic: TensorDict modules for the terms of a loss; where one network serves both,
+            the critic reads what the actor has written (TorchRL's ``A2CLoss`` has to be given
+            :attr:`estimator`, or it trains no critic).
 
-    Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent actor-critic.
+    Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent
+        actor-critic.
     """
 
     offers = ("logits", "probs", "value")
@@ -41,12 +46,18 @@ class ActorCriticNetwork(TensorDictModuleBase):
         super().__init__()
         self.networks = {"both": actor} if critic is None else {"actor": actor, "critic": critic}
         if critic is None:
-            logits, value = partial(self.select, what="logits"), partial(self.select, what="value")
-            self.actor = TensorDictSequential(actor, TensorDictModule(logits, [actor.out_key], ["logits"]))
+            logits = partial(self.select, what="logits")
+            value = partial(self.select, what="value")
+            self.actor = TensorDictSequential(
+                actor, TensorDictModule(logits, [actor.out_key], ["logits"])
+            )
             self.critic = TensorDictModule(value, [actor.out_key], ["state_value"])
         else:
-            self.actor, self.critic = actor, critic
-        self.in_keys = list(dict.fromkeys(key for network in self.networks.values() for key in network.in_keys))
+            self.actor = actor
+            self.critic = critic
+        self.in_keys = list(
+            dict.fromkeys(key for network in self.networks.values() for key in network.in_keys)
+        )
         self.out_keys = [*self.actor.out_keys, *self.critic.out_keys]
 
     @property
@@ -60,7 +71,9 @@ class ActorCriticNetwork(TensorDictModuleBase):
         return self.critic(self.actor(tensordict))
 
     def compress(self, pixels: Tensor) -> Tensor:
-        """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for both networks."""
+        """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for
+        both networks.
+        """
         return next(iter(self.networks.values())).compress(pixels)
 
     def calibrate(self, pixels: Tensor) -> None:
@@ -75,16 +88,27 @@ class ActorCriticNetwork(TensorDictModuleBase):
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
     ) -> tuple[Tensor, TensorDict]:
-        """Everything behind :meth:`encode`, see :meth:`MemoryNetwork.remember`; the output is [B, T, A + 1]."""
+        """Everything behind :meth:`encode`, see :meth:`MemoryNetwork.remember`; the output is [B,
+        T, A + 1].
+        """
         parts = zip(self.networks.items(), features.chunk(len(self.networks), dim=-1), strict=True)
-        read = {name: network.remember(part, last_action, is_init, state[name]) for (name, network), part in parts}
-        after = TensorDict({name: state for name, (_, state) in read.items()}, batch_size=state.batch_size)
+        read = {
+            name: network.remember(part, last_action, is_init, state[name])
+            for (name, network), part in parts
+        }
+        after = TensorDict(
+            {name: state for name, (_, state) in read.items()}, batch_size=state.batch_size
+        )
         return torch.cat([out for out, _ in read.values()], dim=-1), after
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """Recurrent state at the start of an episode, TensorDict [batch_size]."""
-        states = {name: network.initial_state(batch_size) for name, network in self.networks.items()}
-        return TensorDict(states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))
+        states = {
+            name: network.initial_state(batch_size) for name, network in self.networks.items()
+        }
+        return TensorDict(
+            states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
+        )
 
     @staticmethod
     def split(out: Tensor) -> tuple[Tensor, Tensor]:
@@ -122,19 +146,23 @@ def make_actor_critic(
     store: Store = "sequence",
     **options: Any,
 ) -> ActorCriticNetwork:
-    """Make actor and critic: two networks, each with its own initial weights, or one (``towers=1``; "small").
+    """Make actor and critic: two networks, each with its own initial weights, or one (``towers=1``;
+    "small").
 
     Args:
-        preset: see :func:`make_network`; the heads are the preset's ``actor_critic_head`` unless ``head`` is given.
+        preset: see :func:`make_network`; the heads are the preset's ``actor_critic_head`` unless
+            ``head`` is given.
         memory: see :func:`make_network`.
         obs_size: side of the frames in pixels.
         num_actions: A.
         memory_options: options of the cells, over those of the preset.
         store: see :func:`make_network`.
-        **options: see :func:`make_network`; ``use_last_action=False`` is the published code, unlike its table.
+        **options: see :func:`make_network`; ``use_last_action=False`` is the published code, unlike
+            its table.
 
     Returns:
-        The module; states stand under ``("memory", "actor")`` and ``("memory", "critic")``, or ``("memory", "both")``.
+        The module; states stand under ``("memory", "actor")`` and ``("memory", "critic")``, or
+        ``("memory", "both")``.
 
     Raises:
         ValueError: unknown preset, memory, size, or value of an option.
@@ -143,18 +171,26 @@ def make_actor_critic(
     Example:
         >>> network = make_actor_critic("small", "gru")
         >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
-        >>> last_action, is_init = torch.zeros(2, 7, dtype=torch.int64), torch.zeros(2, 7, dtype=torch.bool)
-        >>> out, state = network.remember(network.encode(frames), last_action, is_init, network.initial_state(2))
+        >>> last_action = torch.zeros(2, 7, dtype=torch.int64)
+        >>> is_init = torch.zeros(2, 7, dtype=torch.bool)
+        >>> features = network.encode(frames)
+        >>> out, state = network.remember(features, last_action, is_init, network.initial_state(2))
         >>> [tuple(part.shape) for part in network.split(out)]
         [(2, 7, 5), (2, 7)]
     """
     chosen = preset_of(preset)
     options.setdefault("head", options.pop("actor_critic_head", chosen.actor_critic_head))
-    make: Any = partial(make_network, preset, memory, obs_size=obs_size, num_actions=num_actions, store=store)
+    make: Any = partial(
+        make_network, preset, memory, obs_size=obs_size, num_actions=num_actions, store=store
+    )
     make = partial(make, memory_options=memory_options, **options)
     if options.get("towers", chosen.towers) == 1:
-        both = make(num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both"))
+        both = make(
+            num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both")
+        )
         return ActorCriticNetwork(both)
     actor = make(num_outputs=num_actions, out_key="logits", state_key=("memory", "actor"))
-    critic = make(num_outputs=1, out_key="state_value", state_key=("memory", "critic"), predicts=False)
+    critic = make(
+        num_outputs=1, out_key="state_value", state_key=("memory", "critic"), predicts=False
+    )
     return ActorCriticNetwork(actor, critic)

@@ -16,41 +16,48 @@ BLOCK = 128  # queries looked at together; the fastest on a CPU at W = 128
 
 
 class Attention(Memory):
-    """y_t = sum_j softmax_j(q_t . k_j / sqrt(H)) v_j over the last W steps of the episode; one head, H wide.
+    """y_t = sum_j softmax_j(q_t . k_j / sqrt(H)) v_j over the last W steps of the episode; one
+    head, H wide.
 
-    q and k are linear in x without bias and rotated by their positions (RoPE), v is linear with bias; no projection and
-    no skip follow.
+    q and k are linear in x without bias and rotated by their positions (RoPE), v is linear with
+    bias; no projection and no skip follow.
 
-    The state is the window as a ring buffer: ``"key"`` (rotated) and ``"value"`` [W, H], and ``"step"`` int64 [], the
-    number of steps of the episode so far. Step i of an episode, from 0, stands in slot i mod W; unused slots hold
-    zeros. Acting writes one slot of a copy, because a rollout may keep the state of every step. At H = 512 and W = 128
-    the state has 131,073 numbers: keep it once a sequence, not once a step (``MemoryModule(store="sequence")``,
+    The state is the window as a ring buffer: ``"key"`` (rotated) and ``"value"`` [W, H], and
+    ``"step"`` int64 [], the number of steps of the episode so far. Step i of an episode, from 0,
+    stands in slot i mod W; unused slots hold zeros. Acting writes one slot of a copy, because a
+    rollout may keep the state of every step. At H = 512 and W = 128 the state has 131,073 numbers:
+    keep it once a sequence, not once a step (``MemoryModule(store="sequence")``,
     ``ArcadeCollector``).
 
     Args:
         input_size: D.
         hidden_size: H; the last channel of an odd number is not rotated.
-        window: W, number of steps that are looked at, the current one included; 128 is the paper's rollout.
-        carry_cache: begin a call with the window that the last call returned, so that several calls with a carried
-            state equal one. False is what the paper's text says ("does not maintain a recurrent state"), though not
-            what its code does: a call with more than one step, a chunk of training, begins with an empty window. Acting
-            (T = 1) carries it either way, so the two see different histories until a chunk is W steps old, and
-            ``check_memory`` refuses the model.
+        window: W, number of steps that are looked at, the current one included; 128 is the paper's
+            rollout.
+        carry_cache: begin a call with the window that the last call returned, so that several calls
+            with a carried state equal one. False is what the paper's text says ("does not maintain
+            a recurrent state"), though not what its code does: a call with more than one step, a
+            chunk of training, begins with an empty window. Acting (T = 1) carries it either way, so
+            the two see different histories until a chunk is W steps old, and ``check_memory``
+            refuses the model.
 
     Raises:
         ValueError: a size or the window is not positive.
 
-    Source: Vaswani et al. (2017), arXiv 1706.03762, eq. 1; Su et al. (2021), arXiv 2104.09864; POPGym Arcade, appendix
-        on memory models.
+    Source: Vaswani et al. (2017), arXiv 1706.03762, eq. 1; Su et al. (2021), arXiv 2104.09864;
+        POPGym Arcade, appendix on memory models.
     """
 
     averages_values = True
 
-    def __init__(self, input_size: int, hidden_size: int, *, window: int = 128, carry_cache: bool = True) -> None:
+    def __init__(
+        self, input_size: int, hidden_size: int, *, window: int = 128, carry_cache: bool = True
+    ) -> None:
         super().__init__(input_size, hidden_size)
         if window < 1:
             raise ValueError(f"window must be at least 1 step (the current one), got {window}")
-        self.window, self.carry_cache = window, carry_cache
+        self.window = window
+        self.carry_cache = carry_cache
         self.query = nn.Linear(input_size, hidden_size, bias=False)
         self.key = nn.Linear(input_size, hidden_size, bias=False)
         self.value = nn.Linear(input_size, hidden_size)
@@ -67,7 +74,9 @@ class Attention(Memory):
         y, key, value, step = read(x, state["key"], state["value"], state["step"], is_init)
         return y, TensorDict({"key": key, "value": value, "step": step}, batch_size=[x.shape[0]])
 
-    def _act(self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
+    def _act(
+        self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor
+    ) -> tuple[Tensor, ...]:
         """One step: write one slot of a copy of the ring, attend to all that are in use."""
         begins = _known_starts(is_init)
         if begins is None:
@@ -77,7 +86,8 @@ class Attention(Memory):
         slot = (step % self.window)[:, None, None].expand(-1, 1, self.hidden_size)
         keys = keys.scatter(1, slot, rotate_pairs(self.key(x), *rotation).to(keys.dtype))
         values = values.scatter(1, slot, self.value(x).to(values.dtype))
-        if begins is not None and len(begins):  # in the copies that scatter made; cheaper than a copy with holes before
+        # in the copies that scatter made; cheaper than a copy with holes before
+        if begins is not None and len(begins):
             for rows in (keys, values):
                 rows[:, 1:].index_fill_(0, begins, 0)
         query = rotate_pairs(self.query(x), *rotation) / math.sqrt(self.hidden_size)
@@ -85,31 +95,45 @@ class Attention(Memory):
         score = (query @ keys.mT).masked_fill(unused.unsqueeze(1), -torch.inf)
         return score.softmax(-1) @ values, keys, values, step + 1
 
-    def _read_chunk(self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
-        """Several steps: put the ring in order of time, append the chunk, keep the last W steps as a ring again."""
+    def _read_chunk(
+        self, x: Tensor, keys: Tensor, values: Tensor, step: Tensor, is_init: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Several steps: put the ring in order of time, append the chunk, keep the last W steps as
+        a ring again.
+        """
         window = self.window
         lost = is_init[:, 0] if self.carry_cache else torch.ones_like(is_init[:, 0])
         step = torch.where(lost, 0, step)
         order = torch.arange(window, device=x.device)
-        past = step.unsqueeze(-1) - window + order  # positions of the W steps before the chunk; negative: there is none
+        # positions of the W steps before the chunk; negative: there is none
+        past = step.unsqueeze(-1) - window + order
         keys = rotate_pairs(_take(keys, past % window), *_angles_from(past[:, 0], window, -1, keys))
         none = past < 0
-        keys, values = (rows.masked_fill(none.unsqueeze(-1), 0) for rows in (keys, _take(values, past % window)))
-        keys, values = (torch.cat(pair, dim=1)[:, 1:] for pair in ((keys, self.key(x)), (values, self.value(x))))
+        keys, values = (
+            rows.masked_fill(none.unsqueeze(-1), 0) for rows in (keys, _take(values, past % window))
+        )
+        keys, values = (
+            torch.cat(pair, dim=1)[:, 1:] for pair in ((keys, self.key(x)), (values, self.value(x)))
+        )
         episode = torch.cat([torch.where(none, -1, 0)[:, 1:], is_init.cumsum(1)], dim=1)
         y = window_attention(self.query(x), keys, values, episode, window)
         index = torch.arange(1, x.shape[1] + 1, device=x.device)
-        begun = torch.where(is_init, index - 1, -step.unsqueeze(-1)).amax(1)  # where the last episode begins
+        # where the last episode begins
+        begun = torch.where(is_init, index - 1, -step.unsqueeze(-1)).amax(1)
         step = x.shape[1] - begun
         first = step - window  # position of the oldest of the last W steps
         keys = rotate_pairs(keys[:, -window:], *_angles_from(first, window, 1, keys))
         slots = (order - first.unsqueeze(-1)) % window  # which of them stands in each slot
         unused = (order >= step.unsqueeze(-1)).unsqueeze(-1)
-        keys, values = (_take(rows, slots).masked_fill(unused, 0) for rows in (keys, values[:, -window:]))
+        keys, values = (
+            _take(rows, slots).masked_fill(unused, 0) for rows in (keys, values[:, -window:])
+        )
         return y, keys, values, step
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-        """See ``ReplayableMemory``; step by step (slow): windows are not meant to be stored for every step."""
+        """See ``ReplayableMemory``; step by step (slow): windows are not meant to be stored for
+        every step.
+        """
         self._check(x, stored, is_init, batch_ndim=2)
         return replay_by_steps(self, x, stored, is_init)
 
@@ -120,12 +144,16 @@ class Attention(Memory):
 
 def _take(rows: Tensor, index: Tensor) -> Tensor:
     """Rows [B, W, H] in the order of an index int64 [B, W]."""
-    of_row = torch.arange(0, rows.shape[0] * rows.shape[1], rows.shape[1], device=rows.device).unsqueeze(-1)
-    return rows.flatten(0, 1).index_select(0, (of_row + index).flatten()).unflatten(0, rows.shape[:2])  # type: ignore[no-any-return]
+    batch, width = rows.shape[:2]
+    first_of_row = torch.arange(0, batch * width, width, device=rows.device).unsqueeze(-1)
+    flat_index = (first_of_row + index).flatten()
+    taken: Tensor = rows.flatten(0, 1).index_select(0, flat_index).unflatten(0, (batch, width))
+    return taken
 
 
 def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine [B, count, W // 2] of positions first, first + 1, ..., by the sum of angles (B + count of them).
+    """Cosine and sine [B, count, W // 2] of positions first, first + 1, ..., by the sum of angles
+    (B + count of them).
 
     Args:
         first: int64 [B].
@@ -139,7 +167,9 @@ def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Te
 
 
 def _known_starts(is_init: Tensor) -> Tensor | None:
-    """Rows that begin an episode, int64 [n]; None where finding out costs (a card, a graph) or is refused (vmap)."""
+    """Rows that begin an episode, int64 [n]; None where finding out costs (a card, a graph) or is
+    refused (vmap).
+    """
     if torch.compiler.is_compiling() or is_init.device.type != "cpu":
         return None
     try:
@@ -153,13 +183,14 @@ def window_attention(
 ) -> Tensor:
     """Attend to the last ``window`` steps of the same episode.
 
-    Queries are taken in blocks, each of which sees one stretch of window - 1 + block keys, so the mask and the weights
-    need O(T (window + block)) numbers, and the angles O(window + block). A NaN or infinity among the values reaches the
-    queries that see it and no others.
+    Queries are taken in blocks, each of which sees one stretch of window - 1 + block keys, so the
+    mask and the weights need O(T (window + block)) numbers, and the angles O(window + block). A NaN
+    or infinity among the values reaches the queries that see it and no others.
 
     Args:
         query: float [B, T, H].
-        key: float [B, W - 1 + T, H], those of the W - 1 steps before index 0 first; unrotated, like the query.
+        key: float [B, W - 1 + T, H], those of the W - 1 steps before index 0 first; unrotated, like
+            the query.
         value: float [B, W - 1 + T, H].
         episode: int64 [B, W - 1 + T]; steps with different numbers do not see each other.
         window: W, at least 1.
@@ -170,7 +201,8 @@ def window_attention(
     """
     length = query.shape[1]
     count = 1
-    while count * block < length:  # a loop: a compiled graph then has one number of blocks and any length
+    # a loop: a compiled graph then has one number of blocks and any length
+    while count * block < length:
         count += 1
     size = (length + count - 1) // count
     spare = count * size - length
@@ -181,16 +213,24 @@ def window_attention(
     if spare:
         query, key, value = (F.pad(x, (0, 0, 0, spare)) for x in (query, key, value))
         episode = F.pad(episode, (0, spare), value=-2)
-    bad = ~value.sum(-1).isfinite() if length > 1 else None  # acting: what is not seen has been zeroed
+    # acting: what is not seen has been zeroed
+    bad = ~value.sum(-1).isfinite() if length > 1 else None
     if bad is not None:
         value = value.masked_fill(bad.unsqueeze(-1), 0)  # a weight of zero would not stop it
     queries = rotate_pairs(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
     # Not unfold: its backward is slower, and a graph that is compiled with it has one length.
     each = (torch.arange(count, device=query.device).unsqueeze(-1) * size + index).flatten()
-    keys, values, episodes = (x.index_select(1, each).unflatten(1, (count, stretch)) for x in (key, value, episode))
+    keys, values, episodes = (
+        x.index_select(1, each).unflatten(1, (count, stretch)) for x in (key, value, episode)
+    )
     distance = index[past:, None] - index
-    seen = (distance >= 0) & (distance < window) & (episodes[..., past:, None] == episodes[..., None, :])
-    # Spelled out: on a CPU as fast as scaled_dot_product_attention with a mask, which vmap runs row by row.
+    seen = (
+        (distance >= 0)
+        & (distance < window)
+        & (episodes[..., past:, None] == episodes[..., None, :])
+    )
+    # Spelled out: on a CPU as fast as scaled_dot_product_attention with a mask, which vmap runs row
+    # by row.
     score = queries / math.sqrt(query.shape[-1]) @ rotate_pairs(keys, cosine, sine).mT
     if bad is not None:
         lost = torch.where(bad, torch.nan, 0.0).to(score.dtype).index_select(1, each)
@@ -199,12 +239,16 @@ def window_attention(
     return y.flatten(1, 2)[:, :length]  # type: ignore[no-any-return]
 
 
-def window_attention_loop(query: Tensor, key: Tensor, value: Tensor, episode: Tensor, window: int) -> Tensor:
+def window_attention_loop(
+    query: Tensor, key: Tensor, value: Tensor, episode: Tensor, window: int
+) -> Tensor:
     """The same function as :func:`window_attention`, one query at a time (slow)."""
     outputs = []
     for t in range(query.shape[1]):
         near = slice(t, window + t)  # the window that ends at step t
-        cosine, sine = angles(torch.arange(window, device=query.device), query.shape[-1], query.dtype)
+        cosine, sine = angles(
+            torch.arange(window, device=query.device), query.shape[-1], query.dtype
+        )
         keys = rotate(key[:, near], cosine, sine)
         asked = rotate(query[:, t], cosine[-1], sine[-1])
         score = torch.einsum("bh,bwh->bw", asked, keys) / math.sqrt(query.shape[-1])

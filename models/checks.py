@@ -33,7 +33,8 @@ class MemoryLawError(AssertionError):
 
     def __init__(self, law: str, found: str, cause: str, discrepancy: float = float("nan")) -> None:
         super().__init__(f"law {law!r} is broken: {found}. Likely cause: {cause}.")
-        self.law, self.discrepancy = law, discrepancy
+        self.law = law
+        self.discrepancy = discrepancy
 
 
 def check_memory(
@@ -47,30 +48,33 @@ def check_memory(
 ) -> dict[str, float]:
     """Check that a module is a lawful memory model.
 
-    Works on a copy in float64 and evaluation mode, with random inputs; takes a second or so for small sizes.
+    Works on a copy in float64 and evaluation mode, with random inputs; takes a second or so for
+    small sizes.
 
     Args:
         module: has ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
-            ``initial_state(batch_size)``; ``replay`` is checked too where there is one. A module with
-            ``averages_values = True`` says that its outputs depend on the past through a weighted mean only, as in
-            attention, and has to keep one law more: the same input at every step gives the same output at every step.
+            ``initial_state(batch_size)``; ``replay`` is checked too where there is one. A module
+            with ``averages_values = True`` says that its outputs depend on the past through a
+            weighted mean only, as in attention, and has to keep one law more: the same input at
+            every step gives the same output at every step.
         input_size: D; None reads ``module.input_size``.
-        dtype: of parameters and inputs during the check. float64 finds the most; take float32, bfloat16
-            or float16 for kernels that know nothing else.
-        tolerance: largest difference allowed between two ways to compute the same outputs or states, as a
-            share of their largest entry where that is above 1; None for 1e-7 in float64, 1e-4 in float32,
-            0.01 in float16 and 0.1 in bfloat16.
+        dtype: of parameters and inputs during the check. float64 finds the most; take float32,
+            bfloat16 or float16 for kernels that know nothing else.
+        tolerance: largest difference allowed between two ways to compute the same outputs or
+            states, as a share of their largest entry where that is above 1; None for 1e-7 in
+            float64, 1e-4 in float32, 0.01 in float16 and 0.1 in bfloat16.
         seed: of the random inputs.
-        gradients: also compare gradients (the slowest law): in float64 with finite differences, which less
-            precise numbers cannot tell; in other types those of one call with those of a call a step.
+        gradients: also compare gradients (the slowest law): in float64 with finite differences,
+            which less precise numbers cannot tell; in other types those of one call with those of a
+            call a step.
 
     Returns:
         For each law the largest discrepancy that was found (all within tolerance).
 
     Raises:
         MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
-        ValueError, TypeError: the input size is not known, or ``dtype`` is none of the four; there is no
-            ``initial_state``.
+        ValueError, TypeError: the input size is not known, or ``dtype`` is none of the four; there
+            is no ``initial_state``.
 
     Example:
         >>> from arcade_torch.models import check_memory, make_memory
@@ -79,9 +83,13 @@ def check_memory(
     """
     size = input_size if input_size is not None else getattr(module, "input_size", None)
     if not isinstance(size, int):
-        raise ValueError("input size unknown: pass check_memory(module, input_size=...) or set module.input_size")
+        raise ValueError(
+            "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
+        )
     if not hasattr(module, "initial_state"):
-        raise TypeError(f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict")
+        raise TypeError(
+            f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
+        )
     if dtype not in TOLERANCES:
         allowed = ", ".join(map(str, TOLERANCES))
         raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
@@ -120,20 +128,32 @@ class _Subject:
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
         like = next(self.module.parameters(), torch.zeros(0))
-        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(like.device, self.dtype)
+        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(
+            like.device, self.dtype
+        )
 
-    def inputs(self, batch: int, steps: int, resets: float = 0.0) -> tuple[Tensor, TensorDict, Tensor]:
+    def inputs(
+        self, batch: int, steps: int, resets: float = 0.0
+    ) -> tuple[Tensor, TensorDict, Tensor]:
         """Random x, a state that some steps have led to, and start flags."""
-        x, warm = self.random(batch, steps), self.random(batch, 3)
+        x = self.random(batch, steps)
+        warm = self.random(batch, 3)
         with torch.no_grad():
-            _, state = self.module(warm, self.initial(batch), torch.zeros_like(warm[..., 0], dtype=torch.bool))
+            _, state = self.module(
+                warm, self.initial(batch), torch.zeros_like(warm[..., 0], dtype=torch.bool)
+            )
         return x, state, (torch.rand(batch, steps) < resets).to(x.device)
 
     def initial(self, batch: int) -> TensorDict:
         return self.module.initial_state(batch)  # type: ignore[operator]
 
     def compare(
-        self, law: str, found: str, cause: str, *pairs: tuple[Tensor, Tensor], tolerance: float | None = None
+        self,
+        law: str,
+        found: str,
+        cause: str,
+        *pairs: tuple[Tensor, Tensor],
+        tolerance: float | None = None,
     ) -> float:
         """Largest difference of the pairs; raises if above the tolerance or not a number."""
         worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
@@ -143,8 +163,8 @@ class _Subject:
 
 
 def _difference(p: Tensor, q: Tensor) -> float:
-    """Largest difference, as a share of the largest entry where that is above 1: sums over many steps
-    are large, and so is their rounding. Computed in float64.
+    """Largest difference, as a share of the largest entry where that is above 1: sums over many
+    steps are large, and so is their rounding. Computed in float64.
     """
     wide = torch.complex128 if p.is_complex() else torch.float64
     p = p.to(wide)
@@ -155,7 +175,9 @@ def _difference(p: Tensor, q: Tensor) -> float:
 
 def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
     """The tensors of a state, by path."""
-    return {key if isinstance(key, tuple) else (key,): state.get(key) for key in state.keys(True, True)}
+    return {
+        key if isinstance(key, tuple) else (key,): state.get(key) for key in state.keys(True, True)
+    }
 
 
 def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
@@ -165,27 +187,51 @@ def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
 
 def _shapes(s: _Subject, law: str) -> float:
     for batch, steps in ((1, 1), (3, 1), (2, 5)):
-        x, begin = s.random(batch, steps), s.initial(batch)
+        x = s.random(batch, steps)
+        begin = s.initial(batch)
         out = s.module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
         parts = (begin, *(out if isinstance(out, tuple) else (out,)))
         if [isinstance(part, TensorDictBase) for part in parts] != [True, False, True]:
-            found = f"initial_state and forward gave {', '.join(type(part).__name__ for part in parts)}"
-            raise MemoryLawError(law, found, "a state is no TensorDict, or forward does not return (y, state)")
+            found = (
+                f"initial_state and forward gave {', '.join(type(part).__name__ for part in parts)}"
+            )
+            raise MemoryLawError(
+                law, found, "a state is no TensorDict, or forward does not return (y, state)"
+            )
         y, after = out
-        if y.shape[:2] != (batch, steps) or y.ndim != 3 or y.shape[2] != getattr(s.module, "hidden_size", y.shape[2]):
+        if (
+            y.shape[:2] != (batch, steps)
+            or y.ndim != 3
+            or y.shape[2] != getattr(s.module, "hidden_size", y.shape[2])
+        ):
             found = f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]"
-            raise MemoryLawError(law, found, "time and batch are exchanged, or hidden_size is not the width of y")
-        expected, got = ({k: (list(v.shape), v.dtype) for k, v in _leaves(each).items()} for each in (begin, after))
+            raise MemoryLawError(
+                law, found, "time and batch are exchanged, or hidden_size is not the width of y"
+            )
+        expected, got = (
+            {k: (list(v.shape), v.dtype) for k, v in _leaves(each).items()}
+            for each in (begin, after)
+        )
         if expected != got:
             found = f"initial_state({batch}) has {expected} but forward returned {got}"
-            cause = "the state grows, lacks the batch dimension, or does not take dtype and device from the parameters"
+            cause = (
+                "the state grows, lacks the batch dimension, or does not take dtype and device "
+                "from the parameters"
+            )
             raise MemoryLawError(law, found, cause)
         if y.dtype != s.dtype:
-            raise MemoryLawError(law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype")
+            raise MemoryLawError(
+                law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype"
+            )
     x, state, flags = s.inputs(2, 5, 0.3)
     before = state.clone()
     s.module(x, state, flags)
-    return s.compare(law, "forward changed the state that it was given", "an in-place write", *_pairs(before, state))
+    return s.compare(
+        law,
+        "forward changed the state that it was given",
+        "an in-place write",
+        *_pairs(before, state),
+    )
 
 
 def _steps(s: _Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
@@ -205,14 +251,23 @@ def _scan_equals_steps(s: _Subject, law: str) -> float:
             x, state, flags = s.inputs(3, steps, resets)
             y, after = s.module(x, state, flags)
             stepped, stepped_after = _steps(s, x, state, flags)
-            found = f"one call over T={steps} steps {'with' if resets else 'without'} resets and T calls of one differ"
+            found = (
+                f"one call over T={steps} steps {'with' if resets else 'without'} resets and T "
+                "calls of one differ"
+            )
             cause = (
-                "an operator that is not associative, a scan that mishandles lengths that are no power of two, "
+                "an operator that is not associative, a scan that mishandles lengths that are no "
+                "power of two, "
                 "a look into the future, or acting and learning in different code"
             )
             if resets:
-                cause = "start flags applied one step late or early, or only at index 0; otherwise: " + cause
-            worst = max(worst, s.compare(law, found, cause, (y, stepped), *_pairs(after, stepped_after)))
+                cause = (
+                    "start flags applied one step late or early, or only at index 0; otherwise: "
+                    + cause
+                )
+            worst = max(
+                worst, s.compare(law, found, cause, (y, stepped), *_pairs(after, stepped_after))
+            )
     return worst
 
 
@@ -222,7 +277,8 @@ def _calls_equal_one(s: _Subject, law: str) -> float:
     x, state, flags = s.inputs(3, 11, 0.2)
     y, after = s.module(x, state, flags)
     for cuts in ((5,), (1, 4, 10), (3, 6)):
-        parts, carried = [], state
+        parts = []
+        carried = state
         for begin, end in zip((0, *cuts), (*cuts, 11), strict=True):
             part, carried = s.module(x[:, begin:end], carried, flags[:, begin:end])
             parts.append(part)
@@ -231,7 +287,8 @@ def _calls_equal_one(s: _Subject, law: str) -> float:
             s.compare(
                 law,
                 f"11 steps in one call and in calls cut at {cuts} differ",
-                "the returned state is not the one after the last step, or the given state is not used",
+                "the returned state is not the one after the last step, or the given state is not "
+                "used",
                 (y, torch.cat(parts, dim=1)),
                 *_pairs(after, carried),
             ),
@@ -252,8 +309,10 @@ def _packed_equals_apart(s: _Subject, law: str) -> float:
             worst,
             s.compare(
                 law,
-                f"an episode of {end - begin} steps packed behind others at index {begin} and run on its own differ",
-                "the start flag does not restore initial_state, or restores it after reading the first step",
+                f"an episode of {end - begin} steps packed behind others at index {begin} and run "
+                "on its own differ",
+                "the start flag does not restore initial_state, or restores it after reading the "
+                "first step",
                 (y[:, begin:end], alone),
             ),
         )
@@ -261,7 +320,10 @@ def _packed_equals_apart(s: _Subject, law: str) -> float:
 
 
 def _no_leak(s: _Subject, law: str) -> float:
-    cause = "the state is multiplied by 0 (0 * inf = NaN) or left in place at a start; select with torch.where"
+    cause = (
+        "the state is multiplied by 0 (0 * inf = NaN) or left in place at a start; select with "
+        "torch.where"
+    )
     x, state, flags = s.inputs(2, 9)
     flags[:, 4] = True
     leaves = [v.requires_grad_() for v in _leaves(state).values() if v.is_floating_point()]
@@ -270,14 +332,21 @@ def _no_leak(s: _Subject, law: str) -> float:
     after = y[:, 4:].sum()
     grads = torch.autograd.grad(after, [x, *leaves], allow_unused=True, materialize_grads=True)
     earlier = [grads[0][:, :4], *grads[1:]]
-    worst = s.compare(law, "gradients flow backward over a start", cause, *[(g, torch.zeros_like(g)) for g in earlier])
+    worst = s.compare(
+        law,
+        "gradients flow backward over a start",
+        cause,
+        *[(g, torch.zeros_like(g)) for g in earlier],
+    )
     with torch.no_grad():
         other, other_state, _ = s.inputs(2, 9)
         changed, _ = s.module(torch.cat([other[:, :4], x[:, 4:]], 1), other_state, flags)
         found = "outputs after a start depend on what was before it"
         worst = max(worst, s.compare(law, found, cause, (y[:, 4:], changed[:, 4:])))
         flags[:, 0] = True
-        poisoned = state.apply(lambda v: torch.full_like(v, torch.nan) if v.is_floating_point() else v)
+        poisoned = state.apply(
+            lambda v: torch.full_like(v, torch.nan) if v.is_floating_point() else v
+        )
         clean, after_clean = s.module(x, s.initial(2), flags)
         survived, after_poison = s.module(x, poisoned, flags)
         found = "a NaN in the carried state comes through a start at index 0"
@@ -293,7 +362,8 @@ def _rows_independent(s: _Subject, law: str) -> float:
     return s.compare(
         law,
         "two rows of a batch of four and the same two alone differ",
-        "batch statistics, a reshape that mixes batch and time, or a flag of one row that resets others",
+        "batch statistics, a reshape that mixes batch and time, or a flag of one row that resets "
+        "others",
         (y[1:3], alone),
         *_pairs(after[1:3], alone_after),
     )
@@ -308,7 +378,8 @@ def _replay_loads(s: _Subject, law: str) -> float:
     return s.compare(
         law,
         "replay and a loop that loads stored states by hand differ",
-        "replay must start from stored[:, t] at t = 0 and wherever is_init is set, and return the states after "
+        "replay must start from stored[:, t] at t = 0 and wherever is_init is set, and return the "
+        "states after "
         "each step",
         (y, stepped),
         *_pairs(states, stepped_states),
@@ -325,7 +396,8 @@ def _averages(s: _Subject, law: str) -> float:
     return s.compare(
         law,
         f"{steps} equal inputs from the start of an episode do not give {steps} equal outputs",
-        "weights that do not sum to one: a normaliser that is not accumulated with the values (the last key alone, or "
+        "weights that do not sum to one: a normaliser that is not accumulated with the values (the "
+        "last key alone, or "
         "one that is not reset with them)",
         (y, y[:, :1].expand_as(y)),
         tolerance=max(s.tolerance, GUARD),
@@ -338,7 +410,9 @@ def _gradients(s: _Subject, law: str) -> float:
     keys = [k for k, v in _leaves(state).items() if v.is_floating_point()]
     names = [name for name, p in s.module.named_parameters() if p.requires_grad]
     parameters = [s.module.get_parameter(name).detach().clone() for name in names]
-    arguments = [v.detach().clone().requires_grad_() for v in (x, *(state.get(k) for k in keys), *parameters)]
+    arguments = [
+        v.detach().clone().requires_grad_() for v in (x, *(state.get(k) for k in keys), *parameters)
+    ]
 
     def outputs(x: Tensor, *rest: Tensor) -> Tensor:
         given = state.clone()
@@ -353,7 +427,8 @@ def _gradients(s: _Subject, law: str) -> float:
     except RuntimeError as error:  # gradcheck's own error class derives from it
         raise MemoryLawError(
             law,
-            f"autograd and finite differences disagree in float64 ({str(error).strip().splitlines()[0]})",
+            "autograd and finite differences disagree in float64 "
+            f"({str(error).strip().splitlines()[0]})",
             "a hand-written backward pass, a detach, a .data or an in-place write",
         ) from error
     return 0.0
@@ -373,4 +448,6 @@ def _gradients_of_steps(s: _Subject, law: str) -> float:
         gradients.append(torch.autograd.grad((weight * y).sum(), arguments, materialize_grads=True))
     pairs = zip(*gradients, strict=True)
     found = "the gradients of one call and of a call a step differ"
-    return s.compare(law, found, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs)
+    return s.compare(
+        law, found, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs
+    )

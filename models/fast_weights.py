@@ -1,4 +1,6 @@
-"""What the models with a matrix as state share: everything but what a step writes and how the read-out is used."""
+"""What the models with a matrix as state share: everything but what a step writes and how the
+read-out is used.
+"""
 
 import math
 from abc import abstractmethod
@@ -14,13 +16,14 @@ __all__ = ["FastWeights", "unit_length"]
 
 
 class FastWeights(Memory):
-    """Base of the models whose state ``"h"`` is a matrix [K, V] that every step writes to and reads from.
+    """Base of the models whose state ``"h"`` is a matrix [K, V] that every step writes to and reads
+    from.
 
     Args:
         input_size: D.
         hidden_size: H, features of the output.
-        key_size: K, side of the matrix; None takes the integer nearest to sqrt(H), so that the state has about as
-            many numbers as that of a vector model of the same H.
+        key_size: K, side of the matrix; None takes the integer nearest to sqrt(H), so that the
+            state has about as many numbers as that of a vector model of the same H.
 
     Raises:
         ValueError: a size is not positive.
@@ -36,7 +39,9 @@ class FastWeights(Memory):
 
     @abstractmethod
     def steps(self, x: Tensor, counters: dict[str, Tensor]) -> MatrixSteps:
-        """What every step does to the matrix, for inputs [B, T, D] and :meth:`count`'s counters [B, T]."""
+        """What every step does to the matrix, for inputs [B, T, D] and :meth:`count`'s counters [B,
+        T].
+        """
 
     @abstractmethod
     def read_out(self, x: Tensor, steps: MatrixSteps, o: Tensor) -> Tensor:
@@ -50,7 +55,9 @@ class FastWeights(Memory):
         """:func:`matrix_scan`: (o [B, T, V], last state [B, K, V])."""
         return matrix_scan(steps, is_init, h0)
 
-    def scan_stored(self, steps: MatrixSteps, is_init: Tensor, stored: Tensor) -> tuple[Tensor, Tensor]:
+    def scan_stored(
+        self, steps: MatrixSteps, is_init: Tensor, stored: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """:func:`matrix_scan_stored`: (o [B, T, V], all states [B, T, K, V])."""
         return matrix_scan_stored(steps, is_init, stored)
 

@@ -12,13 +12,16 @@ SLOW_FORGETTING = 4.0  # bias of the decay gate: sigmoid of it is 0.98
 
 
 class GatedDeltaNet(FastWeights):
-    """S_t = alpha (I - beta k k^T) S_{t-1} + beta k v^T, y = W S_t^T q, with keys and queries of length one.
+    """S_t = alpha (I - beta k k^T) S_{t-1} + beta k v^T, y = W S_t^T q, with keys and queries of
+    length one.
 
-    k and q are silu of linear maps, divided by their length; v is linear; beta = 2 sigmoid(w . x + b) and
-    alpha = sigmoid(a . x + c) are numbers. S is the transpose of the paper's H. The state ``"h"`` is [K, K].
+    k and q are silu of linear maps, divided by their length; v is linear; beta = 2 sigmoid(w . x +
+    b) and alpha = sigmoid(a . x + c) are numbers. S is the transpose of the paper's H. The state
+    ``"h"`` is [K, K].
 
-    Differs from the paper's equation by the decay alpha, silu, unit length and the factor 2, as its code does and
-    as "gated" means in the literature; from that code by the side on which the transition acts.
+    Differs from the paper's equation by the decay alpha, silu, unit length and the factor 2, as its
+    code does and as "gated" means in the literature; from that code by the side on which the
+    transition acts.
 
     Args:
         input_size: D.
@@ -26,8 +29,9 @@ class GatedDeltaNet(FastWeights):
         key_size: K; None is the integer nearest to sqrt(H).
         gate_alpha: have the decay gate; False keeps alpha at 1.
         beta_range: largest beta, in (0, 2]; beyond 1 what was stored under the key changes sign.
-        legacy_left: let the transition act on values instead of keys, as the reference package does: it then erases
-            the part of *every* stored value that points along the current key. Runs step by step (slow).
+        legacy_left: let the transition act on values instead of keys, as the reference package
+            does: it then erases the part of *every* stored value that points along the current key.
+                Runs step by step (slow).
 
     Raises:
         ValueError: a size is not positive, or ``beta_range`` lies outside (0, 2].
@@ -47,8 +51,12 @@ class GatedDeltaNet(FastWeights):
     ) -> None:
         super().__init__(input_size, hidden_size, key_size)
         if not 0 < beta_range <= 2:
-            raise ValueError(f"beta_range must lie in (0, 2], beyond which the memory explodes; got {beta_range}")
-        self.gate_alpha, self.beta_range, self.legacy_left = gate_alpha, beta_range, legacy_left
+            raise ValueError(
+                f"beta_range must lie in (0, 2], beyond which the memory explodes; got {beta_range}"
+            )
+        self.gate_alpha = gate_alpha
+        self.beta_range = beta_range
+        self.legacy_left = legacy_left
         self.gates = nn.Linear(input_size, 2 if gate_alpha else 1)
         if gate_alpha:
             nn.init.constant_(self.gates.bias[1:], SLOW_FORGETTING)
@@ -60,7 +68,9 @@ class GatedDeltaNet(FastWeights):
         gates = self.gates(x)
         beta = self.beta_range * gates[..., :1].sigmoid()
         log_alpha = F.logsigmoid(gates[..., 1:]) if self.gate_alpha else None
-        return MatrixSteps(unit_length(F.silu(query)), unit_length(F.silu(key)), beta * value, beta, log_alpha)
+        return MatrixSteps(
+            unit_length(F.silu(query)), unit_length(F.silu(key)), beta * value, beta, log_alpha
+        )
 
     def read_out(self, x: Tensor, steps: MatrixSteps, o: Tensor) -> Tensor:
         """See :meth:`FastWeights.read_out`."""
@@ -74,7 +84,9 @@ class GatedDeltaNet(FastWeights):
         o, states = matrix_scan_loop(steps, is_init, h0, erase_values=True)
         return o, states[:, -1]
 
-    def scan_stored(self, steps: MatrixSteps, is_init: Tensor, stored: Tensor) -> tuple[Tensor, Tensor]:
+    def scan_stored(
+        self, steps: MatrixSteps, is_init: Tensor, stored: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """See :meth:`FastWeights.scan_stored`."""
         if not self.legacy_left:
             return super().scan_stored(steps, is_init, stored)

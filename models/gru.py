@@ -14,11 +14,11 @@ __all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward"]
 class GRU(Memory):
     """z, r = sigmoid(W x + U h), c = tanh(W_h x + U_h (r h)), h' = (1 - z) h + z c, y = h'.
 
-    Sequential in time. Not ``torch.nn.GRU``: the reset gate acts on h *before* U_h, z has the other sense, and U has no
-    bias.
+    Sequential in time. Not ``torch.nn.GRU``: the reset gate acts on h *before* U_h, z has the other
+    sense, and U has no bias.
 
-    The loop over time is one operator, so a graph that ``torch.compile`` makes does not depend on the length. It has
-    first derivatives only.
+    The loop over time is one operator, so a graph that ``torch.compile`` makes does not depend on
+    the length. It has first derivatives only.
 
     Args:
         input_size: D.
@@ -27,8 +27,8 @@ class GRU(Memory):
     Raises:
         ValueError: sizes not positive.
 
-    Source: POPGym Arcade, appendix on memory models; Cho et al. (2014), arXiv 1406.1078, eqs. 5 to 8 (with z and 1 - z
-        exchanged).
+    Source: POPGym Arcade, appendix on memory models; Cho et al. (2014), arXiv 1406.1078, eqs. 5 to
+        8 (with z and 1 - z exchanged).
     """
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
@@ -49,14 +49,17 @@ class GRU(Memory):
         start = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
         scan: Any = gru_loop if x.shape[1] == 1 else gru_scan
         weights = self.gates_from_state.weight, self.candidate_from_state.weight
-        y = scan(steps, *(weight.to(steps.dtype) for weight in weights), start, stored.to(steps.dtype))[0]
+        y = scan(
+            steps, *(weight.to(steps.dtype) for weight in weights), start, stored.to(steps.dtype)
+        )[0]
         return y, y
 
 
 def gru_loop(
     steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The recurrence in plain torch operators: what acting runs, and the oracle of :func:`gru_scan`.
+    """The recurrence in plain torch operators: what acting runs, and the oracle of
+    :func:`gru_scan`.
 
     Args:
         steps: float [B, T, 3 H], what the input adds to z, r and c.
@@ -70,8 +73,11 @@ def gru_loop(
     """
     size = candidate_weight.shape[0]
     gates, candidates = (part.unbind(1) for part in steps.split([2 * size, size], dim=-1))
-    h, kept = stored[:, 0], []
-    for t, (begins, fresh) in enumerate(zip(start.unsqueeze(-1).unbind(1), stored.unbind(1), strict=True)):
+    h = stored[:, 0]
+    kept = []
+    for t, (begins, fresh) in enumerate(
+        zip(start.unsqueeze(-1).unbind(1), stored.unbind(1), strict=True)
+    ):
         h = torch.where(begins, fresh, h) if t else h
         both = torch.sigmoid(torch.addmm(gates[t], h, gates_weight.t()))
         z, r = both.chunk(2, dim=-1)
@@ -86,7 +92,9 @@ def gru_loop(
 def gru_scan(
     steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """:func:`gru_loop` as one operator; gradients flow from the states, not from the gates and candidates."""
+    """:func:`gru_loop` as one operator; gradients flow from the states, not from the gates and
+    candidates.
+    """
     return gru_loop(steps, gates_weight, candidate_weight, start, stored)
 
 
@@ -101,19 +109,21 @@ def gru_scan_backward(
     candidates: Tensor,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of :func:`gru_scan` with respect to its float arguments, from what it took and returned, and the
-    gradient [B, T, H] that arrives at the states.
+    """Gradients of :func:`gru_scan` with respect to its float arguments, from what it took and
+    returned, and the gradient [B, T, H] that arrives at the states.
     """
     size = candidate_weight.shape[0]
     begins = start.unsqueeze(-1)
     before = torch.where(begins, stored, torch.cat([stored[:, :1], states[:, :-1]], dim=1))
     z, r = gates.chunk(2, dim=-1)
     # What does not depend on the gradient from later steps, for all steps at once.
-    to_c, to_gates = z * (1 - candidates * candidates), gates * (1 - gates)
+    to_c = z * (1 - candidates * candidates)
+    to_gates = gates * (1 - gates)
     to_gates[..., :size] *= candidates - before
     to_gates[..., size:] *= before
     columns = [x.unbind(1) for x in (to_c, to_gates, 1 - z, r, begins, grad)]
-    grad_steps, grad_before = grad.new_empty(*grad.shape[:2], 3 * size), torch.empty_like(states)
+    grad_steps = grad.new_empty(*grad.shape[:2], 3 * size)
+    grad_before = torch.empty_like(states)
     carried = torch.zeros_like(states[:, 0])
     for t in range(grad.shape[1] - 1, -1, -1):
         to_c_t, to_gates_t, keep, r_t, begins_t, grad_t = (column[t] for column in columns)
@@ -122,7 +132,9 @@ def gru_scan_backward(
         d_reset = d_c @ candidate_weight
         d_gates = torch.cat([d_h, d_reset], dim=-1) * to_gates_t
         d_before = torch.addmm(d_h * keep + d_reset * r_t, d_gates, gates_weight)
-        grad_steps[:, t, : 2 * size], grad_steps[:, t, 2 * size :], grad_before[:, t] = d_gates, d_c, d_before
+        grad_steps[:, t, : 2 * size] = d_gates
+        grad_steps[:, t, 2 * size :] = d_c
+        grad_before[:, t] = d_before
         carried = d_before.masked_fill(begins_t, 0)
     d_gates, d_c = (part.flatten(0, 1) for part in grad_steps.split([2 * size, size], dim=-1))
     to_weights = d_gates.t() @ before.flatten(0, 1), d_c.t() @ (r * before).flatten(0, 1)
@@ -130,13 +142,17 @@ def gru_scan_backward(
 
 
 @gru_scan.register_fake
-def _(steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor) -> Any:
+def _(
+    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
+) -> Any:
     batch, length, size = stored.shape
     return tuple(steps.new_empty(batch, length, width) for width in (size, 2 * size, size))
 
 
 @gru_scan_backward.register_fake
-def _(gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor, *rest: Tensor) -> Any:
+def _(
+    gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor, *rest: Tensor
+) -> Any:
     grad_steps = stored.new_empty(*stored.shape[:2], 3 * stored.shape[2])
     return grad_steps, *(x.new_empty(x.shape) for x in (gates_weight, candidate_weight, stored))
 
@@ -154,10 +170,15 @@ gru_scan.register_autograd(_differentiate, setup_context=_save)
 
 
 def _one_by_one(op: Any) -> Any:
-    """A vmap rule: the operator once for each entry of the mapped dimension (the weights may differ)."""
+    """A vmap rule: the operator once for each entry of the mapped dimension (the weights may
+    differ).
+    """
 
     def rule(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> Any:
-        rows = [[x] * info.batch_size if d is None else x.unbind(d) for x, d in zip(args, in_dims, strict=True)]
+        rows = [
+            [x] * info.batch_size if d is None else x.unbind(d)
+            for x, d in zip(args, in_dims, strict=True)
+        ]
         found = [op(*row) for row in zip(*rows, strict=True)]
         return tuple(torch.stack(parts) for parts in zip(*found, strict=True)), (0,) * len(found[0])
 

@@ -13,37 +13,49 @@ EPSILON = 1e-6  # keeps the quotient finite where a kernel underflows
 
 
 class LinearTransformer(FastWeights):
-    """S_t = S_{t-1} + phi(k) v^T, n_t = n_{t-1} + phi(k), y = W (S^T phi(q)) / (n . phi(q)) + x, phi = 1 + elu.
+    """S_t = S_{t-1} + phi(k) v^T, n_t = n_{t-1} + phi(k), y = W (S^T phi(q)) / (n . phi(q)) + x,
+    phi = 1 + elu.
 
-    k, q and v are linear in x, without bias. The state ``"h"`` is [K, K + 1]: S, and n as its last column. ``+ x``
-    becomes a linear map when the sizes differ.
+    k, q and v are linear in x, without bias. The state ``"h"`` is [K, K + 1]: S, and n as its last
+    column. ``+ x`` becomes a linear map when the sizes differ.
 
     Args:
         input_size: D.
         hidden_size: H.
         key_size: K; None is the integer nearest to sqrt(H).
-        legacy_normaliser: divide by phi(k_t) . phi(q_t), the last key alone, as the reference package does; outputs
-            then grow with the length of the episode, and the state is S alone. ``check_memory`` refuses it, with the
-            law "an average of equal values is that value".
+        legacy_normaliser: divide by phi(k_t) . phi(q_t), the last key alone, as the reference
+            package does; outputs then grow with the length of the episode, and the state is S
+            alone. ``check_memory`` refuses it, with the law "an average of equal values is that
+            value".
 
     Raises:
         ValueError: a size is not positive.
 
-    Source: Katharopoulos et al. (2020), arXiv 2006.16236, eqs. 18 to 20; POPGym Arcade, appendix on memory models
-        (whose equation also puts phi around the values; neither that paper's code nor the original does).
+    Source: Katharopoulos et al. (2020), arXiv 2006.16236, eqs. 18 to 20; POPGym Arcade, appendix on
+        memory models (whose equation also puts phi around the values; neither that paper's code nor
+        the original does).
     """
 
     averages_values = True
 
     def __init__(
-        self, input_size: int, hidden_size: int, *, key_size: int | None = None, legacy_normaliser: bool = False
+        self,
+        input_size: int,
+        hidden_size: int,
+        *,
+        key_size: int | None = None,
+        legacy_normaliser: bool = False,
     ) -> None:
         super().__init__(input_size, hidden_size, key_size)
         self.legacy_normaliser = legacy_normaliser
         if not legacy_normaliser:
             self.state_shape = (self.key_size, self.key_size + 1)
         self.output = nn.Linear(self.key_size, hidden_size)
-        self.skip = nn.Identity() if input_size == hidden_size else nn.Linear(input_size, hidden_size, bias=False)
+        self.skip = (
+            nn.Identity()
+            if input_size == hidden_size
+            else nn.Linear(input_size, hidden_size, bias=False)
+        )
 
     def steps(self, x: Tensor, counters: dict[str, Tensor]) -> MatrixSteps:
         """See :meth:`FastWeights.steps`."""

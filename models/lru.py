@@ -13,15 +13,17 @@ __all__ = ["LRU"]
 
 
 class LRU(Memory):
-    """h_t = lambda h_{t-1} + exp(gamma) B x_t and y_t = Re(C h_t) + D x_t, lambda = exp(-exp(nu) + i exp(theta)).
+    """h_t = lambda h_{t-1} + exp(gamma) B x_t and y_t = Re(C h_t) + D x_t, lambda = exp(-exp(nu) +
+    i exp(theta)).
 
-    The state ``"h"`` is complex and kept as real pairs [B, H, 2], so that primers, checkpoints and storages see floats.
-    B is stored as its real and imaginary parts and C as (Re C, -Im C), so both products are one real matrix product.
+    The state ``"h"`` is complex and kept as real pairs [B, H, 2], so that primers, checkpoints and
+    storages see floats. B is stored as its real and imaginary parts and C as (Re C, -Im C), so both
+    products are one real matrix product.
 
     Args:
         input_size: D.
-        hidden_size: H, complex channels and outputs. When it differs from ``input_size``, the vector D becomes a
-            matrix [H, D].
+        hidden_size: H, complex channels and outputs. When it differs from ``input_size``, the
+            vector D becomes a matrix [H, D].
         r_min: smallest initial \\|lambda\\|, in [0, r_max).
         r_max: largest initial \\|lambda\\|, in (r_min, 1].
         max_phase: initial phases are uniform in [0, max_phase] radians.
@@ -49,10 +51,16 @@ class LRU(Memory):
         self.nu = nn.Parameter(torch.log(-0.5 * torch.log(square)))
         self.theta = nn.Parameter(torch.log((max_phase * torch.rand(hidden_size)).clamp_min(1e-8)))
         self.gamma = nn.Parameter(0.5 * torch.log1p(-square))
-        self.input = nn.Parameter(torch.randn(hidden_size, 2, input_size) / math.sqrt(2 * input_size))
-        self.output = nn.Parameter(torch.randn(hidden_size, hidden_size, 2) / math.sqrt(hidden_size))
+        self.input = nn.Parameter(
+            torch.randn(hidden_size, 2, input_size) / math.sqrt(2 * input_size)
+        )
+        self.output = nn.Parameter(
+            torch.randn(hidden_size, hidden_size, 2) / math.sqrt(hidden_size)
+        )
         skip = (hidden_size,) if input_size == hidden_size else (hidden_size, input_size)
-        self.skip = nn.Parameter(torch.randn(skip) / (1 if len(skip) == 1 else math.sqrt(input_size)))
+        self.skip = nn.Parameter(
+            torch.randn(skip) / (1 if len(skip) == 1 else math.sqrt(input_size))
+        )
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., H, 2]."""
@@ -60,7 +68,9 @@ class LRU(Memory):
         scaled = (self.input * torch.exp(self.gamma)[:, None, None]).flatten(0, 1)
         b = F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2))
         h = torch.view_as_real(
-            linear_scan(decay, torch.view_as_complex(b), is_init, torch.view_as_complex(h0.contiguous()))
+            linear_scan(
+                decay, torch.view_as_complex(b), is_init, torch.view_as_complex(h0.contiguous())
+            )
         )
         passed = x * self.skip if self.skip.ndim == 1 else F.linear(x, self.skip)
         return F.linear(h.flatten(-2), self.output.flatten(1)) + passed, h

@@ -1,4 +1,6 @@
-"""What a memory model is: two methods, the shared half of ours, and how TorchRL sees one (:class:`MemoryModule`)."""
+"""What a memory model is: two methods, the shared half of ours, and how TorchRL sees one
+(:class:`MemoryModule`).
+"""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
@@ -13,18 +15,22 @@ if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
 __all__ = [
-    "Key", "Memory", "MemoryContract", "MemoryModule", "ReplayableMemory", "Store", "replay", "replay_by_steps",
+    "Key", "Memory", "MemoryContract", "MemoryModule", "ReplayableMemory", "Store", "replay",
+    "replay_by_steps",
 ]  # fmt: skip
 
 Key = str | tuple[str, ...]
 Store = Literal["step", "sequence"]
 
-LARGE_STATE = 49_152  # bytes: what a frame of 128 x 128 pixels takes, beside which a state would be stored
+# bytes: what a frame of 128 x 128 pixels takes, beside which a state would be stored
+LARGE_STATE = 49_152
 
 
 @runtime_checkable
 class MemoryContract(Protocol):
-    """The two methods by which any module, ours or yours, is a memory model; ``check_memory`` tests the laws."""
+    """The two methods by which any module, ours or yours, is a memory model; ``check_memory`` tests
+    the laws.
+    """
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """Read a chunk of steps.
@@ -32,11 +38,12 @@ class MemoryContract(Protocol):
         Args:
             x: float [B, T, D], inputs; acting is the same call with T = 1.
             state: TensorDict [B] of fixed-shape tensors, the recurrent state before step 0.
-            is_init: bool [B, T], True where a step opens an episode: everything before it is forgotten *before*
-                that step is read (at index 0: ``state`` is ignored).
+            is_init: bool [B, T], True where a step opens an episode: everything before it is
+                forgotten *before* that step is read (at index 0: ``state`` is ignored).
 
         Returns:
-            (y float [B, T, H], state TensorDict [B] after the last step); the given state is not modified.
+            (y float [B, T, H], state TensorDict [B] after the last step); the given state is not
+            modified.
         """
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
@@ -45,15 +52,19 @@ class MemoryContract(Protocol):
 
 @runtime_checkable
 class ReplayableMemory(MemoryContract, Protocol):
-    """A memory that also replays stored data at full speed; without this method :func:`replay` steps through time."""
+    """A memory that also replays stored data at full speed; without this method :func:`replay`
+    steps through time.
+    """
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-        """Read sequences whose every step carries the recurrent state that was stored when it was acted.
+        """Read sequences whose every step carries the recurrent state that was stored when it was
+        acted.
 
         Args:
             x: float [B, T, D].
-            stored: TensorDict [B, T], the state *before* each step; loaded at index 0 and wherever ``is_init`` is set
-                (zeros after a real reset, a real state where a sampler cut an episode), not looked at elsewhere.
+            stored: TensorDict [B, T], the state *before* each step; loaded at index 0 and wherever
+                ``is_init`` is set (zeros after a real reset, a real state where a sampler cut an
+                episode), not looked at elsewhere.
             is_init: bool [B, T].
 
         Returns:
@@ -61,8 +72,12 @@ class ReplayableMemory(MemoryContract, Protocol):
         """
 
 
-def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-    """:meth:`ReplayableMemory.replay` of any memory: by its own method, or step by step where it has none."""
+def replay(
+    memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor
+) -> tuple[Tensor, TensorDict]:
+    """:meth:`ReplayableMemory.replay` of any memory: by its own method, or step by step where it
+    has none.
+    """
     if isinstance(memory, ReplayableMemory):
         return memory.replay(x, stored, is_init)
     return replay_by_steps(memory, x, stored, is_init)
@@ -71,9 +86,13 @@ def replay(memory: nn.Module, x: Tensor, stored: TensorDict, is_init: Tensor) ->
 def replay_by_steps(
     memory: Callable[..., tuple[Tensor, TensorDict]], x: Tensor, stored: TensorDict, is_init: Tensor
 ) -> tuple[Tensor, TensorDict]:
-    """The same, one call a step (slow): what :func:`replay` falls back to, and the oracle of ``replay`` methods."""
-    state, carried_on = stored[:, 0], torch.zeros_like(is_init[:, :1])
-    outputs, states = [], []
+    """The same, one call a step (slow): what :func:`replay` falls back to, and the oracle of
+    ``replay`` methods.
+    """
+    state = stored[:, 0]
+    carried_on = torch.zeros_like(is_init[:, :1])
+    outputs = []
+    states = []
     for t in range(x.shape[1]):
         if t > 0:
             state = stored[:, t].where(is_init[:, t], state)
@@ -86,9 +105,9 @@ def replay_by_steps(
 class Memory(nn.Module):
     """Base of the memory models of this package: sizes, initial state, and clear errors.
 
-    A model whose state is one tensor ``"h"``, of which it can afford one per step, says what shape that has
-    (``state_shape``, None for no state) and implements :meth:`run`. Others override :meth:`state_leaves`, ``forward``
-    and ``replay``.
+    A model whose state is one tensor ``"h"``, of which it can afford one per step, says what shape
+    that has (``state_shape``, None for no state) and implements :meth:`run`. Others override
+    :meth:`state_leaves`, ``forward`` and ``replay``.
 
     Args:
         input_size: D, features per step.
@@ -100,25 +119,30 @@ class Memory(nn.Module):
 
     state_shape: tuple[int, ...] | None = None
     averages_values = False
-    """Whether every output is a function of the input and of a weighted mean over the episode's steps, as in softmax
-    and linear attention; ``check_memory`` then has one more law."""
+    """Whether every output is a function of the input and of a weighted mean over the episode's
+    steps, as in softmax and linear attention; ``check_memory`` then has one more law."""
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()
         if input_size < 1 or hidden_size < 1:
-            raise ValueError(f"sizes must be positive, got input_size={input_size}, hidden_size={hidden_size}")
-        self.input_size, self.hidden_size = input_size, hidden_size
+            raise ValueError(
+                f"sizes must be positive, got input_size={input_size}, hidden_size={hidden_size}"
+            )
+        self.input_size = input_size
+        self.hidden_size = hidden_size
         self.register_buffer("like", torch.empty(0), persistent=False)
         self.like: Tensor
-        """An empty tensor with the dtype and the device of the parameters, which a loss may have put elsewhere."""
+        """An empty tensor with the dtype and the device of the parameters, which a loss may have
+        put elsewhere.
+        """
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """Read a chunk of steps.
 
         Args:
             x: float [B, T, D].
-            h0: [B, *state_shape], the state before step 0, or [B, T, *state_shape], one stored state per step (loaded
-                at index 0 and wherever ``is_init`` is set).
+            h0: [B, *state_shape], the state before step 0, or [B, T, *state_shape], one stored
+                state per step (loaded at index 0 and wherever ``is_init`` is set).
             is_init: bool [B, T].
 
         Returns:
@@ -127,14 +151,17 @@ class Memory(nn.Module):
         raise NotImplementedError
 
     def state_leaves(self) -> dict[str, tuple[tuple[int, ...], torch.dtype | None]]:
-        """Shape, without the batch, and dtype (None: that of the parameters) of every tensor in the state."""
+        """Shape, without the batch, and dtype (None: that of the parameters) of every tensor in the
+        state.
+        """
         return {} if self.state_shape is None else {"h": (self.state_shape, None)}
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See :class:`MemoryContract`."""
         self._check(x, state, is_init)
         y, h = self.run(x, state["h"], is_init)
-        return y, TensorDict({"h": h[:, -1].clone()}, batch_size=[x.shape[0]])  # y may be the same memory
+        # y may be the same memory
+        return y, TensorDict({"h": h[:, -1].clone()}, batch_size=[x.shape[0]])
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """See :class:`ReplayableMemory`."""
@@ -143,38 +170,67 @@ class Memory(nn.Module):
         return y, TensorDict({"h": h}, batch_size=x.shape[:2])
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
-        """Zeros: TensorDict [batch_size] with :meth:`state_leaves`, in the parameters' dtype and on their device."""
+        """Zeros: TensorDict [batch_size] with :meth:`state_leaves`, in the parameters' dtype and on
+        their device.
+        """
         batch = [batch_size] if isinstance(batch_size, int) else list(batch_size)
         leaves = {
-            name: torch.zeros(*batch, *shape, dtype=dtype or self.like.dtype, device=self.like.device)
+            name: torch.zeros(
+                *batch, *shape, dtype=dtype or self.like.dtype, device=self.like.device
+            )
             for name, (shape, dtype) in self.state_leaves().items()
         }
         return TensorDict(leaves, batch_size=batch)
 
     def _check(self, x: Tensor, state: TensorDict, is_init: Tensor, batch_ndim: int = 1) -> None:
-        """Raise ValueError unless shapes and types are those of ``forward`` (``batch_ndim`` 1) or ``replay`` (2)."""
+        """Raise ValueError unless shapes and types are those of ``forward`` (``batch_ndim`` 1) or
+        ``replay`` (2).
+        """
         if x.ndim != 3 or x.shape[-1] != self.input_size:
-            raise ValueError(f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)")
+            raise ValueError(
+                f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)"
+            )
         if x.shape[1] == 0:
             raise ValueError(f"x must have at least one step, got {list(x.shape)}")
         dtype = self.like.dtype
         if x.dtype != dtype:
-            raise ValueError(f"x is {x.dtype} but the parameters are {dtype}: cast one of them with .to()")
-        if torch.is_autocast_enabled(x.device.type):
-            raise ValueError("memory models round too much under autocast: turn it off here, as MemoryModule does")
-        if not isinstance(is_init, Tensor) or is_init.dtype != torch.bool or is_init.shape != x.shape[:2]:
-            given = f"{is_init.dtype} {list(is_init.shape)}" if isinstance(is_init, Tensor) else repr(is_init)
             raise ValueError(
-                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {given}; [B, T, 1] needs squeeze(-1)"
+                f"x is {x.dtype} but the parameters are {dtype}: cast one of them with .to()"
             )
-        batch, wanted = x.shape[:batch_ndim], self.state_leaves()
+        if torch.is_autocast_enabled(x.device.type):
+            raise ValueError(
+                "memory models round too much under autocast: turn it off here, as MemoryModule "
+                "does"
+            )
+        if (
+            not isinstance(is_init, Tensor)
+            or is_init.dtype != torch.bool
+            or is_init.shape != x.shape[:2]
+        ):
+            given = (
+                f"{is_init.dtype} {list(is_init.shape)}"
+                if isinstance(is_init, Tensor)
+                else repr(is_init)
+            )
+            raise ValueError(
+                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {given}; [B, T, 1] needs "
+                "squeeze(-1)"
+            )
+        batch = x.shape[:batch_ndim]
+        wanted = self.state_leaves()
         shapes = {name: (*batch, *shape) for name, (shape, _) in wanted.items()}
         if not isinstance(state, TensorDictBase):
-            raise ValueError(f"the state must be a TensorDict, as from initial_state(batch_size), got {type(state)}")
-        if set(state.keys()) != set(wanted) or any(state[name].shape != shape for name, shape in shapes.items()):
+            raise ValueError(
+                "the state must be a TensorDict, as from initial_state(batch_size), got "
+                f"{type(state)}"
+            )
+        if set(state.keys()) != set(wanted) or any(
+            state[name].shape != shape for name, shape in shapes.items()
+        ):
             got = {name: list(leaf.shape) for name, leaf in state.items()}
             raise ValueError(
-                f"the state of {type(self).__name__} must be { {k: list(v) for k, v in shapes.items()} }, got {got}: "
+                f"the state of {type(self).__name__} must be "
+                f"{ {k: list(v) for k, v in shapes.items()} }, got {got}: "
                 "it belongs to another model or batch size; begin with initial_state(batch_size)"
             )
 
@@ -186,20 +242,24 @@ class Memory(nn.Module):
 class MemoryModule(TensorDictModuleBase):
     """A memory model as a TensorDict module with the keys and modes of TorchRL's ``LSTMModule``.
 
-    It reads ``[in_key, state keys, is_init]`` and writes ``[out_key, ("next", state keys)]``; a state key is
-    ``state_key`` followed by the path of the tensor in the model's state, such as ``("memory", "h")``.
+    It reads ``[in_key, state keys, is_init]`` and writes ``[out_key, ("next", state keys)]``; a
+    state key is ``state_key`` followed by the path of the tensor in the model's state, such as
+    ``("memory", "h")``.
 
-    * *Sequential* mode (the default; collecting): every element of the batch is one step; the state is the initial one
-      where ``is_init`` is set.
-    * *Recurrent* mode (``with set_recurrent_mode(True)``; losses switch it on by themselves, GAE called on its own does
-      not): the last batch dimension is time. Sequences start from the state stored at index 0, and at every later
-      ``is_init`` from the state stored *there*: zeros after a true reset, because the primer put them there, and the
-      true state where a sampler cut an episode. Returns the output and the state of every step.
+    * *Sequential* mode (the default; collecting): every element of the batch is one step; the state
+      is the initial one where ``is_init`` is set.
+    * *Recurrent* mode (``with set_recurrent_mode(True)``; losses switch it on by themselves, GAE
+      called on its own does not): the last batch dimension is time. Sequences start from the state
+      stored at index 0, and at every later ``is_init`` from the state stored *there*: zeros after a
+      true reset, because the primer put them there, and the true state where a sampler cut an
+      episode. Returns the output and the state of every step.
 
-    States larger than a frame (the window of a transformer: 0.5 MB a step and layer) are never wanted for every step.
-    With ``store="sequence"`` recurrent mode looks at the state at index 0 only, begins afresh at every ``is_init``, and
-    writes no states: collect with ``ArcadeCollector(..., store_states=False)`` and hand its ``initial_state`` over with
-    :meth:`begin_with`. TorchRL's ``GAE`` needs the state of every step; ``SequenceGAE`` of the agents does not.
+    States larger than a frame (the window of a transformer: 0.5 MB a step and layer) are never
+    wanted for every step. With ``store="sequence"`` recurrent mode looks at the state at index 0
+    only, begins afresh at every ``is_init``, and writes no states: collect with
+    ``ArcadeCollector(..., store_states=False)`` and hand its ``initial_state`` over with
+    :meth:`begin_with`. TorchRL's ``GAE`` needs the state of every step; ``SequenceGAE`` of the
+    agents does not.
 
     Args:
         memory: a memory model (``MemoryContract``).
@@ -208,8 +268,9 @@ class MemoryModule(TensorDictModuleBase):
         state_key: where the recurrent state stands; give actor and critic different ones.
         is_init_key: start flags, bool [*batch, 1].
         default_recurrent_mode: mode outside of ``set_recurrent_mode``.
-        store: "step": a stored sequence holds the state of every step; "sequence": that of its first step; None: "step"
-            unless a state takes more than 49,152 bytes, the size of a frame, or its start is not zeros, or learned.
+        store: "step": a stored sequence holds the state of every step; "sequence": that of its
+            first step; None: "step" unless a state takes more than 49,152 bytes, the size of a
+            frame, or its start is not zeros, or learned.
 
     Raises:
         ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
@@ -219,13 +280,16 @@ class MemoryModule(TensorDictModuleBase):
     Example:
         >>> from arcade_torch.models import make_memory
         >>> from torchrl.modules import set_recurrent_mode
-        >>> module = MemoryModule(make_memory("mingru", 3, 4), in_key="features", out_key="remembered")
+        >>> memory = make_memory("mingru", 3, 4)
+        >>> module = MemoryModule(memory, in_key="features", out_key="remembered")
         >>> module.in_keys, module.out_keys
         (['features', ('memory', 'h'), 'is_init'], ['remembered', ('next', 'memory', 'h')])
         >>> flags = torch.zeros(2, 1, dtype=torch.bool)
-        >>> module(TensorDict({"features": torch.ones(2, 3), "is_init": flags}, [2]))["next", "memory", "h"].shape
+        >>> step = TensorDict({"features": torch.ones(2, 3), "is_init": flags}, [2])
+        >>> module(step)["next", "memory", "h"].shape
         torch.Size([2, 4])
-        >>> sequence = TensorDict({"features": torch.ones(2, 5, 3), "is_init": flags.expand(2, 5)[..., None]}, [2, 5])
+        >>> flags = torch.zeros(2, 5, 1, dtype=torch.bool)
+        >>> sequence = TensorDict({"features": torch.ones(2, 5, 3), "is_init": flags}, [2, 5])
         >>> with set_recurrent_mode(True):
         ...     module(sequence)["remembered"].shape
         torch.Size([2, 5, 4])
@@ -246,18 +310,28 @@ class MemoryModule(TensorDictModuleBase):
         if store not in (None, "step", "sequence"):
             raise ValueError(f"store must be 'step', 'sequence' or None, got {store!r}")
         self.memory = memory
-        self.in_key, self.out_key = unravel_key(in_key), unravel_key(out_key)
+        self.in_key = unravel_key(in_key)
+        self.out_key = unravel_key(out_key)
         self.is_init_key = unravel_key(is_init_key)
         self.default_recurrent_mode = default_recurrent_mode
         prefix = (state_key,) if isinstance(state_key, str) else tuple(state_key)
         example = memory.initial_state(1)  # type: ignore[operator]
-        paths = [(key,) if isinstance(key, str) else tuple(key) for key in example.keys(True, False)]
+        paths = [
+            (key,) if isinstance(key, str) else tuple(key) for key in example.keys(True, False)
+        ]
         leaves = [path for path in paths if isinstance(example.get(path), Tensor)]
-        self._empty = [p for p in paths if p not in leaves and not any(leaf[: len(p)] == p for leaf in leaves)]
+        self._empty = [
+            p for p in paths if p not in leaves and not any(leaf[: len(p)] == p for leaf in leaves)
+        ]
         self._state_keys = {(*prefix, *leaf): leaf for leaf in leaves}
-        zeros = not any(example.get(leaf).any() or example.get(leaf).requires_grad for leaf in leaves)
+        zeros = not any(
+            example.get(leaf).any() or example.get(leaf).requires_grad for leaf in leaves
+        )
         if store == "step" and not zeros:
-            raise ValueError("store='step' needs a memory that begins with zeros and learns no start: take 'sequence'")
+            raise ValueError(
+                "store='step' needs a memory that begins with zeros and learns no start: take "
+                "'sequence'"
+            )
         state_bytes = sum(example.get(leaf).nbytes for leaf in leaves)
         self.store = store or ("step" if zeros and state_bytes <= LARGE_STATE else "sequence")
         self.in_keys = [self.in_key, *self._state_keys, self.is_init_key]
@@ -266,7 +340,8 @@ class MemoryModule(TensorDictModuleBase):
     @property
     def recurrent_mode(self) -> bool:
         """Whether the last batch dimension is read as time."""
-        from torchrl.modules import recurrent_mode  # late: a second to import, for those who want a memory alone
+        # late: a second to import, for those who want a memory alone
+        from torchrl.modules import recurrent_mode
 
         mode = recurrent_mode()
         return self.default_recurrent_mode if mode is None else bool(mode)
@@ -276,15 +351,16 @@ class MemoryModule(TensorDictModuleBase):
         """Read one step, or in recurrent mode sequences, and write output and next state.
 
         Args:
-            tensordict: any batch shape (in recurrent mode [*, T]; [T] alone is one sequence) with ``in_keys``; state
-                keys may be missing, which means the initial state.
+            tensordict: any batch shape (in recurrent mode [*, T]; [T] alone is one sequence) with
+                ``in_keys``; state keys may be missing, which means the initial state.
 
         Returns:
-            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"``: ``out_key`` only; so do not
-            call it with keywords there).
+            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"``:
+            ``out_key`` only; so do not call it with keywords there).
 
         Raises:
-            ValueError: recurrent mode without a time dimension, or start flags that are not [*batch, 1].
+            ValueError: recurrent mode without a time dimension, or start flags that are not
+                [*batch, 1].
             KeyError: no input or no start flags.
         """
         tensordict.set(self.out_key, self.read(tensordict, tensordict[self.in_key]))
@@ -300,13 +376,18 @@ class MemoryModule(TensorDictModuleBase):
         shape = tensordict.batch_size
         is_init = tensordict.get(self.is_init_key, None)
         if is_init is None:
-            raise KeyError(f"no {self.is_init_key!r} in the tensordict: append InitTracker() to the env")
+            raise KeyError(
+                f"no {self.is_init_key!r} in the tensordict: append InitTracker() to the env"
+            )
         if is_init.shape != (*shape, 1):
-            raise ValueError(f"{self.is_init_key!r} must be bool {[*shape, 1]}, got {list(is_init.shape)}")
+            raise ValueError(
+                f"{self.is_init_key!r} must be bool {[*shape, 1]}, got {list(is_init.shape)}"
+            )
         return is_init.squeeze(-1)  # type: ignore[no-any-return]
 
     def read(self, tensordict: TensorDictBase, x: Tensor) -> Tensor:
-        """Like :meth:`forward`, with the input given and the output returned: for modules around this one.
+        """Like :meth:`forward`, with the input given and the output returned: for modules around
+        this one.
 
         Autocast is off inside: a recurrence adds up what bfloat16 rounds away.
 
@@ -317,15 +398,22 @@ class MemoryModule(TensorDictModuleBase):
         Returns:
             float [*batch, H].
         """
-        shape, is_init, recurrent = tensordict.batch_size, self.start_flags(tensordict), self.recurrent_mode
+        shape = tensordict.batch_size
+        is_init = self.start_flags(tensordict)
+        recurrent = self.recurrent_mode
         if recurrent and not shape:
-            raise ValueError("recurrent mode reads the last batch dimension as time, but the batch shape is []")
+            raise ValueError(
+                "recurrent mode reads the last batch dimension as time, but the batch shape is []"
+            )
         rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
-        x, is_init = x.reshape(*rows, x.shape[-1]), is_init.reshape(rows)
+        x = x.reshape(*rows, x.shape[-1])
+        is_init = is_init.reshape(rows)
         x = x.float() if torch.is_autocast_enabled(x.device.type) else x
         with torch.autocast(x.device.type, enabled=False):
             if not recurrent:
-                y, after = self.memory(x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1))
+                y, after = self.memory(
+                    x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1)
+                )
             elif self.store == "step":
                 y, after = replay(self.memory, x, self.stored_state(tensordict, rows), is_init)
             else:
@@ -342,18 +430,22 @@ class MemoryModule(TensorDictModuleBase):
 
         Args:
             tensordict: [*batch, T], sequences.
-            state: [*batch] with ``state_keys``, the states before index 0, such as the ``initial_state`` that
-                ``ArcadeCollector.collect`` returns.
+            state: [*batch] with ``state_keys``, the states before index 0, such as the
+                ``initial_state`` that ``ArcadeCollector.collect`` returns.
 
         Returns:
-            ``tensordict``, with the state keys; a view that takes no memory, of which only index 0 counts.
+            ``tensordict``, with the state keys; a view that takes no memory, of which only index 0
+            counts.
 
         Raises:
             ValueError: ``store`` is "step": later starts would load the state of index 0.
             KeyError: ``state`` lacks a state key.
         """
         if self.store == "step":
-            raise ValueError("with store='step' every step needs a state of its own: make the module with 'sequence'")
+            raise ValueError(
+                "with store='step' every step needs a state of its own: make the module with "
+                "'sequence'"
+            )
         for key in self._state_keys:
             value = state[key]
             axis = tensordict.ndim - 1
@@ -362,13 +454,17 @@ class MemoryModule(TensorDictModuleBase):
         return tensordict
 
     def stored_state(self, tensordict: TensorDictBase, rows: tuple[int, ...]) -> TensorDict:
-        """The states at hand, with the batch shape of ``rows``; where one is missing, the initial state."""
+        """The states at hand, with the batch shape of ``rows``; where one is missing, the initial
+        state.
+        """
         state = TensorDict({}, batch_size=rows)
         for key, leaf in self._state_keys.items():
             value = tensordict.get(key, None)
             if value is None:
                 value = self.memory.initial_state(rows[0]).get(leaf)  # type: ignore[operator]
-                value = value if len(rows) == 1 else value.unsqueeze(1).expand(*rows, *value.shape[1:])
+                value = (
+                    value if len(rows) == 1 else value.unsqueeze(1).expand(*rows, *value.shape[1:])
+                )
             else:
                 value = value.reshape(*rows, *value.shape[tensordict.ndim :])
             state.set(leaf, value)
@@ -377,10 +473,12 @@ class MemoryModule(TensorDictModuleBase):
         return state
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
-        """The transform that puts initial states into an env's resets; ``get_primers_from_module`` finds it.
+        """The transform that puts initial states into an env's resets; ``get_primers_from_module``
+        finds it.
 
         Returns:
-            ``TensorDictPrimer`` for the state keys, zeros (a memory that begins elsewhere does so at ``is_init``).
+            ``TensorDictPrimer`` for the state keys, zeros (a memory that begins elsewhere does so
+            at ``is_init``).
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs import TensorDictPrimer

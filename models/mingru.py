@@ -16,15 +16,16 @@ SLOW_GATE_BIAS = (-5.0, 0.0)  # sigmoid of it: a channel forgets over 2 to 150 s
 class MinGRU(Memory):
     """g = sigmoid(W1 x + b1), h' = (1 - g) h + g c, y = h', with the candidate c = tanh(W2 x + b2).
 
-    Differs from the reference package, which omits the tanh and combines (state, gate) pairs with an operator that is
-    not associative; here acting and learning compute the same function.
+    Differs from the reference package, which omits the tanh and combines (state, gate) pairs with
+    an operator that is not associative; here acting and learning compute the same function.
 
     Args:
         input_size: D.
         hidden_size: H.
-        candidate: "tanh" (the paper's equation) or "linear" (c = W2 x + b2, as in the original MinGRU).
-        slow_gates: draw the gate's bias from U(-5, 0), which spreads the channels' time scales, instead of torch's
-            default (all channels forget half at every step).
+        candidate: "tanh" (the paper's equation) or "linear" (c = W2 x + b2, as in the original
+            MinGRU).
+        slow_gates: draw the gate's bias from U(-5, 0), which spreads the channels' time scales,
+            instead of torch's default (all channels forget half at every step).
 
     Raises:
         ValueError: unknown candidate, or sizes not positive.

@@ -23,17 +23,20 @@ SKIPS = ("residual", "none")
 
 
 class MemoryBlock(nn.Module):
-    """x = W u; then per layer y = cell(x), z = LeakyReLU(LayerNorm(V y)), and x + z (skip "residual") or z ("none").
+    """x = W u; then per layer y = cell(x), z = LeakyReLU(LayerNorm(V y)), and x + z (skip
+    "residual") or z ("none").
 
-    Keeps the contract of a memory model itself (``MemoryContract``), with one nested state per layer:
-    ``("layer0", ...)``, ``("layer1", ...)``. LayerNorm has no parameters.
+    Keeps the contract of a memory model itself (``MemoryContract``), with one nested state per
+    layer: ``("layer0", ...)``, ``("layer1", ...)``. LayerNorm has no parameters.
 
     Args:
         input_size: D.
         hidden_size: H, width of the cells and of the output.
-        memory: a name (:func:`memory_names`) or a factory ``(input_size, hidden_size, **options) -> nn.Module``.
+        memory: a name (:func:`memory_names`) or a factory ``(input_size, hidden_size, **options) ->
+            nn.Module``.
         layers: number of cells.
-        skip: "residual" lets the input bypass the memory, as the paper says; "none" is what its code does.
+        skip: "residual" lets the input bypass the memory, as the paper says; "none" is what its
+            code does.
         memory_options: passed on to the cells.
 
     Raises:
@@ -56,7 +59,9 @@ class MemoryBlock(nn.Module):
         if layers < 1:
             raise ValueError(f"layers must be at least 1, got {layers}")
         options = memory_options or {}
-        self.input_size, self.hidden_size, self.residual = input_size, hidden_size, skip == "residual"
+        self.input_size = input_size
+        self.hidden_size = hidden_size
+        self.residual = skip == "residual"
         self.linear = nn.Linear(input_size, hidden_size)
         make = partial(make_memory, memory) if isinstance(memory, str) else memory
         self.cells = nn.ModuleList(make(hidden_size, hidden_size, **options) for _ in range(layers))
@@ -77,8 +82,12 @@ class MemoryBlock(nn.Module):
         return self._run(x, state, is_init, list(self.cells), [x.shape[0]])
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
-        """Read stored sequences, one stored state per step (see ``ReplayableMemory``); all [B, T]."""
-        return self._run(x, stored, is_init, [partial(replay, cell) for cell in self.cells], x.shape[:2])
+        """Read stored sequences, one stored state per step (see ``ReplayableMemory``); all [B,
+        T].
+        """
+        return self._run(
+            x, stored, is_init, [partial(replay, cell) for cell in self.cells], x.shape[:2]
+        )
 
     def _run(
         self,
@@ -100,29 +109,35 @@ class MemoryBlock(nn.Module):
         """The cells' initial states, TensorDict [batch_size] with one entry per layer."""
         cells = zip(self.names, self.cells, strict=True)
         states = {name: cell.initial_state(batch_size) for name, cell in cells}  # type: ignore[operator]
-        return TensorDict(states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))
+        return TensorDict(
+            states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
+        )
 
 
 class MemoryNetwork(TensorDictModuleBase):
-    """From frames, last actions and start flags to one number per action; a TensorDict module with a recurrent state.
+    """From frames, last actions and start flags to one number per action; a TensorDict module with
+    a recurrent state.
 
-    It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next", *state keys)]``; a
-    network whose block has no state has no state keys. Modes and states are those of :class:`MemoryModule`: one step by
-    default, sequences in recurrent mode. With a predictor it then also writes ``prediction_error`` for losses to add,
-    see the method of that name. :meth:`encode` and :meth:`remember` do the same on plain tensors.
+    It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next",
+    *state keys)]``; a network whose block has no state has no state keys. Modes and states are
+    those of :class:`MemoryModule`: one step by default, sequences in recurrent mode. With a
+    predictor it then also writes ``prediction_error`` for losses to add, see the method of that
+    name. :meth:`encode` and :meth:`remember` do the same on plain tensors.
 
     Args:
         encoder: frames to features [..., E].
         block: a memory model, E + num_actions to H.
         head: [..., H] to [..., A].
-        num_actions: length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is not read.
-        zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is set. Not with
-            ``store="step"``: there TorchRL also sets ``is_init`` in mid-episode (slices, the next observations of
-            ``GAE``).
+        num_actions: length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is
+            not read.
+        zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is
+            set. Not with ``store="step"``: there TorchRL also sets ``is_init`` in mid-episode
+            (slices, the next observations of ``GAE``).
         out_key: where the output is written.
         state_key: where the recurrent state stands; give actor and critic different ones.
         store: which states a stored sequence holds, see :class:`MemoryModule`.
-        predictor: what is remembered and the next one-hot action, [..., H + num_actions], to features [..., E].
+        predictor: what is remembered and the next one-hot action, [..., H + num_actions], to
+            features [..., E].
 
     Attributes:
         out_key, state_keys, store: those of :class:`MemoryModule`.
@@ -166,21 +181,38 @@ class MemoryNetwork(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if zero_action_on_reset and store == "step":
-            raise ValueError("zero_action_on_reset needs store='sequence': with 'step', is_init also marks cuts")
-        self.encoder, self.block, self.head, self.predictor = encoder, block, head, predictor
-        self.obs_size, self.num_actions, self.zero_action_on_reset = encoder.obs_size, num_actions, zero_action_on_reset
+            raise ValueError(
+                "zero_action_on_reset needs store='sequence': with 'step', is_init also marks cuts"
+            )
+        self.encoder = encoder
+        self.block = block
+        self.head = head
+        self.predictor = predictor
+        self.obs_size = encoder.obs_size
+        self.num_actions = num_actions
+        self.zero_action_on_reset = zero_action_on_reset
         self.register_buffer("actions", torch.arange(num_actions), persistent=False)
         self.actions: Tensor
-        # In a tuple, so that the block is registered once and its weights are called "block...." alone.
+        # In a tuple, so that the block is registered once and its weights are called "block...."
+        # alone.
         self._recurrent = (MemoryModule(block, "pixels", out_key, state_key, store=store),)
         module = self._recurrent[0]
-        self.in_keys = ["pixels", *["last_action"] * bool(num_actions), module.is_init_key, *module.state_keys]
+        self.in_keys = [
+            "pixels",
+            *["last_action"] * bool(num_actions),
+            module.is_init_key,
+            *module.state_keys,
+        ]
         self.out_keys = module.out_keys
-        self.out_key, self.state_keys, self.store = module.out_key, module.state_keys, module.store
+        self.out_key = module.out_key
+        self.state_keys = module.state_keys
+        self.store = module.store
         self.state_key = state_key
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
-        """The transform that puts initial states into an env's resets; see :class:`MemoryModule`."""
+        """The transform that puts initial states into an env's resets; see
+        :class:`MemoryModule`.
+        """
         return self._recurrent[0].make_tensordict_primer()
 
     @dispatch  # type: ignore[untyped-decorator]
@@ -188,14 +220,16 @@ class MemoryNetwork(TensorDictModuleBase):
         """Read one step, or in recurrent mode sequences, and write output and next state.
 
         Args:
-            tensordict: any batch shape (in recurrent mode [*, T]) with ``in_keys``; frames may be full or compressed,
-                state keys may be missing, which means the initial state.
+            tensordict: any batch shape (in recurrent mode [*, T]) with ``in_keys``; frames may be
+                full or compressed, state keys may be missing, which means the initial state.
 
         Returns:
-            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"`` without the next states).
+            the same object, with ``out_keys`` (in recurrent mode with ``store="sequence"`` without
+            the next states).
 
         Raises:
-            ValueError: recurrent mode without a time dimension, or start flags that are not [*batch, 1].
+            ValueError: recurrent mode without a time dimension, or start flags that are not
+                [*batch, 1].
             KeyError: an entry is missing.
         """
         x = self.encode(tensordict["pixels"])
@@ -204,7 +238,9 @@ class MemoryNetwork(TensorDictModuleBase):
             x = self._append(x, tensordict["last_action"], recurrent.start_flags(tensordict))
         y = recurrent.read(tensordict, x)
         if self.predictor is not None and recurrent.recurrent_mode:
-            tensordict.set("prediction_error", self.prediction_error(x, y, recurrent.start_flags(tensordict)))
+            tensordict.set(
+                "prediction_error", self.prediction_error(x, y, recurrent.start_flags(tensordict))
+            )
         tensordict.set(recurrent.out_key, self.head(y))
         return tensordict
 
@@ -215,16 +251,21 @@ class MemoryNetwork(TensorDictModuleBase):
             pixels: uint8 [..., S, S, 3].
 
         Returns:
-            uint8 [..., s, s, 3]: 32x32 block means for "small", the upper left 120x120 (of 256: 218x218) for "paper".
+            uint8 [..., s, s, 3]: 32x32 block means for "small", the upper left 120x120 (of 256:
+            218x218) for "paper".
         """
         return self.encoder.compress(pixels)
 
     def calibrate(self, pixels: Tensor) -> None:
-        """Set the input scaling from frames of random play, uint8 [..., S, S, 3] or compressed ("paper": no-op)."""
+        """Set the input scaling from frames of random play, uint8 [..., S, S, 3] or compressed
+        ("paper": no-op).
+        """
         self.encoder.calibrate(pixels)
 
     def encode(self, pixels: Tensor) -> Tensor:
-        """Frames, uint8 or float 0..255, full or compressed [..., S or s, S or s, 3], to features float [..., E]."""
+        """Frames, uint8 or float 0..255, full or compressed [..., S or s, S or s, 3], to features
+        float [..., E].
+        """
         return self.encoder(pixels)  # type: ignore[no-any-return]
 
     def remember(
@@ -246,12 +287,16 @@ class MemoryNetwork(TensorDictModuleBase):
         y, state = self.block(features, state, is_init)
         return self.head(y), state
 
-    def read_sequences(self, sequences: TensorDictBase, state: TensorDictBase | None = None) -> Tensor:
-        """What :meth:`forward` writes in recurrent mode, for sequences whose first states stand apart.
+    def read_sequences(
+        self, sequences: TensorDictBase, state: TensorDictBase | None = None
+    ) -> Tensor:
+        """What :meth:`forward` writes in recurrent mode, for sequences whose first states stand
+        apart.
 
         Args:
             sequences: [B, T] with the observations of ``in_keys``.
-            state: [B] with ``state_keys``, before index 0; None: every sequence begins with an episode.
+            state: [B] with ``state_keys``, before index 0; None: every sequence begins with an
+                episode.
 
         Returns:
             float [B, T, A].
@@ -266,7 +311,8 @@ class MemoryNetwork(TensorDictModuleBase):
         return y
 
     def prediction_error(self, x: Tensor, y: Tensor, is_init: Tensor) -> Tensor:
-        """How far each next frame's features, as deviations from the batch's, are from those expected before it.
+        """How far each next frame's features, as deviations from the batch's, are from those
+        expected before it.
 
         Args:
             x: float [..., T, E + num_actions], what the block read.
@@ -274,24 +320,31 @@ class MemoryNetwork(TensorDictModuleBase):
             is_init: bool [..., T], True where an episode begins.
 
         Returns:
-            float [..., T, 1], mean square; 0 where no frame of the episode follows. Targets get no gradient.
+            float [..., T, 1], mean square; 0 where no frame of the episode follows. Targets get no
+            gradient.
 
         Source: self-prediction with stopped gradient, Ni et al. (2024), arXiv 2401.08898.
         """
         size = self.encoder.feature_size
-        following, action = x[..., 1:, :size].detach(), x[..., 1:, size:]
+        following = x[..., 1:, :size].detach()
+        action = x[..., 1:, size:]
         seen = following.flatten(0, -2)
-        target = (following - seen.mean(0)) / (seen.std(0, correction=0) + 0.01)  # some features hardly ever change
+        # some features hardly ever change
+        target = (following - seen.mean(0)) / (seen.std(0, correction=0) + 0.01)
         expected = self.predictor(torch.cat([y[..., :-1, :], action], dim=-1))  # type: ignore[misc]
         error = (expected - target).square().mean(-1, keepdim=True)
         return F.pad(error.masked_fill(is_init[..., 1:, None], 0.0), (0, 0, 0, 1))
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
-        """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device of the parameters."""
+        """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device
+        of the parameters.
+        """
         return self.block.initial_state(batch_size)  # type: ignore[operator]
 
     def _append(self, features: Tensor, last_action: Tensor, is_init: Tensor) -> Tensor:
-        """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool [...]."""
+        """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool
+        [...].
+        """
         one_hot = last_action.unsqueeze(-1) == self.actions
         if self.zero_action_on_reset:
             one_hot = one_hot & ~is_init.unsqueeze(-1)

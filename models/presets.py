@@ -15,21 +15,35 @@ from arcade_torch.models.memory import Key, Store
 from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork
 from arcade_torch.models.stateless import FeedForward
 
-__all__ = ["FEED_FORWARD", "HEADS", "PRESETS", "NetworkPreset", "make_head", "make_network", "preset_of"]
+__all__ = [
+    "FEED_FORWARD",
+    "HEADS",
+    "PRESETS",
+    "NetworkPreset",
+    "make_head",
+    "make_network",
+    "preset_of",
+]
 
 FEED_FORWARD = "feedforward"
-"""In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see :class:`FeedForward`)."""
+"""In the place of a memory's name: no memory block at all, the paper's "MLP" agent (see
+:class:`FeedForward`).
+"""
 
 
 MOST = {"hidden_size": 2**15, "layers": 256, "towers": 256, "feedforward_size": 2**15}
-"""Largest sizes of a network: a slip of the pen, or a file that somebody else wrote, asks for no more memory."""
+"""Largest sizes of a network: a slip of the pen, or a file that somebody else wrote, asks for no
+more memory.
+"""
 MOST_OPTION = 2**20
 """Largest number in the options of a memory."""
 
 
 @dataclass(frozen=True)
 class NetworkPreset:
-    """A network up to its memory model and its number of outputs; every field is an option of :func:`make_network`."""
+    """A network up to its memory model and its number of outputs; every field is an option of
+    :func:`make_network`.
+    """
 
     encoder: Callable[[int], Encoder]
     """called with ``obs_size``"""
@@ -50,9 +64,13 @@ class NetworkPreset:
     use_last_action: bool = True
     """append the one-hot last action to the features"""
     zero_action_on_reset: bool = False
-    """no last action at the first step of an episode; False shows the last action of the episode before"""
+    """no last action at the first step of an episode; False shows the last action of the episode
+    before
+    """
     predicts: bool = False
-    """the memory (of two towers the actor) learns to expect the next frame, see ``MemoryNetwork.prediction_error``"""
+    """the memory (of two towers the actor) learns to expect the next frame, see
+    ``MemoryNetwork.prediction_error``
+    """
     memory_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     """options of the cells, by name of the memory"""
 
@@ -103,21 +121,24 @@ def make_network(
     """Make a network.
 
     Args:
-        preset: "paper" (1,428,613 parameters plus two cells); "small" (225,733 with MinGRU; learns the easiest games
-            in minutes on one CPU core); "small64", the same with frames of 64 pixels instead of 32 and patches twice
-            as wide, which reads boards and cards better.
-        memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) -> nn.Module``, or
-            "feedforward": no memory block and no last action, the paper's memory-free agent (704,901 parameters).
+        preset: "paper" (1,428,613 parameters plus two cells); "small" (225,733 with MinGRU; learns
+            the easiest games in minutes on one CPU core); "small64", the same with frames of 64
+            pixels instead of 32 and patches twice as wide, which reads boards and cards better.
+        memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) ->
+            nn.Module``, or "feedforward": no memory block and no last action, the paper's
+            memory-free agent (704,901 parameters).
         obs_size: side of the frames in pixels.
         num_outputs: A; one per action for Q-values or logits, 1 for a state value.
         num_actions: number of actions, for the one-hot last action.
         memory_options: options of the cells, over those of the preset.
         out_key: where the output is written.
         state_key: where the recurrent state stands.
-        store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at every ``is_init``;
-            "step": every step has a stored state, see :class:`MemoryModule`; without ``zero_action_on_reset``.
-        **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``, ``head``,
-            ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``predicts``, ``encoder``.
+        store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at
+            every ``is_init``; "step": every step has a stored state, see :class:`MemoryModule`;
+            without ``zero_action_on_reset``.
+        **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``,
+            ``head``, ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``predicts``,
+            ``encoder``.
 
     Returns:
         a :class:`MemoryNetwork`.
@@ -131,38 +152,53 @@ def make_network(
         >>> sum(p.numel() for p in network.parameters())
         225733
         >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
-        >>> last_action, is_init = torch.zeros(2, 7, dtype=torch.int64), torch.zeros(2, 7, dtype=torch.bool)
-        >>> out, state = network.remember(network.encode(frames), last_action, is_init, network.initial_state(2))
+        >>> last_action = torch.zeros(2, 7, dtype=torch.int64)
+        >>> is_init = torch.zeros(2, 7, dtype=torch.bool)
+        >>> features = network.encode(frames)
+        >>> out, state = network.remember(features, last_action, is_init, network.initial_state(2))
         >>> out.shape
         torch.Size([2, 7, 5])
     """
     chosen = preset_of(preset)
     fields = NetworkPreset.__dataclass_fields__
     if unknown := set(options) - set(fields):
-        raise TypeError(f"unknown network option {', '.join(sorted(unknown))}; allowed are {', '.join(fields)}")
+        raise TypeError(
+            f"unknown network option {', '.join(sorted(unknown))}; allowed are {', '.join(fields)}"
+        )
     if memory == FEED_FORWARD and memory_options:
-        raise TypeError(f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got {memory_options}")
+        raise TypeError(
+            f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got "
+            f"{memory_options}"
+        )
     chosen = replace(chosen, **options)
     kinds = {int: "a whole number", bool: "True or False"}
     for name in fields:
-        value, kind = _plain(getattr(chosen, name)), fields[name].type
+        value = _plain(getattr(chosen, name))
+        kind = fields[name].type
         object.__setattr__(chosen, name, value)
         if kind in kinds and type(value) is not kind:
             raise ValueError(f"{name} must be {kinds[kind]}, got {value!r}")
         if kind is int and not 1 <= value <= MOST[name]:
             raise ValueError(f"{name} must be at least 1 and at most {MOST[name]}, got {value}")
     _check_sizes(memory_options or {})
-    for name, allowed in {"skip": SKIPS, "head": HEADS, "actor_critic_head": HEADS, "towers": (1, 2)}.items():
+    for name, allowed in {
+        "skip": SKIPS,
+        "head": HEADS,
+        "actor_critic_head": HEADS,
+        "towers": (1, 2),
+    }.items():
         if (value := getattr(chosen, name)) not in allowed:
             raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
     encoder = chosen.encoder(obs_size)
     block: nn.Module
     if memory == FEED_FORWARD:  # its two layers take the place of a deep head's as well
-        actions, hidden_size = 0, chosen.feedforward_size
+        actions = 0
+        hidden_size = chosen.feedforward_size
         block = FeedForward(encoder.feature_size, hidden_size)
         head = make_head("linear" if chosen.head == "linear" else "plain", hidden_size, num_outputs)
     else:
-        actions, hidden_size = num_actions if chosen.use_last_action else 0, chosen.hidden_size
+        actions = num_actions if chosen.use_last_action else 0
+        hidden_size = chosen.hidden_size
         of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
         block = MemoryBlock(
             encoder.feature_size + actions,
@@ -175,10 +211,17 @@ def make_network(
         head = make_head(chosen.head, hidden_size, num_outputs)
     keys: dict[str, Any] = {"out_key": out_key, "state_key": state_key, "store": store}
     if chosen.predicts:
-        known, size = hidden_size + actions, encoder.feature_size
-        keys["predictor"] = nn.Sequential(nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size))
-    zero_action = chosen.zero_action_on_reset and (store != "step" or "zero_action_on_reset" in options)
-    return MemoryNetwork(encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys)
+        known = hidden_size + actions
+        size = encoder.feature_size
+        keys["predictor"] = nn.Sequential(
+            nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size)
+        )
+    zero_action = chosen.zero_action_on_reset and (
+        store != "step" or "zero_action_on_reset" in options
+    )
+    return MemoryNetwork(
+        encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -200,11 +243,13 @@ def make_head(name: str, input_size: int, num_outputs: int) -> nn.Module:
     """Make an output head.
 
     Args:
-        name: "reference": Linear to 256, Linear (no activation between, as in the published Q-networks);
-            "paper": Linear to 256, Linear 256, LeakyReLU, LayerNorm, Linear (the paper's table; the LayerNorm has
-            parameters, which the table leaves open); "actor_critic": the same with LayerNorm before LeakyReLU, as in
-            the published PPO networks; "linear": one Linear, initial weights a tenth of torch's, bias 0 (small initial
-            values, so that action gaps are not drowned by the noise of the start); "plain": one Linear.
+        name: "reference": Linear to 256, Linear (no activation between, as in the published
+            Q-networks); "paper": Linear to 256, Linear 256, LeakyReLU, LayerNorm, Linear (the
+            paper's table; the LayerNorm has parameters, which the table leaves open);
+            "actor_critic": the same with LayerNorm before LeakyReLU, as in the published PPO
+            networks; "linear": one Linear, initial weights a tenth of torch's, bias 0 (small
+            initial values, so that action gaps are not drowned by the noise of the start); "plain":
+            one Linear.
         input_size: H.
         num_outputs: A.
 

@@ -49,14 +49,15 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     """Make a memory model.
 
     Args:
-        name: one of :func:`memory_names`, or ``"fart"``, the paper's name of the linear transformer.
+        name: one of :func:`memory_names`, or ``"fart"``, the paper's name of the linear
+            transformer.
         input_size: D, features of an input step.
         hidden_size: H, features of an output step.
         **options: those of the model, such as ``candidate="linear"`` of MinGRU.
 
     Returns:
-        ``nn.Module`` with ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
-        ``initial_state(batch_size)``; see ``MemoryContract``.
+        ``nn.Module`` with ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)``
+        and ``initial_state(batch_size)``; see ``MemoryContract``.
 
     Raises:
         ValueError: unknown name; the message has the nearest match and the list.
@@ -65,15 +66,20 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     Example:
         >>> import torch
         >>> memory = make_memory("mingru", input_size=3, hidden_size=4)
-        >>> y, state = memory(torch.zeros(2, 5, 3), memory.initial_state(2), torch.zeros(2, 5, dtype=torch.bool))
+        >>> is_init = torch.zeros(2, 5, dtype=torch.bool)
+        >>> y, state = memory(torch.zeros(2, 5, 3), memory.initial_state(2), is_init)
         >>> y.shape, state["h"].shape
         (torch.Size([2, 5, 4]), torch.Size([2, 4]))
     """
     name = ALIASES.get(name, name)
     if name not in _FACTORIES:
-        near, known = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1), ", ".join(_FACTORIES)
+        near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
+        known = ", ".join(_FACTORIES)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"unknown memory {name!r}: {hint}known are {known}; register_memory or --import adds others")
+        raise ValueError(
+            f"unknown memory {name!r}: {hint}known are {known}; register_memory or --import adds "
+            "others"
+        )
     try:
         inspect.signature(_FACTORIES[name]).bind(input_size, hidden_size, **options)
     except TypeError as error:
@@ -86,8 +92,8 @@ def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = Fals
 
     Args:
         name: what to call it; a Python identifier in lower case.
-        factory: called as ``factory(input_size, hidden_size, **options)``, returns a module that keeps the contract of
-            ``MemoryContract`` (run ``check_memory`` on one).
+        factory: called as ``factory(input_size, hidden_size, **options)``, returns a module that
+            keeps the contract of ``MemoryContract`` (run ``check_memory`` on one).
         overwrite: allow replacing a registered name.
 
     Raises:
@@ -95,9 +101,16 @@ def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = Fals
         TypeError: ``factory`` cannot be called.
     """
     if not name.isidentifier() or name != name.lower():
-        raise ValueError(f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}")
+        raise ValueError(
+            f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}"
+        )
     if not callable(factory) or isinstance(factory, nn.Module):
-        raise TypeError(f"factory must be a class or function of (input_size, hidden_size, **options), got {factory!r}")
+        raise TypeError(
+            "factory must be a class or function of (input_size, hidden_size, **options), got "
+            f"{factory!r}"
+        )
     if (name in _FACTORIES or name in ALIASES) and not overwrite:
-        raise ValueError(f"memory {name!r} is registered already; choose another name or pass overwrite=True")
+        raise ValueError(
+            f"memory {name!r} is registered already; choose another name or pass overwrite=True"
+        )
     _FACTORIES[ALIASES.get(name, name)] = factory

@@ -1,4 +1,6 @@
-"""Rotary position embedding: turns pairs of channels by angles that grow with the position (RoPE)."""
+"""Rotary position embedding: turns pairs of channels by angles that grow with the position
+(RoPE).
+"""
 
 import math
 
@@ -16,8 +18,8 @@ def angles(position: Tensor, width: int, dtype: torch.dtype) -> tuple[Tensor, Te
     Args:
         position: int64 [...], in steps.
         width: number of channels; the last one of an odd number is left alone.
-        dtype: of the result; angles are float64 until the cosine is taken, so that two far positions differ by as
-            much as two near ones.
+        dtype: of the result; angles are float64 until the cosine is taken, so that two far
+            positions differ by as much as two near ones.
 
     Returns:
         (cosine, sine), each [..., width // 2].
@@ -26,7 +28,8 @@ def angles(position: Tensor, width: int, dtype: torch.dtype) -> tuple[Tensor, Te
     """
     pairs = width // 2
     frequency = torch.exp(
-        torch.arange(pairs, dtype=torch.float64, device=position.device) * (-LOG_BASE / max(pairs, 1))
+        torch.arange(pairs, dtype=torch.float64, device=position.device)
+        * (-LOG_BASE / max(pairs, 1))
     )
     angle = position.to(torch.float64).unsqueeze(-1) * frequency
     return angle.cos().to(dtype), angle.sin().to(dtype)
@@ -41,11 +44,13 @@ def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
         sine: like ``cosine``.
 
     Returns:
-        [..., W]: first the first channels of all pairs, then the second ones, then what is left over. The order does
-        not matter to a product of two rotated vectors, which is all that rotated vectors are for.
+        [..., W]: first the first channels of all pairs, then the second ones, then what is left
+        over. The order does not matter to a product of two rotated vectors, which is all that
+        rotated vectors are for.
     """
     turned = 2 * cosine.shape[-1]
-    first, second = x[..., 0:turned:2], x[..., 1:turned:2]
+    first = x[..., 0:turned:2]
+    second = x[..., 1:turned:2]
     parts = [first * cosine - second * sine, first * sine + second * cosine]
     return torch.cat(parts if turned == x.shape[-1] else [*parts, x[..., turned:]], dim=-1)
 
@@ -53,8 +58,9 @@ def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 def rotate_pairs(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
     """:func:`rotate`, with every channel left in its place.
 
-    Pairs are complex numbers and turning is one product of them: one pass over memory, on a CPU several times as fast
-    as picking out every second channel. Graphs that are compiled, and what cannot be read as pairs, go by the latter.
+    Pairs are complex numbers and turning is one product of them: one pass over memory, on a CPU
+    several times as fast as picking out every second channel. Graphs that are compiled, and what
+    cannot be read as pairs, go by the latter.
 
     Args:
         x: [..., W].
@@ -72,7 +78,11 @@ def rotate_pairs(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 
 
 def _is_pairs(x: Tensor) -> bool:
-    """Whether the memory of x can be read as complex numbers, outside of a graph (inductor does not fuse those)."""
+    """Whether the memory of x can be read as complex numbers, outside of a graph (inductor does not
+    fuse those).
+    """
     if torch.compiler.is_compiling() or x.dtype not in (torch.float32, torch.float64):
         return False
-    return x.stride(-1) == 1 and not any(n % 2 for n in (x.shape[-1], x.storage_offset(), *x.stride()[:-1]))
+    return x.stride(-1) == 1 and not any(
+        n % 2 for n in (x.shape[-1], x.storage_offset(), *x.stride()[:-1])
+    )

@@ -1,13 +1,15 @@
-"""The first-order linear scan h_t = a_t h_{t-1} + b_t: everything a linear recurrent memory does over time.
+"""The first-order linear scan h_t = a_t h_{t-1} + b_t: everything a linear recurrent memory does
+over time.
 
-:func:`linear_scan` is the function to use. Below stand the operators that do the work, forward and backward, registered
-with torch (autograd, vmap, compile), with back ends by device: a serial loop, in place over time and vectorised over
-batch and features; on CUDA the kernels of ``scan_triton``, or, without Triton or for other dtypes, the doubling form,
-``log2(T)`` passes over the whole tensor. The backward pass is the same recurrence run the other way on
-conj(a) shifted by one; its own derivative is again a scan, so gradients of any order exist.
+:func:`linear_scan` is the function to use. Below stand the operators that do the work, forward and
+backward, registered with torch (autograd, vmap, compile), with back ends by device: a serial loop,
+in place over time and vectorised over batch and features; on CUDA the kernels of ``scan_triton``,
+or, without Triton or for other dtypes, the doubling form, ``log2(T)`` passes over the whole tensor.
+The backward pass is the same recurrence run the other way on conj(a) shifted by one; its own
+derivative is again a scan, so gradients of any order exist.
 
-Inside the operators conj() is spelled conj_physical(): compiled code (torch 2.13, aot and inductor) calls them in a way
-in which the lazy conj() is silently lost.
+Inside the operators conj() is spelled conj_physical(): compiled code (torch 2.13, aot and inductor)
+calls them in a way in which the lazy conj() is silently lost.
 """
 
 from collections.abc import Iterator
@@ -22,19 +24,26 @@ from arcade_torch.models.scan_triton import runs_triton, scan_backward_triton, s
 __all__ = ["back_end", "linear_scan", "scan", "scan_backward"]
 
 
-def linear_scan(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
-    """Solve ``h_t = a_t h_{t-1} + b_t`` over dimension 1, starting afresh wherever ``start`` is set.
+def linear_scan(
+    a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None
+) -> Tensor:
+    """Solve ``h_t = a_t h_{t-1} + b_t`` over dimension 1, starting afresh wherever ``start`` is
+    set.
 
-    Works under autograd (to any order, batched gradients too), ``torch.vmap`` and ``torch.compile(fullgraph=True)``.
-    ``torch.func.grad`` does not support operators registered through ``torch.library``; use ``torch.autograd.grad``.
+    Works under autograd (to any order, batched gradients too), ``torch.vmap`` and
+    ``torch.compile(fullgraph=True)``. ``torch.func.grad`` does not support operators registered
+    through ``torch.library``; use ``torch.autograd.grad``.
 
     Args:
-        a: float or complex, broadcastable to ``[B, T, ...]``: the factors (a constant ``[...]`` is fine).
+        a: float or complex, broadcastable to ``[B, T, ...]``: the factors (a constant ``[...]`` is
+            fine).
         b: float or complex ``[B, T, ...]``: the inputs.
-        start: bool ``[B, T]`` or None; True where an episode begins: ``h_{t-1}`` is not looked at there, be it NaN.
-        h0: the state before index 0, ``[B, ...]`` (one dimension less than ``b``; dropped where ``start[:, 0]``);
-            or one state *per position*, ``[B, T, ...]``: index 0 and every start then load the state that stands
-            at their own position (how a replay buffer stores sequences cut in mid-episode). None means zeros.
+        start: bool ``[B, T]`` or None; True where an episode begins: ``h_{t-1}`` is not looked at
+            there, be it NaN.
+        h0: the state before index 0, ``[B, ...]`` (one dimension less than ``b``; dropped where
+            ``start[:, 0]``); or one state *per position*, ``[B, T, ...]``: index 0 and every start
+            then load the state that stands at their own position (how a replay buffer stores
+            sequences cut in mid-episode). None means zeros.
 
     Returns:
         ``[B, T, ...]``, every state, in the common dtype of ``a`` and ``b``.
@@ -42,7 +51,8 @@ def linear_scan(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | 
     Raises:
         ValueError: shapes do not fit, or ``start`` is not bool ``[B, T]``.
 
-    Source: Blelloch (1990), "Prefix sums and their applications", section 1.4; resets as in arXiv 2303.03982.
+    Source: Blelloch (1990), "Prefix sums and their applications", section 1.4; resets as in arXiv
+        2303.03982.
 
     Example:
         >>> a, b = torch.full((1, 4, 1), 0.5), torch.ones(1, 4, 1)
@@ -53,7 +63,8 @@ def linear_scan(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | 
     """
     if a.dtype != b.dtype:
         dtype = torch.promote_types(a.dtype, b.dtype)
-        a, b = a.to(dtype), b.to(dtype)
+        a = a.to(dtype)
+        b = b.to(dtype)
     if h0 is not None and h0.dtype != b.dtype:
         h0 = h0.to(b.dtype)
     _check(a, b, start, h0)
@@ -71,24 +82,40 @@ def _check(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor | None) -> Non
     """Raise ValueError unless the shapes are those that :func:`linear_scan` documents."""
     if b.ndim < 2 or b.shape[1] == 0:
         raise ValueError(f"b must be [B, T, ...] with T >= 1, got shape {list(b.shape)}")
-    fits = all(n in (1, m) for n, m in zip(a.shape[::-1], b.shape[::-1], strict=False)) and a.ndim <= b.ndim
+    fits = (
+        all(n in (1, m) for n, m in zip(a.shape[::-1], b.shape[::-1], strict=False))
+        and a.ndim <= b.ndim
+    )
     if not fits:
-        raise ValueError(f"a of shape {list(a.shape)} does not broadcast to b of shape {list(b.shape)}")
+        raise ValueError(
+            f"a of shape {list(a.shape)} does not broadcast to b of shape {list(b.shape)}"
+        )
     if start is not None and (start.shape != b.shape[:2] or start.dtype != torch.bool):
         raise ValueError(
             f"start must be bool {list(b.shape[:2])}, got {start.dtype} {list(start.shape)}; "
             "is_init of shape [B, T, 1] needs squeeze(-1)"
         )
     if h0 is not None and h0.shape != b.shape and h0.shape != b.shape[:1] + b.shape[2:]:
-        raise ValueError(f"h0 must be [B, ...] or [B, T, ...] for b of shape {list(b.shape)}, got {list(h0.shape)}")
+        raise ValueError(
+            f"h0 must be [B, ...] or [B, T, ...] for b of shape {list(b.shape)}, got "
+            f"{list(h0.shape)}"
+        )
 
 
 def _keep(h0: Tensor, start: Tensor | None) -> Tensor:
-    """h0 where the first step does not begin an episode; selected, so that a stale NaN does not come through."""
-    return h0 if start is None else h0.masked_fill(start[:, :1].reshape((-1,) + (1,) * (h0.ndim - 1)), 0)
+    """h0 where the first step does not begin an episode; selected, so that a stale NaN does not
+    come through.
+    """
+    return (
+        h0
+        if start is None
+        else h0.masked_fill(start[:, :1].reshape((-1,) + (1,) * (h0.ndim - 1)), 0)
+    )
 
 
-def _load_stored_states(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> tuple[Tensor, Tensor]:
+def _load_stored_states(
+    a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor
+) -> tuple[Tensor, Tensor]:
     """Fold one stored state per position into b; returns the new (b, start)."""
     begins = (torch.arange(b.shape[1], device=b.device) == 0).expand(b.shape[:2])
     if start is not None:
@@ -129,7 +156,9 @@ def scan_serial(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tenso
 
 
 @torch.library.custom_op("arcade_torch::linear_scan_backward", mutates_args=())
-def scan_backward(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+def scan_backward(
+    a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
+) -> tuple[Tensor, Tensor]:
     """Gradients of :func:`scan` with respect to a and b (that of h0 is ``conj(a_0) grad_b_0``).
 
     Args:
@@ -140,17 +169,20 @@ def scan_backward(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: 
         grad: [B, T, ...], the gradient that arrives at h.
 
     Returns:
-        (grad_a, grad_b): grad_b_t = grad_t + conj(a_{t+1}) grad_b_{t+1}, where nothing crosses a start, and
-        grad_a_t = grad_b_t conj(h_{t-1}), zero at a start.
+        (grad_a, grad_b): grad_b_t = grad_t + conj(a_{t+1}) grad_b_{t+1}, where nothing crosses a
+        start, and grad_a_t = grad_b_t conj(h_{t-1}), zero at a start.
     """
     return BACK_ENDS[_back_end_of(grad)][1](a, start, h0, h, grad)
 
 
-def scan_backward_serial(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+def scan_backward_serial(
+    a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
+) -> tuple[Tensor, Tensor]:
     """The backward pass as a loop."""
     starts = _start_masks(start, a.ndim)
     grad_b = grad.clone(memory_format=torch.contiguous_format)
-    factors, rows = torch.conj_physical(a).unbind(1), grad_b.unbind(1)
+    factors = torch.conj_physical(a).unbind(1)
+    rows = grad_b.unbind(1)
     for t in range(len(rows) - 1, 0, -1):
         after = rows[t].masked_fill(starts[t], 0) if t in starts else rows[t]
         rows[t - 1].addcmul_(factors[t], after)
@@ -161,7 +193,9 @@ def scan_backward_serial(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor,
 
 
 def _start_masks(start: Tensor | None, ndim: int) -> dict[int, Tensor]:
-    """For each step at which some row begins an episode: which rows, bool [B, 1, ...] with ndim - 1 dimensions."""
+    """For each step at which some row begins an episode: which rows, bool [B, 1, ...] with ndim - 1
+    dimensions.
+    """
     if start is None:
         return {}
     masks = start.reshape(start.shape + (1,) * (ndim - 2))
@@ -169,11 +203,14 @@ def _start_masks(start: Tensor | None, ndim: int) -> dict[int, Tensor]:
 
 
 def scan_doubling(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
-    """Parallel form (Hillis and Steele 1986): after the pass with shift s an entry covers the 2s steps up to it."""
+    """Parallel form (Hillis and Steele 1986): after the pass with shift s an entry covers the 2s
+    steps up to it.
+    """
     closed = _closed_at_starts(start, b)
     first = torch.where(closed[:, 0], b[:, 0], torch.addcmul(b[:, 0], a[:, 0], h0))
     h = torch.cat([first.unsqueeze(1), b[:, 1:]], dim=1)
-    shift, steps = 1, b.shape[1]
+    shift = 1
+    steps = b.shape[1]
     while shift < steps:
         joined = torch.addcmul(h[:, shift:], a[:, shift:], h[:, :-shift])
         h = torch.cat([h[:, :shift], torch.where(closed[:, shift:], h[:, shift:], joined)], dim=1)
@@ -188,7 +225,11 @@ def scan_backward_doubling(
 ) -> tuple[Tensor, Tensor]:
     """The backward pass in the doubling form: a forward scan over flipped time."""
     shifted = torch.conj_physical(torch.cat([a[:, :1], a[:, 1:].flip(1)], dim=1))
-    begins = None if start is None else torch.cat([torch.zeros_like(start[:, :1]), start[:, 1:].flip(1)], dim=1)
+    begins = (
+        None
+        if start is None
+        else torch.cat([torch.zeros_like(start[:, :1]), start[:, 1:].flip(1)], dim=1)
+    )
     grad_b = scan_doubling(shifted, grad.flip(1), begins, torch.zeros_like(h0)).flip(1).contiguous()
     before = torch.cat([h0.unsqueeze(1), h[:, :-1]], dim=1)
     grad_a = torch.where(_closed_at_starts(start, a), 0, grad_b * torch.conj_physical(before))
@@ -220,10 +261,12 @@ def _back_end_of(x: Tensor) -> str:
 
 @contextmanager
 def back_end(name: str) -> Iterator[None]:
-    """Inside, every scan of this process runs by one back end, whatever the device: for tests and benchmarks.
+    """Inside, every scan of this process runs by one back end, whatever the device: for tests and
+    benchmarks.
 
     Args:
-        name: key of `BACK_ENDS`. "triton" on a CPU needs ``TRITON_INTERPRET=1`` in the environment from the start.
+        name: key of `BACK_ENDS`. "triton" on a CPU needs ``TRITON_INTERPRET=1`` in the environment
+            from the start.
 
     Raises:
         ValueError: there is no such back end.
@@ -236,7 +279,8 @@ def back_end(name: str) -> Iterator[None]:
     global _forced
     if name not in BACK_ENDS:
         raise ValueError(f"no back end {name!r}; there are {', '.join(BACK_ENDS)}")
-    before, _forced = _forced, name
+    before = _forced
+    _forced = name
     try:
         yield
     finally:
@@ -252,7 +296,9 @@ def _(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
 
 
 @scan_backward.register_fake
-def _(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+def _(
+    a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
+) -> tuple[Tensor, Tensor]:
     like = torch.empty_like(grad, memory_format=torch.contiguous_format)
     return like, torch.empty_like(like)
 
@@ -278,8 +324,12 @@ def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tens
     ctx.save_for_backward(a, start, h0, h, output[1])
 
 
-def _differentiate_backward(ctx: Any, to_grad_a: Tensor, to_grad_b: Tensor) -> tuple[Tensor | None, ...]:
-    """Derivative of grad_b = L^H grad and grad_a = grad_b conj(before), where L is the scan without h0."""
+def _differentiate_backward(
+    ctx: Any, to_grad_a: Tensor, to_grad_b: Tensor
+) -> tuple[Tensor | None, ...]:
+    """Derivative of grad_b = L^H grad and grad_a = grad_b conj(before), where L is the scan without
+    h0.
+    """
     a, start, h0, h, grad_b = ctx.saved_tensors
     closed = _closed_at_starts(start, a)
     to_grad_a = to_grad_a.masked_fill(closed, 0)
@@ -295,8 +345,12 @@ scan.register_autograd(_differentiate_scan, setup_context=_save_scan)
 scan_backward.register_autograd(_differentiate_backward, setup_context=_save_backward)
 
 
-def _fold(size: int, dims: tuple[int | None, ...], args: tuple[Tensor | None, ...]) -> list[Tensor | None]:
-    """Move each argument's vmapped dimension into the batch (an argument without one is repeated)."""
+def _fold(
+    size: int, dims: tuple[int | None, ...], args: tuple[Tensor | None, ...]
+) -> list[Tensor | None]:
+    """Move each argument's vmapped dimension into the batch (an argument without one is
+    repeated).
+    """
 
     def fold(x: Tensor | None, dim: int | None) -> Tensor | None:
         if x is None:

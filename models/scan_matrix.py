@@ -1,16 +1,20 @@
-"""The matrix-valued linear recurrence: what linear attention, the delta rule and its gated form do over time.
+"""The matrix-valued linear recurrence: what linear attention, the delta rule and its gated form do
+over time.
 
-    S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T,        o_t = S_t^T q_t,        S [K, V]
+    S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T,        o_t = S_t^T q_t,        S [K,
+    V]
 
-:func:`matrix_scan` is the function to use. :func:`matrix_scan_loop` beside it is the same thing as a loop that can be
-read at a glance, and the oracle of the tests. :func:`matrix_scan_stored` begins in states that a replay buffer kept.
+:func:`matrix_scan` is the function to use. :func:`matrix_scan_loop` beside it is the same thing as
+a loop that can be read at a glance, and the oracle of the tests. :func:`matrix_scan_stored` begins
+in states that a replay buffer kept.
 
-The fast form cuts time into chunks. Within one, every matrix is gone: S_t = sum_j (decay from j to t) k_j u_j^T, where
-the rows u solve one unit lower triangular system (without erasing, u = v), so a chunk is a few small matrix products,
-and only one state per chunk is ever made. Plain torch operators: autograd, vmap and torch.compile need no help.
+The fast form cuts time into chunks. Within one, every matrix is gone: S_t = sum_j (decay from j to
+t) k_j u_j^T, where the rows u solve one unit lower triangular system (without erasing, u = v), so a
+chunk is a few small matrix products, and only one state per chunk is ever made. Plain torch
+operators: autograd, vmap and torch.compile need no help.
 
-Source: Yang et al. (2024), arXiv 2406.06484, section 3.2; with decay: Yang et al. (2025), arXiv 2412.06464, section
-3.3.
+Source: Yang et al. (2024), arXiv 2406.06484, section 3.2; with decay: Yang et al. (2025), arXiv
+2412.06464, section 3.3.
 """
 
 import math
@@ -42,17 +46,20 @@ class MatrixSteps(NamedTuple):
     """[B, T, 1]: log alpha, at most 0; None keeps everything"""
 
 
-def matrix_scan(steps: MatrixSteps, start: Tensor, h0: Tensor, *, chunk: int = CHUNK) -> tuple[Tensor, Tensor]:
+def matrix_scan(
+    steps: MatrixSteps, start: Tensor, h0: Tensor, *, chunk: int = CHUNK
+) -> tuple[Tensor, Tensor]:
     """Run the recurrence over a sequence, starting afresh (from zeros) wherever ``start`` is set.
 
-    Nothing crosses a start, be it a NaN or infinity; one in what is written (or in ``h0``) loses the rest of its
-    episode, whose outputs and states become NaN.
+    Nothing crosses a start, be it a NaN or infinity; one in what is written (or in ``h0``) loses
+    the rest of its episode, whose outputs and states become NaN.
 
     Args:
         steps: what each step does.
         start: bool [B, T].
         h0: [B, K, V], the state before index 0; not looked at where ``start[:, 0]``.
-        chunk: largest number of steps in a chunk. Memory is O(T chunk + T / chunk K V), never T K V.
+        chunk: largest number of steps in a chunk. Memory is O(T chunk + T / chunk K V), never T K
+            V.
 
     Returns:
         (o [B, T, V], the last state [B, K, V]).
@@ -73,17 +80,19 @@ def matrix_scan_loop(
     Args:
         steps: what each step does.
         start: bool [B, T].
-        h0: [B, K, V], the state before index 0; or [B, T, K, V], a state per position, loaded at index 0 and wherever
-            ``start`` is set.
-        erase_values: erase from the other side, S_t = alpha S_{t-1} (I - beta k k^T) + k v^T, which needs K = V: the
-            transition of the reference package's gated delta net, which does not do what the delta rule is for.
+        h0: [B, K, V], the state before index 0; or [B, T, K, V], a state per position, loaded at
+            index 0 and wherever ``start`` is set.
+        erase_values: erase from the other side, S_t = alpha S_{t-1} (I - beta k k^T) + k v^T, which
+            needs K = V: the transition of the reference package's gated delta net, which does not
+            do what the delta rule is for.
 
     Returns:
         (o [B, T, V], the state after each step [B, T, K, V]).
     """
     stored = h0.ndim == steps.query.ndim + 1
     state = h0[:, 0] if stored else h0
-    outputs, states = [], []
+    outputs = []
+    states = []
     for t, begins in enumerate(start[..., None, None].unbind(1)):
         if stored and t > 0:
             state = torch.where(begins, h0[:, t], state)
@@ -96,15 +105,18 @@ def matrix_scan_loop(
 
 
 def matrix_scan_stored(steps: MatrixSteps, start: Tensor, stored: Tensor) -> tuple[Tensor, Tensor]:
-    """Run the recurrence from stored states, one per position, and return the state after each step.
+    """Run the recurrence from stored states, one per position, and return the state after each
+    step.
 
-    What was loaded only fades, S_t = c_t G + D_t with G the loaded state and c_t the decay since then; D begins with
-    zeros and follows the same recurrence, for values less what G holds under the key.
+    What was loaded only fades, S_t = c_t G + D_t with G the loaded state and c_t the decay since
+    then; D begins with zeros and follows the same recurrence, for values less what G holds under
+    the key.
 
     Args:
         steps: what each step does.
         start: bool [B, T].
-        stored: [B, T, K, V], loaded at index 0 and wherever ``start`` is set, not looked at elsewhere.
+        stored: [B, T, K, V], loaded at index 0 and wherever ``start`` is set, not looked at
+            elsewhere.
 
     Returns:
         (o [B, T, V], the state after each step [B, T, K, V]).
@@ -126,7 +138,9 @@ def matrix_scan_stored(steps: MatrixSteps, start: Tensor, stored: Tensor) -> tup
     return torch.einsum("btk,btkv->btv", steps.query, states), states
 
 
-def _step(step: list[Tensor | None], state: Tensor, erase_values: bool = False) -> tuple[Tensor, Tensor]:
+def _step(
+    step: list[Tensor | None], state: Tensor, erase_values: bool = False
+) -> tuple[Tensor, Tensor]:
     """One step, everything without the time dimension: (o [B, V], S_t)."""
     query, key, value, erase, log_decay = step
     assert query is not None and key is not None and value is not None
@@ -141,7 +155,9 @@ def _step(step: list[Tensor | None], state: Tensor, erase_values: bool = False) 
     return torch.bmm(query.unsqueeze(1), state).squeeze(1), state
 
 
-def _chunked(steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
+def _chunked(
+    steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """(o [B, T, V], the rows u [B, T, V] that were written, the last state [B, K, V])."""
     length = start.shape[1]
     steps, h0, lost = _contained(steps, start, h0)
@@ -152,17 +168,21 @@ def _chunked(steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int) -> tuple
         None if x is None else F.pad(x, (0, 0, 0, spare)).unflatten(1, (count, size)) for x in steps
     )
     assert query is not None and key is not None and value is not None
-    episode = F.pad(start, (0, spare)).unflatten(1, (count, size)).cumsum(-1)  # 0: runs when the chunk begins
+    # 0: runs when the chunk begins
+    episode = F.pad(start, (0, spare)).unflatten(1, (count, size)).cumsum(-1)
     decay, fade = _decays(episode, log_decay, query.dtype)
     attention = (query @ key.mT) * decay
     erased = None
     if erase is not None:
         system = (key @ key.mT) * decay * erase
         given = torch.cat([value, key * (fade * erase)], dim=-1)
-        solved = torch.linalg.solve_triangular(system.tril(-1), given, upper=False, unitriangular=True)
+        solved = torch.linalg.solve_triangular(
+            system.tril(-1), given, upper=False, unitriangular=True
+        )
         value, erased = solved.split([value.shape[-1], key.shape[-1]], dim=-1)
     state = torch.where(start[:, 0, None, None], 0, h0)
-    befores, written = [], []
+    befores = []
+    written = []
     rows = zip(
         (key * decay[..., -1, :].unsqueeze(-1)).mT.unbind(1),
         value.unbind(1),
@@ -182,7 +202,8 @@ def _chunked(steps: MatrixSteps, start: Tensor, h0: Tensor, chunk: int) -> tuple
 
 
 def _contained(steps: MatrixSteps, start: Tensor, h0: Tensor) -> tuple[MatrixSteps, Tensor, Tensor]:
-    """Zeros for what is not finite, which a product with zero would not stop, and which steps have lost their state.
+    """Zeros for what is not finite, which a product with zero would not stop, and which steps have
+    lost their state.
 
     Queries stay: each has a part in its own output alone.
 
@@ -195,22 +216,25 @@ def _contained(steps: MatrixSteps, start: Tensor, h0: Tensor) -> tuple[MatrixSte
         total = total + erase.squeeze(-1)
     if log_decay is not None:
         total = total + log_decay.exp().squeeze(-1)
-    bad, bad_h0 = ~total.isfinite(), ~h0.sum((-1, -2)).isfinite()
+    bad = ~total.isfinite()
+    bad_h0 = ~h0.sum((-1, -2)).isfinite()
     index = torch.arange(start.shape[1], device=start.device)
     last_bad = torch.where(bad, index, -1 - (~bad_h0).long().unsqueeze(-1)).cummax(dim=1).values
     lost = last_bad >= torch.where(start, index, -1).cummax(dim=1).values
     bad = bad.unsqueeze(-1)
-    key, value = key.masked_fill(bad, 0), value.masked_fill(bad, 0)
+    key = key.masked_fill(bad, 0)
+    value = value.masked_fill(bad, 0)
     erase, log_decay = (None if x is None else x.masked_fill(bad, 0) for x in (erase, log_decay))
     h0 = h0.masked_fill(bad_h0[:, None, None], 0)
     return MatrixSteps(steps.query, key, value, erase, log_decay), h0, lost.unsqueeze(-1)
 
 
 def _decays(episode: Tensor, log_decay: Tensor | None, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """How much of what step j wrote is there at step i, and how much of what was there when the chunk began.
+    """How much of what step j wrote is there at step i, and how much of what was there when the
+    chunk began.
 
-    Every ratio is summed in log space over its own steps alone, so none exceeds 1 and nothing before a start, nor the
-    rounding of it, has a part in what comes after.
+    Every ratio is summed in log space over its own steps alone, so none exceeds 1 and nothing
+    before a start, nor the rounding of it, has a part in what comes after.
 
     Args:
         episode: int64 [B, N, C], number of starts in the chunk up to each step.
@@ -218,7 +242,8 @@ def _decays(episode: Tensor, log_decay: Tensor | None, dtype: torch.dtype) -> tu
         dtype: of the result.
 
     Returns:
-        (decay [B, N, C, C], zero for j > i and over a start; fade [B, N, C, 1], zero from the first start on).
+        (decay [B, N, C, C], zero for j > i and over a start; fade [B, N, C, 1], zero from the first
+        start on).
     """
     size = episode.shape[-1]
     past = torch.ones(size, size, dtype=torch.bool, device=episode.device).tril()

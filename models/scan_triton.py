@@ -1,23 +1,28 @@
-"""The linear scan by Triton: what CUDA runs. Triton is imported when a scan first runs on a card, and only then.
+"""The linear scan by Triton: what CUDA runs. Triton is imported when a scan first runs on a card,
+and only then.
 
-A program (``_triton_kernels``) owns one batch row and `LANE_BYTES` of neighbouring features, takes `CHUNK` steps at a
-time, scans them in parallel, and carries the state to the next chunk in registers. So the forward pass reads a and b
-and writes h, each once: three tensors of [B, T, ...]. The backward pass reads a, h and the gradient that arrives and
-writes those of a and b, each once: five. Factors that are expanded (the constant ones of an LRU) are read where they
-stand and never spread out. For comparison: the doubling form moves about nine tensors in each of its log2(T) passes.
+A program (``_triton_kernels``) owns one batch row and `LANE_BYTES` of neighbouring features, takes
+`CHUNK` steps at a time, scans them in parallel, and carries the state to the next chunk in
+registers. So the forward pass reads a and b and writes h, each once: three tensors of [B, T, ...].
+The backward pass reads a, h and the gradient that arrives and writes those of a and b, each once:
+five. Factors that are expanded (the constant ones of an LRU) are read where they stand and never
+spread out. For comparison: the doubling form moves about nine tensors in each of its log2(T)
+passes.
 
-Sizes. A row of a chunk is one cache line of 128 bytes: 32 float32, 16 complex64 or float64, 8 complex128, so that every
-line that is fetched is used whole. 64 steps make 8 KiB of each tensor on their way at a time for a program; with the
-256 programs of B = 16 and H = 512 that is 4 MiB of inputs, more than what a fast card needs in flight to be busy
-(3 TB/s at a delay of 1 us: 3 MB), where one step at a time would have 64 KiB. With 4 warps a thread holds 16 entries of
-a real chunk; compiled for sm_80 and sm_90, no kernel spills registers. How fast it is on a card has not been measured;
-``arcade-torch bench memory --device cuda`` does it where there is one.
+Sizes. A row of a chunk is one cache line of 128 bytes: 32 float32, 16 complex64 or float64, 8
+complex128, so that every line that is fetched is used whole. 64 steps make 8 KiB of each tensor on
+their way at a time for a program; with the 256 programs of B = 16 and H = 512 that is 4 MiB of
+inputs, more than what a fast card needs in flight to be busy (3 TB/s at a delay of 1 us: 3 MB),
+where one step at a time would have 64 KiB. With 4 warps a thread holds 16 entries of a real chunk;
+compiled for sm_80 and sm_90, no kernel spills registers. How fast it is on a card has not been
+measured; ``arcade-torch bench memory --device cuda`` does it where there is one.
 
-Like every parallel form it multiplies factors of several steps. Where |a| is far above 1 such a product can overflow
-though no state does; memories have |a| <= 1.
+Like every parallel form it multiplies factors of several steps. Where |a| is far above 1 such a
+product can overflow though no state does; memories have |a| <= 1.
 
-The matrix-valued recurrences need no kernel: the chunked form of ``scan_matrix`` consists of batched matrix products
-and one triangular solve, which CUDA runs through cuBLAS, and no state per step ever reaches memory.
+The matrix-valued recurrences need no kernel: the chunked form of ``scan_matrix`` consists of
+batched matrix products and one triangular solve, which CUDA runs through cuBLAS, and no state per
+step ever reaches memory.
 """
 
 from functools import cache
@@ -75,7 +80,9 @@ def scan_triton(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tenso
     return h
 
 
-def scan_backward_triton(a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+def scan_backward_triton(
+    a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
+) -> tuple[Tensor, Tensor]:
     """``scan.scan_backward`` in one kernel.
 
     Args:
@@ -108,15 +115,25 @@ def _launch(
     """Run one kernel over its tensors, in the order of its arguments."""
     like = outputs[0]
     if not runs_triton(like):
-        raise RuntimeError(f"no Triton kernel for {like.dtype}: install triton, and use one of {DTYPES}")
+        raise RuntimeError(
+            f"no Triton kernel for {like.dtype}: install triton, and use one of {DTYPES}"
+        )
     if like.numel() == 0:
         return
-    (batch, steps), features = like.shape[:2], like[0, 0].numel()
+    (batch, steps) = like.shape[:2]
+    features = like[0, 0].numel()
     if start is None:
         start = torch.zeros((), dtype=torch.bool, device=like.device).expand(batch, steps)
-    flat = [x.resolve_conj().resolve_neg().reshape(batch, steps, features) for x in (*first, *then, *outputs)]
-    flat[len(first) : len(first)] = [start.view(torch.uint8), h0.resolve_conj().resolve_neg().reshape(batch, features)]
-    strides = [x.stride() for x in flat[: len(flat) - len(outputs) + 1]]  # of the outputs once: all are contiguous
+    flat = [
+        x.resolve_conj().resolve_neg().reshape(batch, steps, features)
+        for x in (*first, *then, *outputs)
+    ]
+    flat[len(first) : len(first)] = [
+        start.view(torch.uint8),
+        h0.resolve_conj().resolve_neg().reshape(batch, features),
+    ]
+    # of the outputs once: all are contiguous
+    strides = [x.stride() for x in flat[: len(flat) - len(outputs) + 1]]
     lanes = min(LANE_BYTES // like.element_size(), _power_of_two(features))
     kernel = getattr(_kernels(), f"{direction}_{'complex' if like.is_complex() else 'real'}")
     with torch.cuda.device_of(like):

@@ -41,10 +41,11 @@ class Stateless(Memory):
 
 
 class FeedForward(nn.Module):
-    """Linear, LayerNorm with parameters, LeakyReLU, twice. Keeps the contract of a memory model, with an empty state.
+    """Linear, LayerNorm with parameters, LeakyReLU, twice. Keeps the contract of a memory model,
+    with an empty state.
 
-    The stateless cell ``"mlp"`` stands in the memory block; this takes the place of the whole block, as in the
-    published "MLP" agents.
+    The stateless cell ``"mlp"`` stands in the memory block; this takes the place of the whole
+    block, as in the published "MLP" agents.
 
     Args:
         input_size: D.
@@ -55,10 +56,15 @@ class FeedForward(nn.Module):
 
     def __init__(self, input_size: int, hidden_size: int = 256) -> None:
         super().__init__()
-        self.input_size, self.hidden_size = input_size, hidden_size
+        self.input_size = input_size
+        self.hidden_size = hidden_size
         layers: list[nn.Module] = []
         for size in (input_size, hidden_size):
-            layers += [nn.Linear(size, hidden_size), nn.LayerNorm(hidden_size), nn.LeakyReLU(inplace=True)]
+            layers += [
+                nn.Linear(size, hidden_size),
+                nn.LayerNorm(hidden_size),
+                nn.LeakyReLU(inplace=True),
+            ]
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
@@ -67,4 +73,6 @@ class FeedForward(nn.Module):
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """An empty TensorDict [batch_size]."""
-        return TensorDict({}, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size))
+        return TensorDict(
+            {}, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
+        )

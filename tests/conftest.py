@@ -1,4 +1,6 @@
-"""What all tests share: one thread a process, equal random numbers, markers that skip where they cannot run."""
+"""What all tests share: one thread a process, equal random numbers, markers that skip where they
+cannot run.
+"""
 
 import importlib.util
 import os
@@ -14,7 +16,9 @@ for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
 # Many test files compile the same games; what one process compiled, the others read from disk.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "jax")
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
@@ -30,22 +34,32 @@ settings.load_profile("arcade")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--device cpu`` rehearses the tests marked `gpu` on the CPU, as far as they make sense there."""
-    parser.addoption("--device", choices=("cuda", "cpu"), default="cuda", help="device of the tests marked gpu")
+    """``--device cpu`` rehearses the tests marked `gpu` on the CPU, as far as they make sense
+    there.
+    """
+    parser.addoption(
+        "--device", choices=("cuda", "cpu"), default="cuda", help="device of the tests marked gpu"
+    )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip `gpu` and `ray` tests with a reason where the machine lacks what they need."""
     rehearsed = config.getoption("device") == "cpu"
     needing_gpu = [item for item in items if item.get_closest_marker("gpu")]
-    needing_gpu = [item for item in needing_gpu if not (rehearsed and "device" in getattr(item, "fixturenames", ()))]
+    needing_gpu = [
+        item
+        for item in needing_gpu
+        if not (rehearsed and "device" in getattr(item, "fixturenames", ()))
+    ]
     needing_ray = [item for item in items if item.get_closest_marker("ray")]
     if needing_gpu and not _has_cuda():
         for item in needing_gpu:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
     if needing_ray and importlib.util.find_spec("ray") is None:
         for item in needing_ray:
-            item.add_marker(pytest.mark.skip(reason="needs the ray extra: pip install 'arcade-torch[ray]'"))
+            item.add_marker(
+                pytest.mark.skip(reason="needs the ray extra: pip install 'arcade-torch[ray]'")
+            )
 
 
 def _has_cuda() -> bool:
@@ -70,7 +84,9 @@ def cuda(device: str) -> str:
 
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> Iterator[None]:
-    """Seed torch's global generator, so that a test does not depend on the ones that ran before it."""
+    """Seed torch's global generator, so that a test does not depend on the ones that ran before
+    it.
+    """
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(0)
     yield
@@ -78,7 +94,9 @@ def _same_random_numbers() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _memories_as_before() -> Iterator[None]:
-    """Forget memory models that a test has registered: others compare the list with the documentation."""
+    """Forget memory models that a test has registered: others compare the list with the
+    documentation.
+    """
     registry = sys.modules.get("arcade_torch.models.registry")
     before = None if registry is None else dict(registry._FACTORIES)
     yield

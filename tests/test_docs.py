@@ -14,14 +14,19 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.options import take_imports
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "results").glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "results").glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+)
 LINKED = ("envs_jax", "models", "agents", "tools")
 SLOW = "<!-- slow -->"
 FENCE = re.compile(
-    rf"(?P<slow>^{SLOW}\n)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^(?P=indent)```$", re.MULTILINE | re.DOTALL
+    rf"(?P<slow>^{SLOW}\n)?^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^(?P=indent)```$",
+    re.MULTILINE | re.DOTALL,
 )
 INLINE = re.compile(r"(?<!`)`arcade-torch ([^`]+)`(?!`)")
-PLACEHOLDER = re.compile(r"[A-Z][A-Z_]+$")  # a word such as NAME or COMMAND stands for something else
+PLACEHOLDER = re.compile(
+    r"[A-Z][A-Z_]+$"
+)  # a word such as NAME or COMMAND stands for something else
 
 
 class Block(NamedTuple):
@@ -33,7 +38,9 @@ class Block(NamedTuple):
 def fenced(text: str, language: str) -> list[Block]:
     """The fenced blocks of a page in one language; what stands below `SLOW` takes long."""
     found = [match for match in FENCE.finditer(text) if match["language"] == language]
-    return [Block(text[: m.start("code")].count("\n") + 1, m["code"], bool(m["slow"])) for m in found]
+    return [
+        Block(text[: m.start("code")].count("\n") + 1, m["code"], bool(m["slow"])) for m in found
+    ]
 
 
 def blocks(path: Path, language: str) -> list[tuple[int, str]]:
@@ -69,24 +76,34 @@ def documented_modules() -> list[str]:
     for path in sources:
         if ">>> " in path.read_text(encoding="utf-8"):
             parts = path.relative_to(ROOT).with_suffix("").parts
-            found.append(".".join(parts if parts[0] == "arcade_torch" else ("arcade_torch", *parts)))
+            found.append(
+                ".".join(parts if parts[0] == "arcade_torch" else ("arcade_torch", *parts))
+            )
     return sorted(module.removesuffix(".__init__") for module in found)
 
 
 def python_pages() -> list[object]:
-    """Pages with Python on them; those with a block that takes long are left to `make test-slow`."""
+    """Pages with Python on them; those with a block that takes long are left to `make
+    test-slow`.
+    """
     found = {page: fenced(page.read_text(encoding="utf-8"), "python") for page in PAGES}
     return [
-        pytest.param(page, id=name(page), marks=[pytest.mark.slow] * any(block.slow for block in found[page]))
+        pytest.param(
+            page, id=name(page), marks=[pytest.mark.slow] * any(block.slow for block in found[page])
+        )
         for page in PAGES
         if found[page]
     ]
 
 
 @pytest.mark.parametrize("page", python_pages())
-def test_the_python_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_examples_of_a_page_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))  # a page may register a model of its own
+    monkeypatch.setattr(
+        registry, "_FACTORIES", dict(registry._FACTORIES)
+    )  # a page may register a model of its own
     namespace: dict[str, object] = {"__name__": "__example__"}
     for line, code in blocks(page, "python"):
         # Blank lines in front: a traceback names the line of the page.
@@ -94,11 +111,20 @@ def test_the_python_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypat
 
 
 def test_a_block_below_the_mark_is_slow_and_every_block_is_found() -> None:
-    text = "a\n```python\n1\n```\n<!-- slow -->\n```python\n2\n```\n- item\n\n  ```python\n  3\n  ```\n"
-    assert [(block.line, block.slow) for block in fenced(text, "python")] == [(3, False), (7, True), (12, False)]
+    text = (
+        "a\n```python\n1\n```\n<!-- slow -->\n```python\n2\n```\n- item\n\n  ```python\n  3\n  "
+        "```\n"
+    )
+    assert [(block.line, block.slow) for block in fenced(text, "python")] == [
+        (3, False),
+        (7, True),
+        (12, False),
+    ]
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        assert len(re.findall(r"^ *```\w", text, re.MULTILINE)) == len(FENCE.findall(text)), name(page)
+        assert len(re.findall(r"^ *```\w", text, re.MULTILINE)) == len(FENCE.findall(text)), name(
+            page
+        )
 
 
 def test_the_readme_has_examples_of_environment_collector_and_memory() -> None:
@@ -108,7 +134,9 @@ def test_the_readme_has_examples_of_environment_collector_and_memory() -> None:
 
 
 @pytest.mark.parametrize("module", documented_modules())
-def test_the_examples_in_docstrings_run(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_in_docstrings_run(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     result = doctest.testmod(importlib.import_module(module), optionflags=flags)
@@ -120,9 +148,13 @@ def test_every_make_target_that_is_named_exists() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        code = [code for _, code in blocks(page, "bash")] + re.findall(r"`(make [a-z-]+[^`]*)`", text)
+        code = [code for _, code in blocks(page, "bash")] + re.findall(
+            r"`(make [a-z-]+[^`]*)`", text
+        )
         for target in re.findall(r"^make ([a-z-]+)", "\n".join(code), re.MULTILINE):
-            assert target in targets, f"{name(page)} names `make {target}`, the Makefile has {sorted(targets)}"
+            assert target in targets, (
+                f"{name(page)} names `make {target}`, the Makefile has {sorted(targets)}"
+            )
 
 
 def command_lines() -> list[tuple[str, ...]]:
@@ -130,11 +162,19 @@ def command_lines() -> list[tuple[str, ...]]:
     code = [code for page in PAGES for _, code in blocks(page, "bash")]
     lines = {line for text in code for line in text.replace("\\\n", " ").splitlines()}
     split = (shlex.split(line, comments=True) for line in lines)
-    return sorted({tuple(words[words.index("arcade-torch") + 1 :]) for words in split if "arcade-torch" in words})
+    return sorted(
+        {
+            tuple(words[words.index("arcade-torch") + 1 :])
+            for words in split
+            if "arcade-torch" in words
+        }
+    )
 
 
 @pytest.mark.parametrize("words", command_lines(), ids=" ".join)
-def test_every_command_is_one_that_the_parser_takes(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_command_is_one_that_the_parser_takes(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
     imports, rest = take_imports(list(words))
     assert all(Path(path).is_file() for path in imports)
@@ -164,8 +204,12 @@ def test_every_command_in_a_sentence_exists() -> None:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of a page's headings, as they are made on the site and by hosts of repositories."""
-    headings = re.findall(r"^#+ (.*)$", without_code(page.read_text(encoding="utf-8")), re.MULTILINE)
+    """The anchors of a page's headings, as they are made on the site and by hosts of
+    repositories.
+    """
+    headings = re.findall(
+        r"^#+ (.*)$", without_code(page.read_text(encoding="utf-8")), re.MULTILINE
+    )
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -184,7 +228,9 @@ def test_the_table_of_environments_is_true() -> None:
     from arcade_torch.envs_jax import make, registered_ids
 
     text = (ROOT / "docs/environments.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `([^`]+-v\d+)` \| (\d+) \| (-?[\d.]+) \| (-?[\d.]+) \|$", text, re.MULTILINE)
+    rows = re.findall(
+        r"^\| `([^`]+-v\d+)` \| (\d+) \| (-?[\d.]+) \| (-?[\d.]+) \|$", text, re.MULTILINE
+    )
     assert sorted(row[0] for row in rows) == registered_ids()
     for id, limit, lowest, highest in rows:
         game = make(id)

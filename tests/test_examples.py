@@ -25,12 +25,18 @@ def example(name: str) -> Any:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_torchrls_trainer_begins_with_the_policy_that_acted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torchrls_trainer_begins_with_the_policy_that_acted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     script = example("torchrl_ppo_trainer")
     monkeypatch.setattr(script, "EPOCHS", 1)
     seen: list[int] = []
     largest = script.largest_log_ratio
-    monkeypatch.setattr(script, "largest_log_ratio", lambda policy, b: (seen.append(b.numel()), largest(policy, b))[1])
+    monkeypatch.setattr(
+        script,
+        "largest_log_ratio",
+        lambda policy, b: (seen.append(b.numel()), largest(policy, b))[1],
+    )
     result = script.main(frames=2 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")
     assert result.log_ratio < 1e-5 and seen == [script.MINIBATCH]
     assert len(result.returns) == 2 and all(-1 <= value <= 1 for value in result.returns)
@@ -59,15 +65,22 @@ def test_pqn_with_a_memory_reads_the_sign() -> None:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("theirs", [False, True], ids=["ours", "theirs"])
-def test_one_line_makes_our_environment_instead_of_theirs(theirs: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_makes_our_environment_instead_of_theirs(
+    theirs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if theirs:
-        pytest.importorskip("pygame", reason="needs the play extra: pip install 'arcade-torch[play]'")
+        pytest.importorskip(
+            "pygame", reason="needs the play extra: pip install 'arcade-torch[play]'"
+        )
     script = example("stock_pixels_ppo")
     monkeypatch.setattr(script, "EPOCHS", 1)
     monkeypatch.setattr(script, "WINDOW", 32)
     monkeypatch.setattr(script, "MINIBATCH", 16)
     env = script.make_env(theirs)
-    assert env.observation_spec["pixels"].dtype is torch.uint8 and env.observation_spec["pixels"].shape[-1] == 3
+    assert (
+        env.observation_spec["pixels"].dtype is torch.uint8
+        and env.observation_spec["pixels"].shape[-1] == 3
+    )
     env.close()
     returns = script.main(frames=64, theirs=theirs)
     assert len(returns) == 2
@@ -96,7 +109,9 @@ def test_ppo_in_one_file_begins_with_the_policy_that_acted(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_stable_baselines3_takes_the_environment() -> None:
-    pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'")
+    pytest.importorskip(
+        "stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'"
+    )
     assert -1 <= example("cleanrl_style_ppo").stable_baselines3(frames=640) <= 1
 
 
@@ -112,7 +127,9 @@ def test_a_thousand_steps_in_jax_do_not_leave_the_device() -> None:
 
 def test_a_script_written_for_gymnax_learns() -> None:
     first, last = example("jax_actor_critic").main()
-    assert first < 0 and last > 0.15  # random play earns -0.6, the best without reading the sign 0.25
+    assert (
+        first < 0 and last > 0.15
+    )  # random play earns -0.6, the best without reading the sign 0.25
 
 
 def test_a_probe_reads_where_things_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,6 @@
-"""What fuzzing (tests/fuzz) found, a test a defect: hostile input is refused in one line of ours, nothing is lost."""
+"""What fuzzing (tests/fuzz) found, a test a defect: hostile input is refused in one line of ours,
+nothing is lost.
+"""
 
 import json
 from pathlib import Path
@@ -11,7 +13,12 @@ from tensordict import TensorDict
 
 import arcade_torch
 from arcade_torch.agents import TrainConfig, load, preset
-from arcade_torch.agents.runs.checkpoint import CheckpointError, load_checkpoint, load_latest, save_checkpoint
+from arcade_torch.agents.runs.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    load_latest,
+    save_checkpoint,
+)
 from arcade_torch.agents.runs.files import CsvLog, checksum, is_final, read_csv, read_json
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools.figures.logs import Rate, curves_of_runs
@@ -38,12 +45,22 @@ def env() -> arcade_torch.ArcadeEnv:
         ({"seed": "7"}, TypeError, "seed is '7', expected a whole number"),
         ({"seed": 0.5}, TypeError, "seed is 0.5, expected a whole number"),
         ({"debug": torch.zeros(0)}, TypeError, "debug is .*, allowed: True, False"),
-        ({"categorical_actions": "no"}, TypeError, "categorical_actions is 'no', allowed: True, False"),
-        ({"obs_size": torch.zeros(2, 2)}, ValueError, r"obs_size is tensor\(\[\[0\., 0\.\], \[0\., 0\.\]\]\), allowed"),
+        (
+            {"categorical_actions": "no"},
+            TypeError,
+            "categorical_actions is 'no', allowed: True, False",
+        ),
+        (
+            {"obs_size": torch.zeros(2, 2)},
+            ValueError,
+            r"obs_size is tensor\(\[\[0\., 0\.\], \[0\., 0\.\]\]\), allowed",
+        ),
         ({"device": 10**30}, ValueError, "device is 1000.*, allowed: 'cpu', 'cuda'"),
     ],
 )
-def test_make_refuses_values_that_broke_inside(options: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_make_refuses_values_that_broke_inside(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message) as found:
         arcade_torch.make(**{"id": "CartPoleEasy", "num_envs": 2, **options})
     assert "\n" not in str(found.value)
@@ -65,13 +82,25 @@ def test_an_endless_name_is_cut_in_the_message() -> None:
             TypeError,
             "'next' is a Tensor, expected a TensorDict",
         ),
-        ({"action": torch.zeros(2).long(), "_step": torch.zeros(2).bool()}, ValueError, "'_step' is false in all envs"),
-        ({"action": torch.zeros(2).long(), "_step": torch.zeros(2)}, TypeError, "'_step' has dtype torch.float32"),
+        (
+            {"action": torch.zeros(2).long(), "_step": torch.zeros(2).bool()},
+            ValueError,
+            "'_step' is false in all envs",
+        ),
+        (
+            {"action": torch.zeros(2).long(), "_step": torch.zeros(2)},
+            TypeError,
+            "'_step' has dtype torch.float32",
+        ),
     ],
 )
 @pytest.mark.parametrize("way", ["step", "step_and_maybe_reset"])
 def test_a_step_refuses_a_tensordict_it_cannot_use(
-    env: arcade_torch.ArcadeEnv, way: str, entries: dict[str, Any], error: type[Exception], message: str
+    env: arcade_torch.ArcadeEnv,
+    way: str,
+    entries: dict[str, Any],
+    error: type[Exception],
+    message: str,
 ) -> None:
     with pytest.raises(error, match=message):
         getattr(env, way)(TensorDict(entries, [2]))
@@ -105,7 +134,9 @@ def test_a_partial_reset_refuses_entries_that_cannot_stay(env: arcade_torch.Arca
         with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected shape"):
             env.reset(TensorDict({"_reset": mask, "pixels": wrong}, [2]))
         with pytest.raises(ValueError, match=r"entry 'pixels' is a .*, expected shape"):
-            env.step(TensorDict({"_step": mask, "pixels": wrong, "action": torch.zeros(2).long()}, [2]))
+            env.step(
+                TensorDict({"_step": mask, "pixels": wrong, "action": torch.zeros(2).long()}, [2])
+            )
     with pytest.raises(TypeError, match=r"'x' is a torch\.sparse_coo tensor, expected a dense one"):
         env.reset(TensorDict({"_reset": mask, "x": torch.zeros(2, 5).to_sparse()}, [2]))
 
@@ -113,7 +144,12 @@ def test_a_partial_reset_refuses_entries_that_cannot_stay(env: arcade_torch.Arca
 @pytest.mark.parametrize(
     ("key", "value", "error", "message"),
     [
-        ("step_count", torch.zeros(2, dtype=torch.bfloat16), ValueError, r"'step_count' is bfloat16 \(2,\)"),
+        (
+            "step_count",
+            torch.zeros(2, dtype=torch.bfloat16),
+            ValueError,
+            r"'step_count' is bfloat16 \(2,\)",
+        ),
         ("step_count", torch.zeros(2).to_sparse(), TypeError, "expected a dense one"),
         ("step_count", TensorDict({}, [2]), TypeError, "'step_count' is a TensorDict"),
         ("state", torch.zeros(2), ValueError, r"no entry 'state\."),
@@ -194,7 +230,9 @@ def test_a_config_of_any_json_is_refused_in_one_line(values: Any, message: str) 
     assert "\n" not in str(found.value)
 
 
-@pytest.mark.parametrize("data", [b"\xff\xfe\n", b"framez,loss\n1,2\n", b"frames,frames\n1,\n", b'frames,"a\n'])
+@pytest.mark.parametrize(
+    "data", [b"\xff\xfe\n", b"framez,loss\n1,2\n", b"frames,frames\n1,\n", b'frames,"a\n']
+)
 def test_a_log_that_is_none_is_refused_and_kept(tmp_path: Path, data: bytes) -> None:
     file = tmp_path / "metrics.csv"
     file.write_bytes(data)
@@ -207,7 +245,14 @@ def test_a_log_that_is_none_is_refused_and_kept(tmp_path: Path, data: bytes) -> 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"returns": 5}, {"returns": [[1]]}, {"returns": [10**400]}, {"mean": {}}, {"lengths": [0.5]}, {"frames": "x"}],
+    [
+        {"returns": 5},
+        {"returns": [[1]]},
+        {"returns": [10**400]},
+        {"mean": {}},
+        {"lengths": [0.5]},
+        {"frames": "x"},
+    ],
 )
 def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(
     tmp_path: Path, changes: dict[str, Any]
@@ -236,7 +281,9 @@ def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(
         ({"question": 5}, "question must be a string"),
     ],
 )
-def test_a_study_that_would_hang_or_leave_its_folder_is_refused(changes: dict[str, Any], message: str) -> None:
+def test_a_study_that_would_hang_or_leave_its_folder_is_refused(
+    changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises((ValueError, TypeError), match=message):
         small_study(**changes)
 
@@ -310,15 +357,23 @@ def test_a_file_of_somebody_else_is_not_overwritten_by_a_score(tmp_path: Path) -
         ("options", "{", "options must be a JSON object"),
     ],
 )
-def test_a_damaged_line_of_human_scores_is_not_replayed(cell: str, value: str, message: str) -> None:
-    row = dict.fromkeys(COLUMNS, "") | {"game": "CartPoleEasy-v0", "obs_size": "128", "rules": "default"}
+def test_a_damaged_line_of_human_scores_is_not_replayed(
+    cell: str, value: str, message: str
+) -> None:
+    row = dict.fromkeys(COLUMNS, "") | {
+        "game": "CartPoleEasy-v0",
+        "obs_size": "128",
+        "rules": "default",
+    }
     row |= {"options": "{}", "seed": "0", "actions": "012", "observability": "full"}
     with pytest.raises(ValueError, match=message):
         replay(row | {cell: value})
 
 
 def test_seeds_that_never_met_make_no_curve(tmp_path: Path) -> None:
-    """Seed 0 was seen at 10 and 20 frames, seed 1 at 14 and 16: between 14 and 16 the longest log has nothing."""
+    """Seed 0 was seen at 10 and 20 frames, seed 1 at 14 and 16: between 14 and 16 the longest log
+    has nothing.
+    """
     runs = [Run(tmp_path / name) for name in ("seed0", "seed1")]
     for run, frames in zip(runs, ((10, 12, 20), (14, 16)), strict=True):
         run.path.mkdir()

@@ -1,4 +1,6 @@
-"""The notebooks: every cell runs, what they say of their figures holds, and what is committed came from the sources."""
+"""The notebooks: every cell runs, what they say of their figures holds, and what is committed came
+from the sources.
+"""
 
 import importlib.util
 import json
@@ -53,7 +55,10 @@ def laws(name: str, namespace: dict[str, Any]) -> None:
     if name == "contamination":
         assert np.nanmax(namespace["found"]["no memory"].mean("flip")[:, 1:]) == 0
     if name == "torchrl_pipeline":
-        assert namespace["density"].mass(5).sum() == pytest.approx(1) and namespace["density"].mass(5)[0] > 0
+        assert (
+            namespace["density"].mass(5).sum() == pytest.approx(1)
+            and namespace["density"].mass(5)[0] > 0
+        )
 
 
 @pytest.mark.parametrize("name", build.NAMES)
@@ -85,7 +90,9 @@ def test_the_committed_notebook_was_built_from_its_source(name: str) -> None:
     file = FOLDER / f"{name}.ipynb"
     made = json.loads(file.read_text())
     cells = [build.Cell(cell["cell_type"], "".join(cell["source"])) for cell in made["cells"]]
-    assert cells == build.read_cells(FOLDER / f"{name}.py"), f"run: python examples/notebooks/build.py {name}"
+    assert cells == build.read_cells(FOLDER / f"{name}.py"), (
+        f"run: python examples/notebooks/build.py {name}"
+    )
     assert any(cell.get("outputs") for cell in made["cells"]) and file.stat().st_size < 200_000
 
 
@@ -99,7 +106,9 @@ def test_cells_become_a_notebook_with_what_they_printed_and_drew(tmp_path: Path)
     source = '"""# T"""\n\n# %%\nimport matplotlib.pyplot as plt\nFRAMES = 5  # n\nprint(FRAMES)\n_ = plt.figure()\n'
     (tmp_path / "x.py").write_text(source + "# %% [markdown]\n# a\n#\n# b\n")
     cells = build.read_cells(tmp_path / "x.py")
-    assert [cell.kind for cell in cells] == ["markdown", "code", "markdown"] and cells[2].text == "a\n\nb"
+    assert [cell.kind for cell in cells] == ["markdown", "code", "markdown"] and cells[
+        2
+    ].text == "a\n\nb"
     _, outputs = build.run_cells(cells, 7)
     made = json.loads(build.notebook(cells, outputs))
     printed, picture = made["cells"][1]["outputs"]

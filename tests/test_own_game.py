@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 import arcade_torch
-from arcade_torch.envs_jax import BatchedGame, Game, check_game, env_keys, make, probe_ids, register, registered_ids
+from arcade_torch.envs_jax import (
+    BatchedGame,
+    Game,
+    check_game,
+    env_keys,
+    make,
+    probe_ids,
+    register,
+    registered_ids,
+)
 from arcade_torch.envs_jax.game import Rules
 from arcade_torch.envs_jax.oracles import make_oracle, oracle_return
 from arcade_torch.tools import cli
@@ -48,7 +57,11 @@ def test_whoever_remembers_finds_all_pairs_and_two_that_differ_are_turned_back(p
     cards = np.asarray(batch.state.cards[0])
     assert sorted(cards) == sorted(list(range(8)) * 2)
     different = [int(np.flatnonzero(cards != cards[0])[0])]
-    order = [0, *different, *(int(card) for face in range(8) for card in np.flatnonzero(cards == face))]
+    order = [
+        0,
+        *different,
+        *(int(card) for face in range(8) for card in np.flatnonzero(cards == face)),
+    ]
     place, total, hidden = 0, 0.0, batched.render(batch)
     for count, goal in enumerate(order):
         for action in way(place, goal):
@@ -74,14 +87,27 @@ def test_the_pomdp_hides_the_cards_that_are_down_and_nothing_else(pairs: Any) ->
     assert np.array_equal(draw(up, True), draw(up, False))
 
 
-def test_it_trains_and_is_evaluated_with_the_stock_tools(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--preset", "smoke", "--env", "PairsEasy", "--observability", "partial", "--out", str(tmp_path / "run")]
+def test_it_trains_and_is_evaluated_with_the_stock_tools(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "--preset",
+        "smoke",
+        "--env",
+        "PairsEasy",
+        "--observability",
+        "partial",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert cli.main(["train", "--import", str(FILE), *words]) == cli.EXIT_OK
     assert cli.main(["evaluate", str(tmp_path / "run"), "--episodes", "4"]) == cli.EXIT_OK
     assert "PairsEasy-v0 (partial)" in capsys.readouterr().out
 
 
-def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     right = "return self.layers.draw(state.found.sum() // 2, codes)"
     source = FILE.read_text().replace('register("PairsEasy-v0"', 'register("PairsWrong-v0"')
     assert right in source
@@ -89,7 +115,10 @@ def test_a_frame_of_the_wrong_shape_is_refused_in_one_line(tmp_path: Path, capsy
     words = ["--preset", "smoke", "--env", "PairsWrong", "--out", str(tmp_path / "run")]
     assert cli.main(["train", "--import", str(tmp_path / "wrong.py"), *words]) == cli.EXIT_BAD_INPUT
     err = capsys.readouterr().err
-    assert err == "arcade-torch: PairsWrong-v0: render gives uint8 [128, 64, 3], wanted uint8 [128, 128, 3]\n"
+    assert (
+        err
+        == "arcade-torch: PairsWrong-v0: render gives uint8 [128, 64, 3], wanted uint8 [128, 128, 3]\n"
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -110,9 +139,16 @@ class Toy(Game[ToyState]):
     def reset(self, key: jax.Array) -> ToyState:
         return ToyState(jnp.int32(0))
 
-    def step(self, key: jax.Array, state: ToyState, action: jax.Array) -> tuple[ToyState, Any, Any, Any]:
+    def step(
+        self, key: jax.Array, state: ToyState, action: jax.Array
+    ) -> tuple[ToyState, Any, Any, Any]:
         count = state.count + 1
-        return ToyState(count), (action == 4) * jnp.float32(self.pay), jnp.bool_(False), count >= self.max_steps
+        return (
+            ToyState(count),
+            (action == 4) * jnp.float32(self.pay),
+            jnp.bool_(False),
+            count >= self.max_steps,
+        )
 
     def render(self, state: ToyState, partial: Any) -> jax.Array:
         shade = jnp.where(partial, 0, 40 * state.count + 50).astype(jnp.uint8)
@@ -129,16 +165,22 @@ class Fire:
         return np.full(len(is_init), 4, np.int32)
 
 
-def test_one_line_registers_a_game_for_make_oracles_gymnasium_and_the_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_registers_a_game_for_make_oracles_gymnasium_and_the_sheet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     register("ToyEasy-v0", Toy)
 
     assert make("ToyEasy", pay=0.5).pay == 0.5 and "ToyEasy-v0" in registered_ids()
     assert arcade_torch.make("ToyEasy", num_envs=2).rollout(5)["next", "truncated"][:, -1].all()
-    frame, _ = gymnasium.make("arcade_torch/ToyEasy-v0", observability="partial", pay=0.5).reset(seed=0)
+    frame, _ = gymnasium.make("arcade_torch/ToyEasy-v0", observability="partial", pay=0.5).reset(
+        seed=0
+    )
     assert frame.shape == (128, 128, 3) and not frame.any()
     full, hidden = scene("ToyEasy", 128)  # a game without an oracle is played at random
     assert full.min() == full.max() > 50 and not hidden.any()
-    with pytest.raises(ValueError, match=r"ToyEasy-v0 has no state oracle: name one in Toy\.oracles"):
+    with pytest.raises(
+        ValueError, match=r"ToyEasy-v0 has no state oracle: name one in Toy\.oracles"
+    ):
         make_oracle(make("ToyEasy"))
     monkeypatch.setattr(Toy, "oracles", {"state": Fire})
     assert (oracle_return(make("ToyEasy"), episodes=3) == 5).all()

@@ -65,8 +65,19 @@ def test_a_buffer_replays_it_step_by_step_though_it_has_no_replay(lstm: Any) -> 
 
 
 @pytest.mark.usefixtures("own_names")
-def test_it_trains_and_is_evaluated_with_the_stock_tools(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--memory", "lstm", "--preset", "smoke", "--env", "SignpostEasy", "--out", str(tmp_path / "run")]
+def test_it_trains_and_is_evaluated_with_the_stock_tools(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "--memory",
+        "lstm",
+        "--preset",
+        "smoke",
+        "--env",
+        "SignpostEasy",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert cli.main(["train", "--import", str(FILE), *words]) == cli.EXIT_OK
     assert cli.main(["evaluate", str(tmp_path / "run"), "--episodes", "4"]) == cli.EXIT_OK
     assert "SignpostEasy-v0" in capsys.readouterr().out

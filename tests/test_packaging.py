@@ -15,8 +15,22 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LINKED = ("envs_jax", "models", "agents", "tools")
 # What the build reads. Nothing else is copied, so that old build output cannot slip into the wheel.
-SOURCES = (*LINKED, "arcade_torch", "setup.cfg", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
-METADATA = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "constraints.txt", "constraints-oldest.txt")
+SOURCES = (
+    *LINKED,
+    "arcade_torch",
+    "setup.cfg",
+    "pyproject.toml",
+    "MANIFEST.in",
+    "README.md",
+    "LICENSE",
+)
+METADATA = (
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "constraints.txt",
+    "constraints-oldest.txt",
+)
 
 STEP_AN_ENV = """
 import importlib.util, pathlib, sys
@@ -38,17 +52,38 @@ print("stepped", arcade_torch.__version__)
 
 def run(*command: str | Path, cwd: Path) -> str:
     """Run a command that must succeed, away from the checkout and its import path."""
-    environment = {key: value for key, value in os.environ.items() if key not in {"PYTHONPATH", "PYTHONHOME"}}
+    environment = {
+        key: value for key, value in os.environ.items() if key not in {"PYTHONPATH", "PYTHONHOME"}
+    }
     result = subprocess.run(
-        [str(part) for part in command], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+        [str(part) for part in command],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert result.returncode == 0, f"{' '.join(map(str, command))}\n{result.stdout}\n{result.stderr}"
+    assert result.returncode == 0, (
+        f"{' '.join(map(str, command))}\n{result.stdout}\n{result.stderr}"
+    )
     return result.stdout
 
 
 def build(what: str, source: Path, target: Path) -> Path:
-    """Build "wheel" or "sdist" from a source tree with the installed setuptools; nothing is downloaded."""
-    run(sys.executable, "-m", "build", "--no-isolation", f"--{what}", "--outdir", target, source, cwd=target.parent)
+    """Build "wheel" or "sdist" from a source tree with the installed setuptools; nothing is
+    downloaded.
+    """
+    run(
+        sys.executable,
+        "-m",
+        "build",
+        "--no-isolation",
+        f"--{what}",
+        "--outdir",
+        target,
+        source,
+        cwd=target.parent,
+    )
     (made,) = target.glob("*.whl" if what == "wheel" else "*.tar.gz")
     return made
 
@@ -60,7 +95,12 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy.mkdir()
     for name in (*SOURCES, *METADATA):
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / name,
+                copy / name,
+                symlinks=True,
+                ignore=shutil.ignore_patterns("__pycache__"),
+            )
         else:
             shutil.copy(ROOT / name, copy / name)
     return copy
@@ -82,7 +122,17 @@ def installed(wheel: Path) -> Path:
     environment = wheel.parents[1] / "environment"
     venv.create(environment, with_pip=False, symlinks=True)
     python = environment / "bin" / "python"
-    command = ("-m", "pip", "--python", python, "install", "--quiet", "--no-index", "--no-deps", wheel)
+    command = (
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        wheel,
+    )
     run(sys.executable, *command, cwd=wheel.parent)
     return environment
 
@@ -98,28 +148,45 @@ def files_in(wheel: Path) -> set[str]:
 
 
 def test_the_wheel_holds_every_source_file_and_nothing_else(wheel: Path, source: Path) -> None:
-    wanted = {path.relative_to(source).as_posix() for path in (source / "arcade_torch").glob("*.py")}
-    wanted |= {path.relative_to(source).as_posix() for path in (source / "arcade_torch" / "gym").glob("*.py")}
+    wanted = {
+        path.relative_to(source).as_posix() for path in (source / "arcade_torch").glob("*.py")
+    }
+    wanted |= {
+        path.relative_to(source).as_posix()
+        for path in (source / "arcade_torch" / "gym").glob("*.py")
+    }
     wanted.add("arcade_torch/py.typed")
     for folder in LINKED:
-        wanted |= {f"arcade_torch/{path.relative_to(source).as_posix()}" for path in (source / folder).rglob("*.py")}
+        wanted |= {
+            f"arcade_torch/{path.relative_to(source).as_posix()}"
+            for path in (source / folder).rglob("*.py")
+        }
     for data in ("templates", "data"):
         folder = source / "tools" / data
-        wanted |= {f"arcade_torch/tools/{data}/{path.name}" for path in folder.glob("*") if path.is_file()}
+        wanted |= {
+            f"arcade_torch/tools/{data}/{path.name}" for path in folder.glob("*") if path.is_file()
+        }
     assert files_in(wheel) == wanted
-    assert any(name.startswith("arcade_torch/tools/templates/") for name in wanted), "the report needs its template"
+    assert any(name.startswith("arcade_torch/tools/templates/") for name in wanted), (
+        "the report needs its template"
+    )
 
 
 def test_site_packages_gets_one_package_and_its_metadata(installed: Path) -> None:
-    found = sorted(path.name for path in site_packages(installed).iterdir() if path.name != "__pycache__")
+    found = sorted(
+        path.name for path in site_packages(installed).iterdir() if path.name != "__pycache__"
+    )
     assert len(found) == 2, found
     assert found[0] == "arcade_torch"
     assert found[1].startswith("arcade_torch-") and found[1].endswith(".dist-info")
     assert not any(path.is_symlink() for path in site_packages(installed).rglob("*"))
 
 
-def test_the_installed_wheel_steps_an_env_from_another_directory(installed: Path, tmp_path: Path) -> None:
-    # The dependencies come from the environment of the tests: a path entry adds them behind the new environment's own.
+def test_the_installed_wheel_steps_an_env_from_another_directory(
+    installed: Path, tmp_path: Path
+) -> None:
+    # The dependencies come from the environment of the tests: a path entry adds them behind the new
+    # environment's own.
     shared = site_packages(installed) / "dependencies.pth"
     shared.write_text(sysconfig.get_paths()["purelib"] + "\n")
     try:
@@ -137,7 +204,14 @@ def test_a_wheel_built_from_the_sdist_is_the_same(sdist: Path, wheel: Path, tmp_
         archive.extractall(tmp_path, filter="data")
     top = {name.split("/")[1] for name in names if "/" in name}
     assert not top & set(LINKED), "the code folders belong inside arcade_torch"
-    assert {"arcade_torch", "setup.cfg", "pyproject.toml", "LICENSE", "CHANGELOG.md", "constraints.txt"} <= top
+    assert {
+        "arcade_torch",
+        "setup.cfg",
+        "pyproject.toml",
+        "LICENSE",
+        "CHANGELOG.md",
+        "constraints.txt",
+    } <= top
     (unpacked,) = (path for path in tmp_path.iterdir() if path.is_dir())
     assert files_in(build("wheel", unpacked, tmp_path / "again")) == files_in(wheel)
 
@@ -148,8 +222,14 @@ def test_constraints_pin_every_declared_dependency_inside_its_range() -> None:
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
-    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
-    pinned = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines)}
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if line and line[0] != "#"
+    ]
+    pinned = {
+        canonicalize_name(name): version for name, version in (line.split("==") for line in lines)
+    }
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     declared = config["options"]["install_requires"].split()
@@ -159,4 +239,6 @@ def test_constraints_pin_every_declared_dependency_inside_its_range() -> None:
         version = pinned.get(canonicalize_name(requirement.name))
         assert version is not None, f"constraints.txt does not pin {requirement.name}"
         assert requirement.specifier.contains(version), f"{requirement} does not allow {version}"
-    assert f"torch=={pinned['torch']}" in (ROOT / "Makefile").read_text(), "Makefile installs another torch"
+    assert f"torch=={pinned['torch']}" in (ROOT / "Makefile").read_text(), (
+        "Makefile installs another torch"
+    )

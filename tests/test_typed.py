@@ -1,4 +1,6 @@
-"""The public API as a type checker sees it: the installed wheel, ``mypy --strict``, no ``Any`` in what users hold."""
+"""The public API as a type checker sees it: the installed wheel, ``mypy --strict``, no ``Any`` in
+what users hold.
+"""
 
 import subprocess
 import sys
@@ -74,7 +76,9 @@ arcade_torch.mkae("CartPoleEasy")
 @pytest.fixture(scope="module")
 def checked(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The environment with the wheel alone, and a path entry for the dependencies behind it."""
-    (site_packages(installed) / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    (site_packages(installed) / "dependencies.pth").write_text(
+        sysconfig.get_paths()["purelib"] + "\n"
+    )
     return installed
 
 
@@ -92,10 +96,17 @@ def mypy(environment: Path, program: str, folder: Path) -> str:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
 
 
-def test_a_users_program_is_checked_strictly_against_the_installed_wheel(checked: Path, tmp_path: Path) -> None:
+def test_a_users_program_is_checked_strictly_against_the_installed_wheel(
+    checked: Path, tmp_path: Path
+) -> None:
     found = mypy(checked, PROGRAM, tmp_path)
     assert found.startswith("Success: no issues found"), found
-    origin = run(checked / "bin" / "python", "-c", "import arcade_torch; print(arcade_torch.__file__)", cwd=tmp_path)
+    origin = run(
+        checked / "bin" / "python",
+        "-c",
+        "import arcade_torch; print(arcade_torch.__file__)",
+        cwd=tmp_path,
+    )
     assert str(checked) in origin
 
 

@@ -1,4 +1,6 @@
-"""What of a game the paper's encoder cannot see: its convolutions and pools leave the right and lower edge over."""
+"""What of a game the paper's encoder cannot see: its convolutions and pools leave the right and
+lower edge over.
+"""
 
 import pytest
 import torch
@@ -11,7 +13,9 @@ SEEN = {128: 119, 256: 217}
 
 
 def suits(name: str, size: int) -> Tensor:
-    """The different pictures of the upper right corner, where AutoEncode answers and CountRecall asks."""
+    """The different pictures of the upper right corner, where AutoEncode answers and CountRecall
+    asks.
+    """
     env = arcade_torch.make(name, num_envs=32, observability="partial", seed=0, obs_size=size)
     pixels = env.rollout(40, break_when_any_done=False)["pixels"].flatten(0, 1)
     frames = pixels[:1].repeat(len(pixels), 1, 1, 1)
@@ -22,12 +26,16 @@ def suits(name: str, size: int) -> Tensor:
 
 @pytest.mark.parametrize("name", ["AutoEncodeEasy", "CountRecallHard"])
 @pytest.mark.parametrize("size", [128, 256])
-def test_the_suit_in_the_corner_is_seen_in_part_at_128_pixels_and_not_at_all_at_256(name: str, size: int) -> None:
+def test_the_suit_in_the_corner_is_seen_in_part_at_128_pixels_and_not_at_all_at_256(
+    name: str, size: int
+) -> None:
     frames = suits(name, size)
     assert len(frames) == 4
     with torch.no_grad():
         features = PaperEncoder(size)(frames)
-    assert len(torch.unique(frames[:, :, : SEEN[size]].flatten(1), dim=0)) == (4 if size == 128 else 1)
+    assert len(torch.unique(frames[:, :, : SEEN[size]].flatten(1), dim=0)) == (
+        4 if size == 128 else 1
+    )
     assert len(torch.unique(features, dim=0)) == (4 if size == 128 else 1)
 
 

@@ -1,7 +1,8 @@
 """Command line, studies, memory analyses, figures, reports and benchmarks.
 
-Every analysis is a function: runs or an agent in, arrays out; figures are made by functions beside it.
-Public names are resolved on first use, so that ``arcade-torch --help`` loads neither torch nor JAX.
+Every analysis is a function: runs or an agent in, arrays out; figures are made by functions beside
+it. Public names are resolved on first use, so that ``arcade-torch --help`` loads neither torch nor
+JAX.
 """
 
 from importlib import import_module
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "contamination", "gap_and_bias", "greedy_window", "recall_density", "report", "saliency",
-    "saliency_figure", "study",
+    "Policy", "Study", "contamination", "gap_and_bias", "greedy_window", "recall_density", "report",
+    "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 
@@ -43,7 +44,9 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first asked for (PEP 562)."""
         if name not in _PUBLIC:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; names: {', '.join(__all__)}")
+            raise AttributeError(
+                f"module {__name__!r} has no attribute {name!r}; names: {', '.join(__all__)}"
+            )
         return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
 
 

@@ -1,8 +1,8 @@
 """The command line ``arcade-torch``.
 
-The first words choose a command, only then is its module imported: help and typing errors stay quick.
-Each command is a dataclass in `arcade_torch.tools.commands`: its fields are the options, its docstring is the help, and
-its `run` does the work.
+The first words choose a command, only then is its module imported: help and typing errors stay
+quick. Each command is a dataclass in `arcade_torch.tools.commands`: its fields are the options, its
+docstring is the help, and its `run` does the work.
 """
 
 import difflib
@@ -27,21 +27,37 @@ from arcade_torch.tools.figures import FIGURES
 from arcade_torch.tools.options import imported, load_extensions, take_imports
 from arcade_torch.tools.text import printable, warn
 
-EXIT_OK, EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 0, 1, 2, program.EXIT_STOPPED
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = program.EXIT_STOPPED
 
 HELP = ("-h", "--help", "help")
 EVERYWHERE = """\
-With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory models;
---debug shows the traceback of an error."""
+With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory
+models; --debug shows the traceback of an error."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("study.Demo", "small study of two games: learning, gap, bias and saliency in one HTML page"),
-    "list": ("list.List", "games, memory models, what scripted players earn, and pictures of the games"),
+    "demo": (
+        "study.Demo",
+        "small study of two games: learning, gap, bias and saliency in one HTML page",
+    ),
+    "list": (
+        "list.List",
+        "games, memory models, what scripted players earn, and pictures of the games",
+    ),
     "train": ("train.Train", "train one agent into a run folder"),
     "evaluate": ("train.Evaluate", "greedy returns of a trained agent"),
-    "study": ("study.StudyCommand", "run a grid of trainings from one TOML file, resumable run by run"),
+    "study": (
+        "study.StudyCommand",
+        "run a grid of trainings from one TOML file, resumable run by run",
+    ),
     "report": ("study.Report", "write the HTML page of a study"),
-    **{f"analyze {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items() if entry.analysis},
+    **{
+        f"analyze {name}": ("figure.Figure", entry.summary)
+        for name, entry in FIGURES.items()
+        if entry.analysis
+    },
     **{f"figure {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items()},
     "play": ("play.Play", "play a game by hand, in a window or in the terminal"),
     "record": ("play.Record", "a GIF or MP4 of a random, scripted or trained player"),
@@ -73,7 +89,8 @@ arcade-torch COMMAND --help explains a command and gives an example.
 
 
 def split_command(words: Sequence[str]) -> tuple[str, list[str]]:
-    """Separate the name of the command from its options; a ``ValueError`` names the nearest if there is none.
+    """Separate the name of the command from its options; a ``ValueError`` names the nearest if
+    there is none.
 
     Example:
         >>> split_command(["analyze", "gap-bias", "runs/demo"])
@@ -113,8 +130,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``arcade-torch``.
 
     Args:
-        argv: the words after the program's name. Without them the words are those of the process, which then ends here
-            with the exit code.
+        argv: the words after the program's name. Without them the words are those of the process,
+            which then ends here with the exit code.
 
     Returns:
         The exit code: 0 done, 1 something failed, 2 bad input, 130 stopped by a signal.
@@ -162,7 +179,8 @@ def _carry_out(words: Sequence[str], begun: list[Any]) -> int:
             return stop.code if isinstance(stop.code, int) else EXIT_FAILED
         print(EVERYWHERE)  # below the help of a command
         return EXIT_OK
-    if program.is_asked_to_stop():  # something swallowed the interruption, and then the work was over
+    # something swallowed the interruption, and then the work was over
+    if program.is_asked_to_stop():
         raise KeyboardInterrupt
     return code
 
@@ -202,8 +220,16 @@ def _tell(error: Exception) -> int:
     if isinstance(error, BrokenPipeError):  # the reader of stdout, such as head, has what it wanted
         _close_stdout()
         return EXIT_OK
-    if is_of_the_machine(error) and isinstance(error, OSError) and error.filename is None and _is_stdout_full():
-        _say(f"could not write to standard output: {error.strerror}; what was written to files is whole")
+    if (
+        is_of_the_machine(error)
+        and isinstance(error, OSError)
+        and error.filename is None
+        and _is_stdout_full()
+    ):
+        _say(
+            f"could not write to standard output: {error.strerror}; what was written to files is "
+            "whole"
+        )
         return EXIT_FAILED
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("arcade_torch"):
         error = MissingPackage(str(error.name))
@@ -213,9 +239,16 @@ def _tell(error: Exception) -> int:
     if lack := trouble_of_the_machine(error):
         _say(lack)
         return EXIT_FAILED
-    passed = {(at.f_code.co_filename, at.f_globals["__name__"]) for at, _ in traceback.walk_tb(error.__traceback__)}
+    passed = {
+        (at.f_code.co_filename, at.f_globals["__name__"])
+        for at, _ in traceback.walk_tb(error.__traceback__)
+    }
     own = [name for name in imported() if any(name in names for names in passed)]
-    _say(f"{own[0]} failed:" if own else "this is a fault of arcade-torch; please report it with what follows")
+    _say(
+        f"{own[0]} failed:"
+        if own
+        else "this is a fault of arcade-torch; please report it with what follows"
+    )
     for line in "".join(traceback.format_exception(error)).rstrip("\n").split("\n"):
         warn(line)
     return EXIT_FAILED
@@ -236,6 +269,8 @@ def _is_stdout_full() -> bool:
     return False
 
 
-def _format_warning(message: Any, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+def _format_warning(
+    message: Any, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
     """A warning in one line, without the line of source that gave it."""
     return f"{category.__name__}: {printable(message)} ({printable(filename)}:{lineno})\n"

@@ -1,4 +1,6 @@
-"""Which errors are bad input, told in one line, and which are faults of ours; optional packages, imported when used."""
+"""Which errors are bad input, told in one line, and which are faults of ours; optional packages,
+imported when used.
+"""
 
 import errno
 import opcode
@@ -11,7 +13,13 @@ from arcade_torch.tools.text import printable
 
 EXTRA_OF = {
     **dict.fromkeys(("tyro", "rich", "matplotlib", "jinja2", "PIL"), "tools"),
-    **{"pygame": "play", "imageio_ffmpeg": "video", "wandb": "loggers", "tensorboard": "loggers", "ray": "ray"},
+    **{
+        "pygame": "play",
+        "imageio_ffmpeg": "video",
+        "wandb": "loggers",
+        "tensorboard": "loggers",
+        "ray": "ray",
+    },
 }
 """Import name -> the extra of arcade-torch that brings it."""
 
@@ -68,10 +76,11 @@ def need(name: str) -> Any:
 
 
 def is_told(error: BaseException) -> bool:
-    """Whether an error is told in one line: one of our own types, something about a file, or a refusal of ours.
+    """Whether an error is told in one line: one of our own types, something about a file, or a
+    refusal of ours.
 
-    A ``ValueError`` or ``TypeError`` is a refusal only if a ``raise`` statement of this package raised it; one that
-    comes out of an operation, or out of a library, is a fault.
+    A ``ValueError`` or ``TypeError`` is a refusal only if a ``raise`` statement of this package
+    raised it; one that comes out of an operation, or out of a library, is a fault.
     """
     if type(error).__module__.startswith("arcade_torch."):
         return True
@@ -89,10 +98,16 @@ def is_told(error: BaseException) -> bool:
 
 
 def is_of_the_machine(error: BaseException) -> bool:
-    """Whether work failed because of this machine or of the work itself, and not because of what was asked for."""
+    """Whether work failed because of this machine or of the work itself, and not because of what
+    was asked for.
+    """
     if type(error).__name__ in WORK_FAILED:
         return True
-    return isinstance(error, OSError) and error.errno in MACHINE and not isinstance(error, PermissionError)
+    return (
+        isinstance(error, OSError)
+        and error.errno in MACHINE
+        and not isinstance(error, PermissionError)
+    )
 
 
 def one_line(error: BaseException) -> str:
@@ -122,9 +137,22 @@ def reason(error: BaseException) -> str:
 def trouble_of_the_machine(error: BaseException) -> str:
     """What this machine lacks, if that is why JAX or torch raised an error; empty if it is not."""
     said = str(error)
-    short = ("RESOURCE_EXHAUSTED", "out of memory", "can't allocate memory", "Unable to allocate", "std::bad_alloc")
+    short = (
+        "RESOURCE_EXHAUSTED",
+        "out of memory",
+        "can't allocate memory",
+        "Unable to allocate",
+        "std::bad_alloc",
+    )
     if isinstance(error, MemoryError) or any(words in said for words in short):
         return f"there is not enough memory: ask for less at once ({one_line(error)[:200]})"
-    if sys.flags.optimize > 1 and isinstance(error, TypeError | AttributeError) and "NoneType" in said:
-        return "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the place of -OO"
+    if (
+        sys.flags.optimize > 1
+        and isinstance(error, TypeError | AttributeError)
+        and "NoneType" in said
+    ):
+        return (
+            "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the "
+            "place of -OO"
+        )
     return missing_platform()

@@ -1,4 +1,6 @@
-"""Tables: on the terminal, in Markdown, in files; arrays in files. See also `arcade_torch.agents.runs.files`."""
+"""Tables: on the terminal, in Markdown, in files; arrays in files. See also
+`arcade_torch.agents.runs.files`.
+"""
 
 import csv
 import hashlib
@@ -40,9 +42,13 @@ class Table:
     left: int = 1  # how many columns are aligned left and name the row; the others are numbers
 
     def show(self) -> None:
-        """Print it to stdout; a table that is wider than the terminal is cut into several, each with the names."""
+        """Print it to stdout; a table that is wider than the terminal is cut into several, each
+        with the names.
+        """
         lines = [[_lines(cell) for cell in line] for line in (self.columns, *self.rows)]
-        widths = [max(map(len, "\n".join(cells).split("\n"))) + 3 for cells in zip(*lines, strict=True)]
+        widths = [
+            max(map(len, "\n".join(cells).split("\n"))) + 3 for cells in zip(*lines, strict=True)
+        ]
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
         width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
@@ -57,7 +63,9 @@ class Table:
             table = need("rich.table").Table(title=title or None, caption=caption or None)
             table.title_justify = table.caption_justify = "left"
             for i in part:
-                table.add_column(lines[0][i], justify="left" if i < self.left else "right", overflow="fold")
+                table.add_column(
+                    lines[0][i], justify="left" if i < self.left else "right", overflow="fold"
+                )
             for line in lines[1:]:
                 table.add_row(*(line[i] for i in part))
             console(highlight=False, markup=False, emoji=False, width=width).print(table)
@@ -75,7 +83,9 @@ def format_value(value: Any) -> str:
     return str(value)
 
 
-def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int | None = None) -> str:
+def markdown_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], left: int | None = None
+) -> str:
     """A Markdown table; columns after the first ``left`` are aligned right."""
     left = len(columns) if left is None else left
     lines = ["| " + " | ".join(map(markdown_cell, line)) + " |" for line in (columns, *rows)]
@@ -89,8 +99,13 @@ def write_between(page: Path, begin: str, end: str, text: str) -> Path:
     except UnicodeDecodeError as error:
         raise ValueError(f"{page} is not text in UTF-8: {error}") from error
     if old.count(begin) != 1 or old.count(end) != 1 or old.index(begin) > old.index(end):
-        raise ValueError(f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes between them")
-    return write_atomic(page, f"{old.partition(begin)[0]}{begin}\n\n{text}\n\n{end}{old.partition(end)[2]}")
+        raise ValueError(
+            f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes "
+            "between them"
+        )
+    return write_atomic(
+        page, f"{old.partition(begin)[0]}{begin}\n\n{text}\n\n{end}{old.partition(end)[2]}"
+    )
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> Path:
@@ -99,8 +114,11 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[s
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Rows as CSV, by default with every column that one has; a missing key or None gives an empty cell."""
-    buffer, known = io.StringIO(), dict.fromkeys(name for row in rows for name in row)
+    """Rows as CSV, by default with every column that one has; a missing key or None gives an empty
+    cell.
+    """
+    buffer = io.StringIO()
+    known = dict.fromkeys(name for row in rows for name in row)
     names = list(columns or known)
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([csv_cell(name) for name in names])
@@ -112,7 +130,10 @@ def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> 
 def read_rows(path: Path, kind: type[Row]) -> list[Row]:
     """Rows of a CSV file as named tuples of a kind; a ``ValueError`` if it is no table of them."""
     try:
-        return [kind(*(of(row[name]) for name, of in kind.__annotations__.items())) for row in read_csv(path)]
+        return [
+            kind(*(of(row[name]) for name, of in kind.__annotations__.items()))
+            for row in read_csv(path)
+        ]
     except (KeyError, ValueError) as error:
         wanted = ", ".join(kind._fields)
         raise ValueError(f"{path} is no table with columns {wanted} ({error})") from None
@@ -121,7 +142,8 @@ def read_rows(path: Path, kind: type[Row]) -> list[Row]:
 def measured_rows(
     path: Path | None, kind: type[Row], keys: Iterable[tuple[Any, ...]], measure: Callable[..., Row]
 ) -> Iterator[Row]:
-    """The row of every key, its first cells: those that a CSV file holds, the others measured and added to it.
+    """The row of every key, its first cells: those that a CSV file holds, the others measured and
+    added to it.
 
     ``measure`` is called with the cells of a key; without a ``path`` nothing is kept.
     """
@@ -143,25 +165,36 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
 
 
 def read_npz(path: Path) -> dict[str, Any]:
-    """Arrays from a file, after a look at what they claim to be: a small file may unpack to more than memory holds.
+    """Arrays from a file, after a look at what they claim to be: a small file may unpack to more
+    than memory holds.
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is no regular file, no archive of plain arrays, or larger than ``MOST_ARRAYS``.
+        ValueError: it is no regular file, no archive of plain arrays, or larger than
+            ``MOST_ARRAYS``.
     """
     with open_regular(path, MOST_ARRAYS) as stream:
         try:
             with zipfile.ZipFile(stream) as archive:
                 total = sum(entry.file_size for entry in archive.infolist())
                 if total > MOST_ARRAYS:
-                    raise ValueError(f"its arrays take {total:,} bytes, at most {MOST_ARRAYS:,} are read")
+                    raise ValueError(
+                        f"its arrays take {total:,} bytes, at most {MOST_ARRAYS:,} are read"
+                    )
                 for entry in archive.infolist():
                     with archive.open(entry) as member:
                         _check_header(member, entry.file_size)
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as arrays:
                 return {key: arrays[key] for key in arrays.files}
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, KeyError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            NotImplementedError,
+            RuntimeError,
+            KeyError,
+        ) as error:
             raise ValueError(f"{path} is no archive of arrays: {error}") from error
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
@@ -170,10 +203,16 @@ def read_npz(path: Path) -> dict[str, Any]:
 def _check_header(member: IO[bytes], size: int) -> None:
     """Refuse an array that claims to be larger than what is stored of it, or that holds objects."""
     version = np.lib.format.read_magic(member)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = read(member)
     if dtype.hasobject or math.prod(shape) * dtype.itemsize > size:
-        raise ValueError(f"an array claims to be {dtype} {list(shape)}, which is not what is stored")
+        raise ValueError(
+            f"an array claims to be {dtype} {list(shape)}, which is not what is stored"
+        )
 
 
 def cached_arrays(
@@ -182,10 +221,12 @@ def cached_arrays(
     options: Mapping[str, Any],
     compute: Callable[[], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Arrays from ``run/analysis``, computed and written there if they are missing, made for others, or damaged.
+    """Arrays from ``run/analysis``, computed and written there if they are missing, made for
+    others, or damaged.
 
-    ``options`` are JSON values and everything that decides the numbers, the checkpoint included; they stand as JSON in
-    ``options`` of the arrays. What is no run folder (a single checkpoint), or cannot be written, keeps nothing.
+    ``options`` are JSON values and everything that decides the numbers, the checkpoint included;
+    they stand as JSON in ``options`` of the arrays. What is no run folder (a single checkpoint), or
+    cannot be written, keeps nothing.
     """
     text = json.dumps(dict(options), sort_keys=True)
     file = run / "analysis" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.npz"
@@ -196,13 +237,16 @@ def cached_arrays(
     if (run / "config.json").is_file() and os.access(run, os.W_OK) and not file.parent.is_symlink():
         try:
             write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
-        except OSError as error:  # a full disk, for one: what took minutes to compute is still of use
+        # a full disk, for one: what took minutes to compute is still of use
+        except OSError as error:
             warnings.warn(f"the numbers could not be kept for another time: {error}", stacklevel=2)
     return arrays
 
 
 def _kept_arrays(file: Path, options: str) -> dict[str, Any] | None:
-    """The arrays of a file, if they were made with these options and have the layout that was written."""
+    """The arrays of a file, if they were made with these options and have the layout that was
+    written.
+    """
     try:
         arrays = read_npz(file)
     except (OSError, ValueError):  # there is none, or it is damaged
@@ -214,5 +258,7 @@ def _kept_arrays(file: Path, options: str) -> dict[str, Any] | None:
 
 def _layout(arrays: Mapping[str, Any]) -> str:
     """Names, types and shapes of arrays as text."""
-    described = {name: [str(np.asarray(value).dtype), np.shape(value)] for name, value in arrays.items()}
+    described = {
+        name: [str(np.asarray(value).dtype), np.shape(value)] for name, value in arrays.items()
+    }
     return json.dumps(described, sort_keys=True)

@@ -1,4 +1,6 @@
-"""The machine and this process: what a result was made with, cores, threads, and memory that is kept."""
+"""The machine and this process: what a result was made with, cores, threads, and memory that is
+kept.
+"""
 
 import ctypes
 import os
@@ -14,20 +16,30 @@ _MALLOC = {-4: 0, -1: 2**31 - 1, -2: 2**28}
 
 
 def versions() -> dict[str, str]:
-    """Versions of what decides a result, the commit of this package (empty if unknown), and the platform."""
+    """Versions of what decides a result, the commit of this package (empty if unknown), and the
+    platform.
+    """
     from arcade_torch.agents.runs import folder
 
-    return folder.versions() | {"commit": _commit(), "platform": f"{platform.system()} {platform.machine()}"}
+    return folder.versions() | {
+        "commit": _commit(),
+        "platform": f"{platform.system()} {platform.machine()}",
+    }
 
 
 def _commit() -> str:
     def git(*words: str) -> str:
         run = ["git", "-C", str(Path(__file__).resolve().parent), *words]
-        return subprocess.run(run, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+        return subprocess.run(
+            run, capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # another repository may hold an installed copy
-        return git("rev-parse", "--short=12", "HEAD") + ("+changes" if git("status", "--porcelain") else "")
+        # another repository may hold an installed copy
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("rev-parse", "--short=12", "HEAD") + (
+            "+changes" if git("status", "--porcelain") else ""
+        )
     except (OSError, subprocess.SubprocessError):
         return ""
 
@@ -50,7 +62,11 @@ def machine() -> dict[str, Any]:
 
 def available_cores() -> list[int]:
     """Numbers of the processor cores this process may use, at least one."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [*range(os.cpu_count() or 1)]
+    return (
+        sorted(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else [*range(os.cpu_count() or 1)]
+    )
 
 
 @contextmanager
@@ -69,10 +85,11 @@ def torch_threads(count: int) -> Iterator[None]:
 def keep_freed_memory() -> bool:
     """Have the C library use freed memory again instead of handing it back to the system.
 
-    The feature maps of one minibatch take hundreds of megabytes. By default glibc maps every such tensor anew, and the
-    system fills each of its pages with zeros before it is written; this process then keeps what it once had. No number
-    that is computed changes. A gradient step of the paper's network with LRU took 0.46 s of one core instead of 0.66 s,
-    and the process 1.3 GB instead of 0.85 GB. Elsewhere than on glibc nothing happens.
+    The feature maps of one minibatch take hundreds of megabytes. By default glibc maps every such
+    tensor anew, and the system fills each of its pages with zeros before it is written; this
+    process then keeps what it once had. No number that is computed changes. A gradient step of the
+    paper's network with LRU took 0.46 s of one core instead of 0.66 s, and the process 1.3 GB
+    instead of 0.85 GB. Elsewhere than on glibc nothing happens.
 
     Source: ``mallopt(3)``, ``M_MMAP_MAX`` and ``M_TRIM_THRESHOLD``.
     """

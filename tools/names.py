@@ -29,18 +29,22 @@ class AgentKey:
         options = config.get("network_options") or {}
         if not isinstance(options, Mapping) or not isinstance(config.get("memory"), str):
             raise ValueError("its memory or its network_options are of no use")
-        network, size = str(config.get("network", "paper")), ""
+        network = str(config.get("network", "paper"))
+        size = ""
         flat = {name: str(plain_number(value)) for name, value in flatten(options).items()}
         if any(name in flat for name in _SIZE):
             default = preset_size(network)
-            chosen = "x".join(flat.get(name, base) for name, base in zip(_SIZE, default.split("x"), strict=True))
+            chosen = "x".join(
+                flat.get(name, base) for name, base in zip(_SIZE, default.split("x"), strict=True)
+            )
             size = "" if chosen == default else chosen
         rest = tuple(sorted((name, value) for name, value in flat.items() if name not in _SIZE))
         return cls(str(config.get("algorithm", "pqn")), config["memory"], network, size, rest)
 
 
 def plain_number(value: Any) -> Any:
-    """A setting with its whole numbers as ints, in lists too: JSON files of one setting may say 1 and 1.0.
+    """A setting with its whole numbers as ints, in lists too: JSON files of one setting may say 1
+    and 1.0.
 
     Example:
         >>> plain_number([1.0, 0.5, "1.0"])
@@ -60,7 +64,8 @@ def preset_size(network: str) -> str:
 
 
 def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey, str]:
-    """The shortest names that tell agents apart: the memory, and whatever else differs among those that share it.
+    """The shortest names that tell agents apart: the memory, and whatever else differs among those
+    that share it.
 
     Example:
         >>> list(agent_names([AgentKey("pqn", "lru"), AgentKey("ppo", "lru")]).values())
@@ -72,35 +77,51 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
     found = {}
     for key in every:
         same = [other for other in every if other.memory == key.memory]
-        name = f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
+        name = (
+            f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
+        )
         several = sized or len({other.size for other in same}) > 1
         parts = [key.size or preset_size(key.network or "paper")] if several else []
         parts += [key.network] if len(networks) > 1 and key.network else []
         shared = set.intersection(*(set(other.options) for other in same))
-        parts += [f"{option}={value}" for option, value in key.options if (option, value) not in shared]
+        parts += [
+            f"{option}={value}" for option, value in key.options if (option, value) not in shared
+        ]
         found[key] = printable(" ".join([name, *parts]))
     return found
 
 
 def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
-    """Whether an agent is the memory-free one, in any case and size; group 1 is its algorithm, ``ppo-``, or empty."""
+    """Whether an agent is the memory-free one, in any case and size; group 1 is its algorithm,
+    ``ppo-``, or empty.
+    """
     return re.fullmatch(rf"(|\S*-){re.escape(baseline)}( .*)?", agent, re.IGNORECASE)
 
 
 def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
-    """Agent -> the memory-free agent of its algorithm, where there is one; that of the very name or of PQN is first."""
-    algorithm = {agent: found[1].lower() for agent in agents if (found := memory_free(agent, baseline))}
-    free = sorted(algorithm, key=lambda agent: (agent.lower() != baseline.lower(), algorithm[agent] != "pqn-"))
+    """Agent -> the memory-free agent of its algorithm, where there is one; that of the very name or
+    of PQN is first.
+    """
+    algorithm = {
+        agent: found[1].lower() for agent in agents if (found := memory_free(agent, baseline))
+    }
+    free = sorted(
+        algorithm, key=lambda agent: (agent.lower() != baseline.lower(), algorithm[agent] != "pqn-")
+    )
     first = {algorithm[agent]: agent for agent in reversed(free)}
-    own = {agent: [start for start in first if agent.lower().startswith(start)] for agent in (*free, *agents)}
+    own = {
+        agent: [start for start in first if agent.lower().startswith(start)]
+        for agent in (*free, *agents)
+    }
     return {agent: first[max(starts, key=len)] for agent, starts in own.items() if starts}
 
 
 def game_names(written: Iterable[str]) -> dict[str, str]:
-    """One name for each game that is written in several ways: with its version, without, or by an alias.
+    """One name for each game that is written in several ways: with its version, without, or by an
+    alias.
 
-    A name without a version stands for the newest version that is there. A game that is always written in the same way
-    keeps that name.
+    A name without a version stands for the newest version that is there. A game that is always
+    written in the same way keeps that name.
 
     Example:
         >>> game_names(["NoisyPoleEasy", "NoisyCartPoleEasy-v0", "TetrisEasy"])["NoisyPoleEasy"]

@@ -1,4 +1,6 @@
-"""Words of the command line: options read into dataclasses by tyro, and ``--import`` of a user's games and models."""
+"""Words of the command line: options read into dataclasses by tyro, and ``--import`` of a user's
+games and models.
+"""
 
 import hashlib
 import importlib.util
@@ -18,21 +20,33 @@ from arcade_torch.tools.errors import need, one_line
 
 FLAG = "--import"
 VARIABLE = "ARCADE_TORCH_IMPORT"
-"""Environment variable that hands what was imported on to worker processes; entries separated like those of PATH."""
+"""Environment variable that hands what was imported on to worker processes; entries separated like
+those of PATH.
+"""
 LARGEST = 2**53
 """No option that counts something goes beyond; up to here every whole number is a float as well."""
 _FRAME = re.compile(r"\x1b\[[0-9;]*m|^ *[│╭╰|+] ?| ?[│╮╯|+] *$", re.MULTILINE)
 _RULE = re.compile(r"^ *[─-](?: |[─-]{3}).*$", re.MULTILINE)
-_TITLES = ("Unrecognized options", "Value error", "Required options", "Invalid choice", "Parsing error")
+_TITLES = (
+    "Unrecognized options",
+    "Value error",
+    "Required options",
+    "Invalid choice",
+    "Parsing error",
+)
 
 
 def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> Any:
-    """Read options of a command into a dataclass; ``default`` is an instance with values where no option is given.
+    """Read options of a command into a dataclass; ``default`` is an instance with values where no
+    option is given.
 
-    An option that is unknown, missing or malformed is a ``ValueError`` in one line; help is a ``SystemExit``.
+    An option that is unknown, missing or malformed is a ``ValueError`` in one line; help is a
+    ``SystemExit``.
     """
-    tyro, constructors = need("tyro"), need("tyro.constructors")
-    registry, captured = constructors.ConstructorRegistry(), StringIO()
+    tyro = need("tyro")
+    constructors = need("tyro.constructors")
+    registry = constructors.ConstructorRegistry()
+    captured = StringIO()
 
     @registry.primitive_rule  # type: ignore[untyped-decorator]
     def whole(info: Any) -> Any:
@@ -49,19 +63,32 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
     how: dict[str, Any] = {"config": (tyro.conf.FlagCreatePairsOff,), "registry": registry}
     try:
         with redirect_stderr(captured):
-            return tyro.cli(kind, args=list(words), prog=prog, **how, **({"default": default} if default else {}))
+            return tyro.cli(
+                kind,
+                args=list(words),
+                prog=prog,
+                **how,
+                **({"default": default} if default else {}),
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
     # The framed message that tyro wrote, in one line.
     parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", captured.getvalue()))]
-    said = [part for part in parts if part and part not in _TITLES] or ["the options could not be read"]
-    near = [f"; perhaps you meant {part.split()[3]}" for part in said if part.startswith("Perhaps you meant: ")]
+    said = [part for part in parts if part and part not in _TITLES] or [
+        "the options could not be read"
+    ]
+    near = [
+        f"; perhaps you meant {part.split()[3]}"
+        for part in said
+        if part.startswith("Perhaps you meant: ")
+    ]
     raise ValueError(f"{said[0].rstrip('.')}{''.join(near)} (see {prog} --help)")
 
 
 def at_least(options: Any, **least: float) -> None:
-    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``; of several, any.
+    """Refuse options, fields of a dataclass, below a number, such as ``at_least(self, scale=1)``;
+    of several, any.
 
     NaN is refused too, and what is above `LARGEST`.
     """
@@ -109,18 +136,22 @@ def name_and_value(text: str) -> tuple[str, Any]:
         raise ValueError(f"an option is written NAME=VALUE, got {text!r}")
     try:
         return name, json.loads(value.lower() if value in ("True", "False") else value)
-    except (ValueError, RecursionError):  # no JSON, or numbers and nesting that Python does not read
+    # no JSON, or numbers and nesting that Python does not read
+    except (ValueError, RecursionError):
         return name, value
 
 
 def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the remaining words.
+    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the
+    remaining words.
 
     Example:
         >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
         (['my_games'], ['train', '--env', 'PairsEasy'])
     """
-    found, rest, pending = list[str](), list[str](), iter(words)
+    found = list[str]()
+    rest = list[str]()
+    pending = iter(words)
     for word in pending:
         flag, equals, value = word.partition("=")
         if flag != FLAG:
@@ -128,13 +159,17 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
             continue
         name = value if equals else next(pending, "")
         if not name or "\0" in name:
-            raise ValueError(f"{FLAG} needs a file (games.py) or a module (package.games) that registers something")
+            raise ValueError(
+                f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
+                "something"
+            )
         found.append(str(Path(name).resolve()) if _is_file(name) else name)
     return found, rest
 
 
 def load_extensions(names: Sequence[str] = ()) -> None:
-    """Import files and modules that register games or memory models, once a process, and all that a parent process did.
+    """Import files and modules that register games or memory models, once a process, and all that a
+    parent process did.
 
     Raises:
         FileNotFoundError: there is no such file or module.
@@ -153,7 +188,9 @@ def imported() -> list[str]:
 
 def command_line(words: Sequence[str]) -> str:
     """A line for a shell that runs ``arcade-torch`` with these words and the same imports."""
-    return shlex.join(["arcade-torch", *words, *(part for name in imported() for part in (FLAG, name))])
+    return shlex.join(
+        ["arcade-torch", *words, *(part for name in imported() for part in (FLAG, name))]
+    )
 
 
 def _is_file(name: str) -> bool:
@@ -164,12 +201,18 @@ def _load(name: str) -> None:
     if _is_file(name) and not Path(name).is_file():
         raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
     # A file gets a name of its own, so that two files of one name do not meet.
-    module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}" if _is_file(name) else name
+    module = (
+        f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+        if _is_file(name)
+        else name
+    )
     try:
         if not _is_file(name):
             importlib.import_module(module)
         elif module not in sys.modules:
-            spec: Any = importlib.util.spec_from_file_location(module, name, loader=SourceFileLoader(module, name))
+            spec: Any = importlib.util.spec_from_file_location(
+                module, name, loader=SourceFileLoader(module, name)
+            )
             sys.modules[module] = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(sys.modules[module])
     except Exception as error:
@@ -177,7 +220,9 @@ def _load(name: str) -> None:
         if not isinstance(error, ModuleNotFoundError):
             why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
         elif error.name and (name == error.name or name.startswith(f"{error.name}.")):
-            raise FileNotFoundError(f"{FLAG} {name}: there is no module of that name; a file needs its .py") from error
+            raise FileNotFoundError(
+                f"{FLAG} {name}: there is no module of that name; a file needs its .py"
+            ) from error
         else:
             why = f"it imports {error.name}, which is not installed"
         raise ValueError(f"{FLAG} {name}: {why}") from error

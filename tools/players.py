@@ -15,15 +15,19 @@ from arcade_torch.envs_jax import make
 from arcade_torch.tools.files import markdown_table, measured_rows
 
 PLAYERS = ("random", "state", "frames")
-"""Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's frames have shown."""
-BEGIN, END = "<!-- baselines -->", "<!-- end of baselines -->"
+"""Uniformly random; the oracle that sees the state; the oracle that remembers what the POMDP's
+frames have shown.
+"""
+BEGIN = "<!-- baselines -->"
+END = "<!-- end of baselines -->"
 EPISODES = 256
 """Of each player, for the reference lines of a report."""
 
 
 class Baseline(NamedTuple):
-    """What one player earned in one game: mean undiscounted return, half its 95 % interval (Student's; NaN of one
-    episode), mean length of an episode, and the seconds it took, compilation included.
+    """What one player earned in one game: mean undiscounted return, half its 95 % interval
+    (Student's; NaN of one episode), mean length of an episode, and the seconds it took, compilation
+    included.
     """
 
     id: str
@@ -36,9 +40,15 @@ class Baseline(NamedTuple):
 
 
 def measure(
-    id: str, player: str, episodes: int = EPISODES, seconds: float = math.inf, block: int = 250, **options: Any
+    id: str,
+    player: str,
+    episodes: int = EPISODES,
+    seconds: float = math.inf,
+    block: int = 250,
+    **options: Any,
 ) -> Baseline:
-    """Let one of `PLAYERS` play a game, ``block`` episodes side by side, until ``seconds`` are over.
+    """Let one of `PLAYERS` play a game, ``block`` episodes side by side, until ``seconds`` are
+    over.
 
     Raises:
         ValueError: unknown game or player, or the game has no such oracle.
@@ -46,19 +56,41 @@ def measure(
     from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 
     require(player in PLAYERS, "player", player, f"one of {', '.join(PLAYERS)}")
-    started, game = time.monotonic(), make(id, **options)
-    who = RandomPlayer(0) if player == "random" else make_oracle(game, "state" if player == "state" else "frames")
-    played = play(game, who, episodes, 0, frames=player == "frames", block=min(episodes, block), seconds=seconds)
+    started = time.monotonic()
+    game = make(id, **options)
+    who = (
+        RandomPlayer(0)
+        if player == "random"
+        else make_oracle(game, "state" if player == "state" else "frames")
+    )
+    played = play(
+        game,
+        who,
+        episodes,
+        0,
+        frames=player == "frames",
+        block=min(episodes, block),
+        seconds=seconds,
+    )
     returns = played.returns.astype(np.float64)
     half_width = student_half_width(returns)
-    mean, half_width, steps = (round(float(each), 5) for each in (returns.mean(), half_width, played.lengths.mean()))
-    return Baseline(game.id, player, returns.size, mean, half_width, steps, round(time.monotonic() - started, 1))
+    mean, half_width, steps = (
+        round(float(each), 5) for each in (returns.mean(), half_width, played.lengths.mean())
+    )
+    return Baseline(
+        game.id, player, returns.size, mean, half_width, steps, round(time.monotonic() - started, 1)
+    )
 
 
 def references(
-    game: str, folder: Path, rules: str = "default", options: Mapping[str, Any] | None = None, episodes: int = EPISODES
+    game: str,
+    folder: Path,
+    rules: str = "default",
+    options: Mapping[str, Any] | None = None,
+    episodes: int = EPISODES,
 ) -> dict[str, Baseline]:
-    """What the players earn under the rules and options of a study, kept in ``folder/references-GAME-RULES.json``.
+    """What the players earn under the rules and options of a study, kept in
+    ``folder/references-GAME-RULES.json``.
 
     A game without an oracle lacks that player.
     """
@@ -72,7 +104,9 @@ def references(
         pass  # there is none, or it is damaged or older: it is made anew
     settings = {"rules": rules, **how["options"]}
     there = players_of(game, **settings)
-    found = {player: measure(game, player, episodes, block=EPISODES, **settings) for player in there}
+    found = {
+        player: measure(game, player, episodes, block=EPISODES, **settings) for player in there
+    }
     write_json(file, {"how": how, "players": [row._asdict() for row in found.values()]})
     return found
 
@@ -83,9 +117,13 @@ def players_of(game: str, **settings: Any) -> list[str]:
 
 
 def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
-    """Every player in every game, one row after another; rows that ``out`` holds already are not measured again."""
+    """Every player in every game, one row after another; rows that ``out`` holds already are not
+    measured again.
+    """
     keys = ((id, player) for id in ids for player in players_of(id))
-    return measured_rows(out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds))
+    return measured_rows(
+        out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds)
+    )
 
 
 def _mean_cell(row: Baseline | None) -> str:
@@ -102,7 +140,15 @@ def markdown(rows: Iterable[Baseline]) -> str:
     games: dict[str, dict[str, Baseline]] = {}
     for row in rows:
         games.setdefault(row.id, {})[row.player] = row
-    columns = ("id", "random", "state oracle", "frames oracle", "highest", "steps: random, state, frames", "episodes")
+    columns = (
+        "id",
+        "random",
+        "state oracle",
+        "frames oracle",
+        "highest",
+        "steps: random, state, frames",
+        "episodes",
+    )
     lines = []
     for id, by_player in games.items():
         found = [by_player.get(player) for player in PLAYERS]

@@ -1,4 +1,6 @@
-"""Progress on stderr: bars on a terminal, a line now and then elsewhere. Speed and time left are measured by rich."""
+"""Progress on stderr: bars on a terminal, a line now and then elsewhere. Speed and time left are
+measured by rich.
+"""
 
 import sys
 import time
@@ -16,12 +18,13 @@ LINE_EVERY_S = 15.0
 
 
 class Bars:
-    """Shows on stderr, or another stream, how much of each named part is done; use it as a context manager.
+    """Shows on stderr, or another stream, how much of each named part is done; use it as a context
+    manager.
 
     Args:
         stream: where to; stderr by default.
-        unit: what is counted, such as frames; if it is named, speed and time left are shown, and without a terminal the
-            last line says how far the work came.
+        unit: what is counted, such as frames; if it is named, speed and time left are shown, and
+            without a terminal the last line says how far the work came.
         first_line_s: when the first line is printed, where there is no terminal.
 
     Example:
@@ -29,15 +32,24 @@ class Bars:
         ...     bars.update("run-one", 3, 100)
     """
 
-    def __init__(self, stream: Any = None, unit: str = "", first_line_s: float = LINE_EVERY_S) -> None:
+    def __init__(
+        self, stream: Any = None, unit: str = "", first_line_s: float = LINE_EVERY_S
+    ) -> None:
         self.stream = sys.stderr if stream is None else stream
         self.unit, self.terminal = unit, self.stream.isatty()
-        rich, console = need("rich.progress"), need("rich.console").Console(file=self.stream)
-        columns = [rich.TextColumn("{task.description}", markup=False), rich.BarColumn(bar_width=24)]
+        rich = need("rich.progress")
+        console = need("rich.console").Console(file=self.stream)
+        columns = [
+            rich.TextColumn("{task.description}", markup=False),
+            rich.BarColumn(bar_width=24),
+        ]
         columns += [rich.TaskProgressColumn(), rich.TextColumn("{task.fields[text]}", markup=False)]
-        self._bars = rich.Progress(*columns, console=console, refresh_per_second=4, speed_estimate_period=WINDOW_S)
+        self._bars = rich.Progress(
+            *columns, console=console, refresh_per_second=4, speed_estimate_period=WINDOW_S
+        )
         self._tasks: dict[str, Any] = {}
-        self._next_line_s, self._line = time.monotonic() + first_line_s, ""
+        self._next_line_s = time.monotonic() + first_line_s
+        self._line = ""
 
     def __enter__(self) -> Self:
         """Start to show."""
@@ -53,7 +65,9 @@ class Bars:
             self.note(self._line)
 
     def update(self, name: str, done: int, total: int, text: str = "") -> None:
-        """Show how much of a part is done, of 0 where that is not known, and some words about it."""
+        """Show how much of a part is done, of 0 where that is not known, and some words about
+        it.
+        """
         if name not in self._tasks:
             self._tasks[name] = self._bars.add_task(printable(name), total=None, text="")
         self._bars.update(self._tasks[name], completed=done, total=total or None)
@@ -64,14 +78,19 @@ class Bars:
             parts = [f"{task.speed:,.0f} {self.unit}/s", *left, text]
         task.fields["text"] = said = printable(", ".join(filter(None, parts)))
         of, share = (f" of {total:,}", f"({task.percentage:.0f} %)") if total else ("", "")
-        self._line = " ".join(filter(None, [f"{name}: {done:,}{of}", self.unit, share])) + (f", {said}" if said else "")
+        self._line = " ".join(filter(None, [f"{name}: {done:,}{of}", self.unit, share])) + (
+            f", {said}" if said else ""
+        )
         if not self.terminal and time.monotonic() >= self._next_line_s:
             self.note(self._line)
-            self._next_line_s, self._line = time.monotonic() + LINE_EVERY_S, ""
+            self._next_line_s = time.monotonic() + LINE_EVERY_S
+            self._line = ""
 
     def note(self, text: str) -> None:
         """Print a line, above the bars if there are any."""
-        self._bars.console.print(printable(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
+        self._bars.console.print(
+            printable(text), markup=False, emoji=False, highlight=False, soft_wrap=True
+        )
 
     def remove(self, name: str) -> None:
         """Forget a part."""
@@ -91,10 +110,14 @@ _SHOWN = {
 
 
 def standing(row: Mapping[str, Any]) -> str:
-    """How a run stands by a row of ``metrics.csv``, in a few words; what there is not yet is left out.
+    """How a run stands by a row of ``metrics.csv``, in a few words; what there is not yet is left
+    out.
 
     Example:
-        >>> standing({"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "epsilon": 0.2, "lr": 5e-5})
+        >>> row = {"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "lr": 5e-5}
+        >>> standing({**row, "epsilon": 0.2})
         'return 0.500, loss 0.0123, epsilon 0.20, lr 5.0e-05'
     """
-    return ", ".join(words.format(float(row[key])) for key, words in _SHOWN.items() if row.get(key) is not None)
+    return ", ".join(
+        words.format(float(row[key])) for key, words in _SHOWN.items() if row.get(key) is not None
+    )

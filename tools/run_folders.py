@@ -1,4 +1,6 @@
-"""Where runs lie on the disk: the folders with a ``config.json`` below a folder, through symbolic links too."""
+"""Where runs lie on the disk: the folders with a ``config.json`` below a folder, through symbolic
+links too.
+"""
 
 import os
 from collections.abc import Iterator
@@ -14,8 +16,9 @@ _OF_A_RUN = ("checkpoints", "replay")
 class RunFolders:
     """Finds run folders, each real folder once, however many links lead to it.
 
-    Links are followed after everything else, so that a run has the name of its own folder where that lies below the
-    same root. A link to a folder that holds the root is left alone: what lies there was not asked for.
+    Links are followed after everything else, so that a run has the name of its own folder where
+    that lies below the same root. A link to a folder that holds the root is left alone: what lies
+    there was not asked for.
     """
 
     def __init__(self) -> None:
@@ -30,7 +33,8 @@ class RunFolders:
     def below(self, root: Path) -> Iterator[Path]:
         """Every run folder at or below ``root`` that was not met before, in no order."""
         real_root = os.path.realpath(root)
-        waiting, links = [(root, real_root, 0)], list[tuple[Path, str, int]]()
+        waiting = [(root, real_root, 0)]
+        links = list[tuple[Path, str, int]]()
         while waiting or links:
             folder, real, depth = waiting.pop() if waiting else links.pop(0)
             if real in self._seen or depth > MOST_DEPTH:
@@ -50,7 +54,9 @@ class RunFolders:
                     links.append((folder / entry.name, target, depth + 1))
 
     def _folders_in(self, folder: Path) -> list[os.DirEntry[str]]:
-        """Folders, and links to folders, in a folder; a note where it may not be read, and on links to nothing."""
+        """Folders, and links to folders, in a folder; a note where it may not be read, and on links
+        to nothing.
+        """
         try:
             with os.scandir(folder) as entries:
                 listed = sorted(entries, key=lambda entry: entry.name)

@@ -1,7 +1,9 @@
-"""Text from files and from the command line on its way out: names in it are text, whatever they hold.
+"""Text from files and from the command line on its way out: names in it are text, whatever they
+hold.
 
-One function for each place that text goes to: `printable` for a terminal, `csv_cell` for a table, `markdown_cell` for a
-page. HTML pages are escaped by their templates, figures by `arcade_torch.tools.figures.style`.
+One function for each place that text goes to: `printable` for a terminal, `csv_cell` for a table,
+`markdown_cell` for a page. HTML pages are escaped by their templates, figures by
+`arcade_torch.tools.figures.style`.
 """
 
 import html

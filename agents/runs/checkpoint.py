@@ -1,14 +1,17 @@
-"""Checkpoints: everything a run needs to go on to the bit, in a folder that is either whole or absent.
+"""Checkpoints: everything a run needs to go on to the bit, in a folder that is either whole or
+absent.
 
-``checkpoints/`` of a run holds the last two, named by their frame count, and ``latest``, the name of the newest::
+``checkpoints/`` of a run holds the last two, named by their frame count, and ``latest``, the name
+of the newest::
 
     checkpoints/latest                              text: frames-000000204800
     checkpoints/frames-000000204800/weights.safetensors    network that acts, with buffers
-    checkpoints/frames-000000204800/trainer.pt             optimiser, counters, generators, environments, memory
-    checkpoints/frames-000000204800/meta.json              format, config, frames, checksums; written last
+    checkpoints/frames-000000204800/trainer.pt             optimiser, counters, generators,
+    environments, memory checkpoints/frames-000000204800/meta.json              format, config,
+    frames, checksums; written last
 
-A learner with a replay keeps it beside, in ``replay/`` of the run: the trainer's state names its files.
-Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights_only=True``.
+A learner with a replay keeps it beside, in ``replay/`` of the run: the trainer's state names its
+files. Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights_only=True``.
 """
 
 import io
@@ -53,7 +56,10 @@ _PLAIN = re.compile(
     r"|torch (Size|device|u?int\d+|b?float\d+|bool)"
 )
 """What ``torch.save`` names in tables of tensors, numbers and text."""
-_WEIGHTS, _TRAINER, _META, _LATEST = "weights.safetensors", "trainer.pt", "meta.json", "latest"
+_WEIGHTS = "weights.safetensors"
+_TRAINER = "trainer.pt"
+_META = "meta.json"
+_LATEST = "latest"
 
 _MOST_BYTES = {_WEIGHTS: MOST_WEIGHTS, _TRAINER: MOST_TENSORS}
 
@@ -69,7 +75,8 @@ class Checkpoint:
     config: TrainConfig
     frames: int
     weights: dict[str, Tensor]  # the network's state_dict, on the CPU
-    trainer: dict[str, Any] | None  # the rest of the training state; None if only the weights were asked for
+    # the rest of the training state; None if only the weights were asked for
+    trainer: dict[str, Any] | None
     path: Path
 
 
@@ -78,10 +85,11 @@ def save_checkpoint(
 ) -> Path:
     """Write a checkpoint and make it the latest; keep the last two.
 
-    The folder is written under a temporary name and renamed, then ``latest`` is replaced: a process killed at any
-    moment leaves at least the previous checkpoint whole.
+    The folder is written under a temporary name and renamed, then ``latest`` is replaced: a process
+    killed at any moment leaves at least the previous checkpoint whole.
 
-    The weights are the network's ``state_dict``, the trainer's state nests tensors, numbers, text, dicts and lists.
+    The weights are the network's ``state_dict``, the trainer's state nests tensors, numbers, text,
+    dicts and lists.
     """
     final = folder / f"frames-{frames:012d}"
     draft = folder / f".{final.name}.{os.getpid()}"
@@ -127,7 +135,9 @@ def remove_draft_checkpoints(folder: Path) -> None:
 
 
 def list_checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames) first."""
+    """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames)
+    first.
+    """
     checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
     try:
         latest = read_text(folder / _LATEST).strip()
@@ -141,11 +151,14 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
     """Load one checkpoint folder; with ``weights_only`` the trainer's state is left on disk.
 
     Raises:
-        CheckpointError: a part is missing or damaged, the format is another, or the config is not ``expect``.
+        CheckpointError: a part is missing or damaged, the format is another, or the config is not
+            ``expect``.
     """
     meta = _read_meta(path)
     try:
-        config, frames, sums = TrainConfig.from_dict(meta["config"]), meta["frames"], dict(meta["sha256"])
+        config = TrainConfig.from_dict(meta["config"])
+        frames = meta["frames"]
+        sums = dict(meta["sha256"])
         require(type(frames) is int and 0 <= frames < 10**12, "frames", frames, "a count of frames")
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error
@@ -166,12 +179,15 @@ def load_latest(
 
     Args:
         folder: ``checkpoints/`` of a run.
-        expect: config of the run that wants to go on; a checkpoint of another run is an error, never skipped.
+        expect: config of the run that wants to go on; a checkpoint of another run is an error,
+            never skipped.
         weights_only: leave the trainer's state on disk.
-        use: called with the checkpoint; one for which it raises ``CheckpointError`` counts as damaged.
+        use: called with the checkpoint; one for which it raises ``CheckpointError`` counts as
+            damaged.
 
     Raises:
-        CheckpointError: there is none, none is whole, or it belongs to another run or to version 0.1.
+        CheckpointError: there is none, none is whole, or it belongs to another run or to version
+            0.1.
     """
     problems: list[str] = []
     for path in list_checkpoints(folder):
@@ -200,11 +216,14 @@ def refuse_format(what: object, found: Any) -> str | None:
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
-    """The weights of one checkpoint, or of a run or its ``checkpoints`` folder: the newest that is whole."""
+    """The weights of one checkpoint, or of a run or its ``checkpoints`` folder: the newest that is
+    whole.
+    """
     hint = "give a run folder or one of its checkpoints"
     try:
         names = os.listdir(path)
-    except (FileNotFoundError, NotADirectoryError, ValueError) as error:  # the last for names that no file can have
+    # the last for names that no file can have
+    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
         raise CheckpointError(f"{path} is not a folder; {hint}") from error
     except OSError as error:
         raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
@@ -233,7 +252,9 @@ def _load_tensors(file: Path) -> dict[str, Any]:
 
 
 def _check_archive(archive: zipfile.ZipFile) -> None:
-    """Refuse parts that are packed, and tables that call for anything but tensors: both may grow without bound."""
+    """Refuse parts that are packed, and tables that call for anything but tensors: both may grow
+    without bound.
+    """
     for entry in archive.infolist():
         if entry.compress_type != zipfile.ZIP_STORED:
             raise ValueError(f"{entry.filename} is compressed, which torch.save does not do")

@@ -1,4 +1,6 @@
-"""Small files of a run: read with a bound, replaced atomically, or tables that grow by whole rows."""
+"""Small files of a run: read with a bound, replaced atomically, or tables that grow by whole
+rows.
+"""
 
 import contextlib
 import csv
@@ -41,7 +43,8 @@ class CheckpointError(RuntimeError):
 
 
 def is_our_name(name: object, kind: str) -> bool:
-    """Whether a name is one that we give: to a ``draft``, a ``window``, a ``checkpoint`` or a ``checkpoint draft``.
+    """Whether a name is one that we give: to a ``draft``, a ``window``, a ``checkpoint`` or a
+    ``checkpoint draft``.
 
     Whatever reads, lists or removes files by names that stand in a file or a folder asks here.
     """
@@ -49,14 +52,18 @@ def is_our_name(name: object, kind: str) -> bool:
 
 
 def is_ours(path: Path, kind: str) -> bool:
-    """Whether a path has a name that we give, and is what we make of it: a file or a folder, and no link."""
+    """Whether a path has a name that we give, and is what we make of it: a file or a folder, and no
+    link.
+    """
     if not is_our_name(path.name, kind) or path.is_symlink():
         return False
     return path.is_dir() if kind.startswith("checkpoint") else path.is_file()
 
 
 def is_inside(folder: Path, name: str) -> bool:
-    """Whether a relative name leads to a place for a file below a folder, through no link and nothing upwards."""
+    """Whether a relative name leads to a place for a file below a folder, through no link and
+    nothing upwards.
+    """
     parts = name.split("/")
     if "\0" in name or any(part in ("", ".", "..") for part in parts):
         return False
@@ -67,7 +74,8 @@ def is_inside(folder: Path, name: str) -> bool:
 def open_regular(path: Path, most_bytes: int | None = MOST_TEXT) -> BinaryIO:
     """Open a file for reading, if it is a regular one of a size that can be meant.
 
-    What is opened is looked at, so that nothing can take its place in between; nothing is waited for.
+    What is opened is looked at, so that nothing can take its place in between; nothing is waited
+    for.
 
     Args:
         path: the file, or a link to it.
@@ -121,7 +129,9 @@ def read_bytes(path: Path, most_bytes: int = MOST_TEXT) -> bytes:
 
 
 def read_text(path: Path, most_bytes: int = MOST_TEXT) -> str:
-    """What a regular file of text in UTF-8 holds, without a byte order mark; a ``ValueError`` if it is no such file."""
+    """What a regular file of text in UTF-8 holds, without a byte order mark; a ``ValueError`` if it
+    is no such file.
+    """
     return read_bytes(path, most_bytes).decode("utf-8-sig")
 
 
@@ -134,7 +144,8 @@ def read_end(path: Path) -> str:
 
 
 def write_atomic(path: Path, data: str | bytes) -> Path:
-    """Replace a file in one step: readers see the old content or the new, never a part; missing folders are made.
+    """Replace a file in one step: readers see the old content or the new, never a part; missing
+    folders are made.
 
     What of a text has no UTF-8 (names of files may be any bytes) is written with backslashes.
 
@@ -174,7 +185,8 @@ def read_json(path: Path) -> Any:
     data = read_bytes(path, MOST_JSON)
     try:
         return json.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # no text, no JSON, too many digits, nested too deeply
+    # no text, no JSON, too many digits, nested too deeply
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} does not hold JSON: {error}") from error
 
 
@@ -188,30 +200,39 @@ def checksum(path: Path, most_bytes: int = MOST_TENSORS) -> str:
 
 
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
-    """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run holds."""
+    """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
+    holds.
+    """
     if not isinstance(values, dict) or values.get("status", "finished") != "finished" or not set(needed) <= set(values):
         return False
-    returns, lengths = values.get("returns", []), values.get("lengths", [])
+    returns = values.get("returns", [])
+    lengths = values.get("lengths", [])
     if not (isinstance(returns, list) and isinstance(lengths, list)) or values.get("mean", returns or None) is None:
         return False
     others = [values.get(name) for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm")]
     numbers = [*returns, *lengths, *(value for value in others if value is not None)]
-    sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)  # what can be squared; NaN is one
+    # what can be squared; NaN is one
+    sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)
     return sound and all(type(n) is int for n in lengths)
 
 
 class CsvLog:
-    """A table, first column ``frames``, that grows by whole rows; on opening, what is beyond ``keep_frames`` is dropped."""
+    """A table, first column ``frames``, that grows by whole rows; on opening, what is beyond
+    ``keep_frames`` is dropped.
+    """
 
     def __init__(self, path: Path, columns: Sequence[str], keep_frames: int = 0) -> None:
-        self.path, self.columns = path, list(columns)
+        self.path = path
+        self.columns = list(columns)
         rows = read_csv(path, strict=False) if path.exists() else []
         kept = [[row.get(name, "") for name in columns] for row in rows if int(row["frames"]) <= keep_frames]
         write_atomic(path, "".join(",".join(cells) + "\n" for cells in [columns, *kept]))
         self._stream = io.TextIOWrapper(open_append(path), encoding="utf-8", newline="")
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Add one row and hand it to the operating system at once; None is written as an empty cell."""
+        """Add one row and hand it to the operating system at once; None is written as an empty
+        cell.
+        """
         try:
             self._stream.write(",".join(_cell(row.get(name)) for name in self.columns) + "\n")
             self._stream.flush()
@@ -229,8 +250,8 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
 
     Args:
         path: the file.
-        strict: refuse a line of another length; else the file is a log, its first column is ``frames``, and unfinished
-            or damaged lines are left out.
+        strict: refuse a line of another length; else the file is a log, its first column is
+            ``frames``, and unfinished or damaged lines are left out.
 
     Raises:
         FileNotFoundError: there is none.

@@ -24,17 +24,19 @@ METRIC_COLUMNS = (
     "replay_frames", "epsilon", "lr",
     "train_return", "train_return_ewm", "train_return_last", "episodes",
 )  # fmt: skip
-"""Columns of ``metrics.csv``; a cell that means nothing for an algorithm is empty. ``seconds`` is time spent
-collecting and learning. ``train_return`` is the mean return of the episodes that ended in the rollout (empty if none),
-``train_return_ewm`` its running average, and ``train_return_last`` the last finished return of every environment
-averaged over the rollout, which is what the paper's score reads."""
+"""Columns of ``metrics.csv``; a cell that means nothing for an algorithm is empty. ``seconds`` is
+time spent collecting and learning. ``train_return`` is the mean return of the episodes that ended
+in the rollout (empty if none), ``train_return_ewm`` its running average, and ``train_return_last``
+the last finished return of every environment averaged over the rollout, which is what the paper's
+score reads."""
 EVAL_COLUMNS = ("frames", "mean", "std", "n")
 LOCK = "lock"
-"""File in a run folder that the process which trains there holds locked. The file itself stays; a killed process
-loses the lock at once."""
+"""File in a run folder that the process which trains there holds locked. The file itself stays; a
+killed process loses the lock at once."""
 
 
-_WRITTEN = (LOCK, "checkpoints", "replay", "tensorboard", "wandb", "wandb_id.txt")  # in place, so never behind a link
+# in place, so never behind a link
+_WRITTEN = (LOCK, "checkpoints", "replay", "tensorboard", "wandb", "wandb_id.txt")
 
 
 class RunFolderError(RuntimeError):
@@ -42,7 +44,9 @@ class RunFolderError(RuntimeError):
 
 
 class RunFolder:
-    """Paths and small files of one run, in a folder that :meth:`check` looks at and :meth:`claim` creates."""
+    """Paths and small files of one run, in a folder that :meth:`check` looks at and :meth:`claim`
+    creates.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -52,8 +56,8 @@ class RunFolder:
         self._reported = 0.0
 
     def check(self, config: TrainConfig, resume: bool) -> None:
-        """Refuse, by a ``RunFolderError``, a folder that holds something (with ``resume``: another run) or that cannot be
-        written; change nothing.
+        """Refuse, by a ``RunFolderError``, a folder that holds something (with ``resume``: another
+        run) or that cannot be written; change nothing.
         """
         if self._config.exists() and resume:
             self._check_same(config)
@@ -66,10 +70,12 @@ class RunFolder:
 
     @contextlib.contextmanager
     def claim(self, config: TrainConfig) -> Iterator[None]:
-        """Hold the folder for this process alone; what a killed process left half written is removed.
+        """Hold the folder for this process alone; what a killed process left half written is
+        removed.
 
         Raises:
-            RunFolderError: another process trains here, the folder holds another run, or it cannot be written.
+            RunFolderError: another process trains here, the folder holds another run, or it cannot
+                be written.
         """
         for name in _WRITTEN:
             if (self.path / name).is_symlink():
@@ -114,7 +120,9 @@ class RunFolder:
             raise RunFolderError(f"{self.path} is not there any more, or its config.json: the run ends here")
 
     def finished(self) -> dict[str, Any] | None:
-        """The final ``eval.json`` if the run is finished; a damaged one is made again from the last checkpoint."""
+        """The final ``eval.json`` if the run is finished; a damaged one is made again from the last
+        checkpoint.
+        """
         try:
             result = read_json(self.path / "eval.json")
         except PermissionError as error:
@@ -139,7 +147,8 @@ class RunFolder:
 def wait_until_free(path: Path, limit_s: float) -> None:
     """Wait until no process trains in a run folder, at most so many seconds."""
     if (path / LOCK).is_file() and not (path / LOCK).is_symlink():
-        with contextlib.suppress(OSError), FileLock(path / LOCK).acquire(timeout=limit_s):  # Timeout is an OSError
+        # Timeout is an OSError
+        with contextlib.suppress(OSError), FileLock(path / LOCK).acquire(timeout=limit_s):
             pass
 
 
@@ -153,7 +162,9 @@ def versions() -> dict[str, str]:
 
 
 def _version(name: str) -> str:
-    """The version of a package, also where a nightly build of it is installed, which has a name of its own."""
+    """The version of a package, also where a nightly build of it is installed, which has a name of
+    its own.
+    """
     for distribution in (name, f"{name}-nightly"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             return importlib.metadata.version(distribution)

@@ -1,4 +1,6 @@
-"""TensorBoard and Weights & Biases beside the CSV files: a copy of the same rows that no run depends on."""
+"""TensorBoard and Weights & Biases beside the CSV files: a copy of the same rows that no run
+depends on.
+"""
 
 import importlib.util
 import json
@@ -18,18 +20,23 @@ class LoggerError(RuntimeError):
 
 
 def check_logger(name: str) -> None:
-    """Refuse a logger (see ``TrainConfig.logger``) whose package is missing, by a ``LoggerError``."""
+    """Refuse a logger (see ``TrainConfig.logger``) whose package is missing, by a
+    ``LoggerError``.
+    """
     if name != "none" and importlib.util.find_spec(name) is None:
         raise LoggerError(f"logger={name!r} needs a package that is missing: pip install 'arcade-torch[loggers]'")
 
 
 class RunLogger:
-    """Hands rows to the logger of TorchRL that a run names, at their frame count; after its first error it stays silent.
+    """Hands rows to the logger of TorchRL that a run names, at their frame count; after its first
+    error it stays silent.
 
     Args:
         config: of the run.
-        folder: of the run, which exists; TensorBoard writes to ``tensorboard`` in it, Weights & Biases to ``wandb``.
-        frames: where the run goes on; what TensorBoard shows beyond is dropped, as in the CSV files.
+        folder: of the run, which exists; TensorBoard writes to ``tensorboard`` in it, Weights &
+            Biases to ``wandb``.
+        frames: where the run goes on; what TensorBoard shows beyond is dropped, as in the CSV
+            files.
     """
 
     def __init__(self, config: TrainConfig, folder: Path, frames: int) -> None:
@@ -37,7 +44,9 @@ class RunLogger:
         self._logger = open_logger and self._try(lambda: open_logger(config, folder, frames))
 
     def log(self, group: str, row: Mapping[str, Any]) -> None:
-        """Log a row of ``metrics.csv`` or ``eval.csv``, without empty cells, as ``group/name``, of times ``time/name``."""
+        """Log a row of ``metrics.csv`` or ``eval.csv``, without empty cells, as ``group/name``, of
+        times ``time/name``.
+        """
         if (logger := self._logger) is not None:
             names = {key: "time" if key in ("seconds", "fps") else group for key in row if key != "frames"}
             found = {f"{name}/{key}": float(row[key]) for key, name in names.items() if row[key] is not None}
@@ -77,7 +86,9 @@ def _tensorboard(config: TrainConfig, folder: Path, frames: int) -> Any:
 
 
 def _wandb(config: TrainConfig, folder: Path, frames: int) -> Any:
-    """Offline unless WANDB_MODE says otherwise, so that no run waits for a network or asks for a key."""
+    """Offline unless WANDB_MODE says otherwise, so that no run waits for a network or asks for a
+    key.
+    """
     from torchrl.record.loggers import WandbLogger
 
     file = folder / "wandb_id.txt"

@@ -1,6 +1,7 @@
 """Whether the saved state of a trainer can be one of this trainer: the same names, types and sizes.
 
-Torch and Python take many a wrong value without a word, and fail in the middle of the training that follows.
+Torch and Python take many a wrong value without a word, and fail in the middle of the training that
+follows.
 """
 
 import math
@@ -18,8 +19,8 @@ def check_state(saved: Any, expected: Any, name: str = "the state") -> None:
 
     Args:
         saved: what a file holds: tensors, numbers, text, None, and tables and lists of them.
-        expected: the like of this trainer. Names that only one side has are left to those who read them, and so is
-            what an empty table or list may hold.
+        expected: the like of this trainer. Names that only one side has are left to those who read
+            them, and so is what an empty table or list may hold.
         name: of the state in the message.
 
     Raises:
@@ -54,7 +55,9 @@ def _check_value(saved: Any, expected: Any, name: str) -> None:
 
 
 def check_optimizer(saved: Any, parameters: Sequence[nn.Parameter]) -> None:
-    """Refuse the saved state of Adam or RAdam if its averages are not those of these parameters, by a ``ValueError``."""
+    """Refuse the saved state of Adam or RAdam if its averages are not those of these parameters, by
+    a ``ValueError``.
+    """
     name = "the state['optimizer']"
     _require(isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping), name, saved, "one of an optimiser")
     for index, averages in saved["state"].items():

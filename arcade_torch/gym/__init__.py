@@ -1,4 +1,6 @@
-"""The games for Gymnasium. Ids and entry points are strings, so that registering them loads neither JAX nor torch."""
+"""The games for Gymnasium. Ids and entry points are strings, so that registering them loads neither
+JAX nor torch.
+"""
 
 from collections.abc import Iterable
 
@@ -10,10 +12,11 @@ NAMESPACE = "arcade_torch"
 
 
 def register_games(ids: Iterable[str] = ()) -> None:
-    """Put games into Gymnasium's registry, as ``"arcade_torch/<id>"``; those that are there already stay.
+    """Put games into Gymnasium's registry, as ``"arcade_torch/<id>"``; those that are there already
+    stay.
 
-    The games of the benchmark are there from the beginning, and a game of your own from its ``register`` on; this is
-    for probes, which stay out by themselves.
+    The games of the benchmark are there from the beginning, and a game of your own from its
+    ``register`` on; this is for probes, which stay out by themselves.
 
     Args:
         ids: Versioned ids of ``arcade_torch.envs_jax``.

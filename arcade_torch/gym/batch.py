@@ -1,4 +1,5 @@
-"""N episodes of one game behind numpy arrays: what the Gymnasium environments and the player's session stand on.
+"""N episodes of one game behind numpy arrays: what the Gymnasium environments and the player's
+session stand on.
 
 Loads no torch. Every array that is handed out is the caller's own.
 """
@@ -34,8 +35,9 @@ def seed_keys(seed: int | Sequence[int] | npt.NDArray[Any], num_envs: int) -> ja
     """Random keys of N envs.
 
     Args:
-        seed: One seed for the batch: env ``i`` walks the path of env ``i`` of an ``ArcadeEnv`` with that seed. Or one
-            seed an env: each walks the path of env 0 of an ``ArcadeEnv`` with its seed.
+        seed: One seed for the batch: env ``i`` walks the path of env ``i`` of an ``ArcadeEnv`` with
+            that seed. Or one seed an env: each walks the path of env 0 of an ``ArcadeEnv`` with its
+            seed.
         num_envs: Number of envs.
 
     Returns:
@@ -54,9 +56,11 @@ def seed_keys(seed: int | Sequence[int] | npt.NDArray[Any], num_envs: int) -> ja
 
 
 class NumpyBatch:
-    """N running episodes: numpy in, numpy out, nothing is begun anew unless asked. The first call is a reset of all.
+    """N running episodes: numpy in, numpy out, nothing is begun anew unless asked. The first call
+    is a reset of all.
 
-    Steps and drawing are compiled apart, so that whoever plays, resets and redraws compiles the picture once.
+    Steps and drawing are compiled apart, so that whoever plays, resets and redraws compiles the
+    picture once.
 
     Args:
         compiled: The game.
@@ -65,19 +69,25 @@ class NumpyBatch:
 
     def __init__(self, compiled: CompiledGame, flags: Bools) -> None:
         check_process()
-        self._compiled, self._batched = compiled, compiled.batched
+        self._compiled = compiled
+        self._batched = compiled.batched
         self.num_envs = len(flags)
-        # Nothing runs before the first reset, so its shape is all that is needed of a batch, and nothing is compiled.
+        # Nothing runs before the first reset, so its shape is all that is needed of a batch, and
+        # nothing is compiled.
         shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
         batch: Batch = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
         self._batch = batch._replace(partial=jnp.asarray(flags))
         self._no_ends = (jnp.zeros(self.num_envs, bool), jnp.zeros(self.num_envs, bool))
         (device,) = self._batch.partial.devices()
         self._finals = FinalObservations(compiled, self.num_envs, 1, device)
-        self._memory = FrameMemory((self.num_envs, self.game.obs_size, self.game.obs_size, 3), device)
+        self._memory = FrameMemory(
+            (self.num_envs, self.game.obs_size, self.game.obs_size, 3), device
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        """The game and everything that determines what comes, as numpy arrays, for ``copy`` and ``pickle``."""
+        """The game and everything that determines what comes, as numpy arrays, for ``copy`` and
+        ``pickle``.
+        """
         return {"compiled": self._compiled, "batch": jax.tree.map(np.array, self._batch)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -100,7 +110,10 @@ class NumpyBatch:
     def info(self) -> Info:
         """Return so far (float64 [N]) and steps so far (int64 [N]) of the running episodes."""
         counts = np.array(self._batch.step_count, np.int64)
-        return {"episode_reward": np.array(self._batch.episode_reward, np.float64), "step_count": counts}
+        return {
+            "episode_reward": np.array(self._batch.episode_reward, np.float64),
+            "step_count": counts,
+        }
 
     def set_partial(self, flags: Bools) -> None:
         """Change which twin is shown, bool [N]; only what is drawn from now on changes."""
@@ -120,7 +133,9 @@ class NumpyBatch:
         return np.array(self._batched.render(batch), copy=copy or None)
 
     def reset(self, mask: Bools, keys: jax.Array | None = None) -> None:
-        """Begin a new episode where ``mask`` (bool [N]) is true, from ``keys`` (uint32 [N, 2]) if they are given."""
+        """Begin a new episode where ``mask`` (bool [N]) is true, from ``keys`` (uint32 [N, 2]) if
+        they are given.
+        """
         if keys is not None:
             keys = jnp.where(jnp.asarray(mask)[:, None], keys, self._batch.key)
             self._batch = self._batch._replace(key=keys)
@@ -134,7 +149,8 @@ class NumpyBatch:
         return self._stepped(outcome)
 
     def reset_or_step(self, action: npt.NDArray[np.int32], ended: Bools) -> Stepped:
-        """Begin anew where ``ended`` (bool [N]) is true and take one action elsewhere; nothing is drawn.
+        """Begin anew where ``ended`` (bool [N]) is true and take one action elsewhere; nothing is
+        drawn.
 
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
@@ -151,13 +167,16 @@ class NumpyBatch:
     def step_and_reset(
         self, action: npt.NDArray[np.int32], copy: bool = True
     ) -> tuple[Stepped, Frames, npt.NDArray[np.int64], Frames]:
-        """Take one action in every env, begin anew where that ended an episode, draw once, and draw the ends.
+        """Take one action in every env, begin anew where that ended an episode, draw once, and draw
+        the ends.
 
         Returns:
-            What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that; the n envs that
-            ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
+            What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that;
+            the n envs that ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
         """
-        step = self._compiled.step(self._batched.without_ends(self._batch), action, self._memory.spare())
+        step = self._compiled.step(
+            self._batched.without_ends(self._batch), action, self._memory.spare()
+        )
         frames = np.array(self._memory.show(step.pixels), copy=copy or None)
         numbers = np.asarray(step.numbers)
         # Now that the step has been computed: one that fails leaves the state as it was.
@@ -171,5 +190,7 @@ class NumpyBatch:
         stepped = Stepped(paid, terminated > 0, truncated > 0, info)
         ended = stepped.terminated | stepped.truncated
         self._finals.add(0, step.final_state, step.root.partial)
-        drawn = [np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])]
+        drawn = [
+            np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])
+        ]
         return stepped, frames, np.flatnonzero(ended), np.concatenate([frames[:0], *drawn])

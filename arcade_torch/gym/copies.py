@@ -5,7 +5,9 @@ from typing import Any
 
 
 class Copyable:
-    """An env whose copies and pickles walk the same path, and whose ``spec`` knows the game's time limit."""
+    """An env whose copies and pickles walk the same path, and whose ``spec`` knows the game's time
+    limit.
+    """
 
     _batch: Any
     _spec: Any = None
@@ -16,7 +18,9 @@ class Copyable:
 
     @property
     def spec(self) -> Any:
-        """Gymnasium's description of the env, with the game's time limit, which Gymnasium itself need not keep."""
+        """Gymnasium's description of the env, with the game's time limit, which Gymnasium itself
+        need not keep.
+        """
         return self._spec
 
     @spec.setter

@@ -39,9 +39,10 @@ def check_reset_options(options: dict[str, Any] | None, allowed: tuple[str, ...]
 class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
     """One game, one episode at a time. Made by ``gymnasium.make("arcade_torch/<id>", ...)``.
 
-    Observations are the true frames, uint8 [S, S, 3]; the last one of an episode shows its end. ``info`` has
-    ``episode_reward`` (float64, return so far) and ``step_count`` (int64). A seed gives the bits that env 0 of
-    ``arcade_torch.make(..., seed=seed)`` has; ``reset()`` without a seed goes on as that env does after an end.
+    Observations are the true frames, uint8 [S, S, 3]; the last one of an episode shows its end.
+    ``info`` has ``episode_reward`` (float64, return so far) and ``step_count`` (int64). A seed
+    gives the bits that env 0 of ``arcade_torch.make(..., seed=seed)`` has; ``reset()`` without a
+    seed goes on as that env does after an end.
 
     Args:
         game: Id of the game; ``gymnasium.make`` fills it in.
@@ -49,7 +50,8 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         partial_obs: Alias: true means ``"partial"``.
         obs_size: Side of the frames, 128 or 256.
         rules: ``"default"`` or ``"reference"``.
-        render_mode: ``"rgb_array"``: ``render()`` returns the frame; ``"human"``: a window shows every frame.
+        render_mode: ``"rgb_array"``: ``render()`` returns the frame; ``"human"``: a window shows
+            every frame.
         **options: Options of the game.
 
     Raises:
@@ -86,19 +88,26 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         self.action_space = action_space(self._batch.game.num_actions)
         self.observation_space = observation_space(obs_size)
         self.render_mode = render_mode
-        self._window = Window(max(1, _WINDOW_SIDE_PIXELS // obs_size)) if render_mode == "human" else None
+        self._window = (
+            Window(max(1, _WINDOW_SIDE_PIXELS // obs_size)) if render_mode == "human" else None
+        )
         self._frame: Frames | None = None
         self._running = False
 
     def set_observability(self, observability: Observability) -> None:
-        """Change which twin is shown, also in mid-episode; only the frames drawn from now on change."""
+        """Change which twin is shown, also in mid-episode; only the frames drawn from now on
+        change.
+        """
         self._batch.set_partial(partial_flags(observability, 1))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Frames, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Frames, Info]:
         """Begin an episode.
 
         Args:
-            seed: 0 to 4294967295; None goes on with the random numbers there are (at first: draws a seed).
+            seed: 0 to 4294967295; None goes on with the random numbers there are (at first: draws a
+                seed).
             options: ``{"observability": "full" | "partial"}`` changes the twin.
 
         Returns:
@@ -108,7 +117,8 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
             ValueError: A seed out of range (TypeError: no whole number), or an unknown option.
         """
         options = check_reset_options(options, ("observability",))
-        keys = None if seed is None else env_keys(seed, 1)  # a seed is refused before anything changes
+        # a seed is refused before anything changes
+        keys = None if seed is None else env_keys(seed, 1)
         if "observability" in options:
             self.set_observability(options["observability"])
         super().reset(seed=None if seed is None else int(seed))
@@ -134,20 +144,33 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         if not self._running:
             raise ResetNeeded("no episode is running: call reset() first, and after every end")
         if not self.action_space.contains(action):
-            raise ValueError(f"action is {action!r}, allowed: integers from 0 to {self._batch.game.num_actions - 1}")
+            raise ValueError(
+                f"action is {action!r}, allowed: integers from 0 to "
+                f"{self._batch.game.num_actions - 1}"
+            )
         stepped = self._batch.step(np.array([action], np.int32))
-        terminated, truncated = bool(stepped.terminated[0]), bool(stepped.truncated[0])
+        terminated = bool(stepped.terminated[0])
+        truncated = bool(stepped.truncated[0])
         self._running = not (terminated or truncated)
-        return self._look(self._batch.draw()), float(stepped.reward[0]), terminated, truncated, self._info(stepped.info)
+        return (
+            self._look(self._batch.draw()),
+            float(stepped.reward[0]),
+            terminated,
+            truncated,
+            self._info(stepped.info),
+        )
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """The frame of the twin that is played, uint8 [S, S, 3], with ``render_mode="rgb_array"``; otherwise None.
+        """The frame of the twin that is played, uint8 [S, S, 3], with ``render_mode="rgb_array"``;
+        otherwise None.
 
         Raises:
             ResetNeeded: There is no frame yet.
         """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() without a render mode: pass render_mode='rgb_array' to gymnasium.make")
+            gymnasium.logger.warn(
+                "render() without a render mode: pass render_mode='rgb_array' to gymnasium.make"
+            )
             return None
         if self._frame is None:
             raise ResetNeeded("there is no frame before the first reset()")

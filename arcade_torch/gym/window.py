@@ -1,4 +1,6 @@
-"""A window that shows frames, enlarged to whole pixels; needs pygame, which the extra ``play`` brings."""
+"""A window that shows frames, enlarged to whole pixels; needs pygame, which the extra ``play``
+brings.
+"""
 
 import weakref
 from collections.abc import Callable
@@ -9,7 +11,8 @@ import numpy.typing as npt
 
 
 class Window:
-    """One window of pygame, opened by the first frame; ``scale`` is the side of a frame's pixel on the screen.
+    """One window of pygame, opened by the first frame; ``scale`` is the side of a frame's pixel on
+    the screen.
 
     pygame has one window a process, so a second one is refused until the first is closed.
     """
@@ -20,7 +23,9 @@ class Window:
         try:
             import pygame
         except ModuleNotFoundError as error:
-            raise ImportError("a window needs the package pygame: pip install 'arcade-torch[play]'") from error
+            raise ImportError(
+                "a window needs the package pygame: pip install 'arcade-torch[play]'"
+            ) from error
         self.pygame: Any = pygame
         self._scale = scale
         self._screen: Any = None
@@ -36,7 +41,9 @@ class Window:
         height, width = (side * self._scale for side in frame.shape[:2])
         if self._screen is None:
             if Window._shown() is not None:
-                raise RuntimeError("pygame shows one window a process: close() the env that has it first")
+                raise RuntimeError(
+                    "pygame shows one window a process: close() the env that has it first"
+                )
             pygame.display.init()
             Window._shown = weakref.ref(self)
             self._screen = pygame.display.set_mode((width, height))
@@ -46,7 +53,9 @@ class Window:
         pygame.display.flip()
 
     def tick(self, fps: float) -> None:
-        """Wait so that this is reached at most ``fps`` times a second, and answer the window system."""
+        """Wait so that this is reached at most ``fps`` times a second, and answer the window
+        system.
+        """
         if self._clock is not None:
             self.pygame.event.pump()
             self._clock.tick(fps)

@@ -1,4 +1,5 @@
-"""How our docstrings are read: ``Example:`` is a section of examples, a role such as ``:func:`` is only its name.
+"""How our docstrings are read: ``Example:`` is a section of examples, a role such as ``:func:`` is
+only its name.
 
 The comment behind a field or a constant is its docstring.
 """
@@ -17,7 +18,9 @@ class OurDocstrings(griffe.Extension):
     """Rewrites every docstring before it is parsed."""
 
     def on_object(self, *, obj: Any, **_: Any) -> None:
-        """Called once for each module, class, function and attribute that was found in the source."""
+        """Called once for each module, class, function and attribute that was found in the
+        source.
+        """
         lines = getattr(obj, "lines", [])
         if obj.docstring is None and len(lines) == 1 and (comment := _COMMENT.search(lines[0])):
             obj.docstring = griffe.Docstring(comment[1], parent=obj)

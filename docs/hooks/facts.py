@@ -1,4 +1,5 @@
-"""Facts that have their owner elsewhere, put into a page where it says ``<!-- insert: KIND NAME -->``.
+"""Facts that have their owner elsewhere, put into a page where it says ``<!-- insert: KIND NAME
+-->``.
 
 In the repository the mark is invisible, and the sentence beside it links to the owner.
 """
@@ -53,12 +54,16 @@ def section(path: str, title: str) -> str:
 
 
 def table_rows(text: str, wanted: re.Pattern[str], what: str) -> str:
-    """The rows of the table in a text whose first cell fits, under its heading, in the order of the levels."""
+    """The rows of the table in a text whose first cell fits, under its heading, in the order of the
+    levels.
+    """
     lines = [line for line in text.splitlines() if line.startswith("|")]
     rows = [line for line in lines[2:] if wanted.match(line)]
     if not rows:
         raise ValueError(f"no row for {what}")
-    rows.sort(key=lambda row: next((place for place, level in enumerate(LEVELS) if level in row), -1))
+    rows.sort(
+        key=lambda row: next((place for place, level in enumerate(LEVELS) if level in row), -1)
+    )
     return "\n".join([*lines[:2], *rows])
 
 
@@ -72,19 +77,28 @@ def probe(game: str) -> str:
     """Step limits and range of returns of a game that the table of the benchmark leaves out."""
     from arcade_torch.envs_jax import make, probe_ids
 
-    games = [make(f"{game}{level}") for level in LEVELS if any(id.startswith(f"{game}{level}-v") for id in probe_ids())]
+    games = [
+        make(f"{game}{level}")
+        for level in LEVELS
+        if any(id.startswith(f"{game}{level}-v") for id in probe_ids())
+    ]
     if not games:
         raise ValueError(f"no probe is called {game!r}")
     rows = [
-        f"| `{made.id}` | {made.max_steps} | {made.return_range[0]:.4g} | {made.return_range[1]:.4g} |"
+        f"| `{made.id}` | {made.max_steps} | {made.return_range[0]:.4g} | "
+        f"{made.return_range[1]:.4g} |"
         for made in games
     ]
-    return "\n".join(["| id | limit (steps) | lowest return | highest return |", "|---|---|---|---|", *rows])
+    return "\n".join(
+        ["| id | limit (steps) | lowest return | highest return |", "|---|---|---|---|", *rows]
+    )
 
 
 def earned(game: str) -> str:
     """What random play and scripted players earn in a game."""
-    return table_rows(section("docs/environments.md", "What players earn"), _row(game), f"the returns of {game}")
+    return table_rows(
+        section("docs/environments.md", "What players earn"), _row(game), f"the returns of {game}"
+    )
 
 
 def differences(title: str) -> str:
@@ -95,7 +109,9 @@ def differences(title: str) -> str:
 def recall(name: str) -> str:
     """What a memory model reached in delayed recall."""
     wanted = re.compile(rf"\| `{re.escape(name)}[`,]")
-    return table_rows(section("docs/memories.md", "Delayed recall"), wanted, f"the recall of {name}")
+    return table_rows(
+        section("docs/memories.md", "Delayed recall"), wanted, f"the recall of {name}"
+    )
 
 
 def cost(name: str) -> str:
@@ -111,7 +127,9 @@ def cost(name: str) -> str:
     for preset, size in (("paper's network", 512), ("small network", PRESETS["small"].hidden_size)):
         found = memory_cost(make_memory(name, size, size), size)
         numbers = (found.parameters, found.state_numbers, found.state_bytes, found.products)
-        lines.append(f"| {preset}, {size} wide | " + " | ".join(f"{number:,}" for number in numbers) + " |")
+        lines.append(
+            f"| {preset}, {size} wide | " + " | ".join(f"{number:,}" for number in numbers) + " |"
+        )
     return "\n".join(lines)
 
 
@@ -124,7 +142,11 @@ def laws(name: str) -> str:
     torch.manual_seed(0)
     found = check_memory(make_memory(name, 8, 16))
     return "\n".join(
-        ["| law | largest deviation |", "|---|--:|", *(f"| {law} | {far:.1g} |" for law, far in found.items())]
+        [
+            "| law | largest deviation |",
+            "|---|--:|",
+            *(f"| {law} | {far:.1g} |" for law, far in found.items()),
+        ]
     )
 
 

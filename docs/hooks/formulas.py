@@ -1,10 +1,14 @@
-"""Formulas as MathML, which browsers draw by themselves: the site needs no script and no font for them."""
+"""Formulas as MathML, which browsers draw by themselves: the site needs no script and no font for
+them.
+"""
 
 import html
 import re
 
 _FORMULA = re.compile(
-    r'<(?P<tag>span|div) class="arithmatex">(?:\\\((?P<inline>.*?)\\\)|\\\[(?P<block>.*?)\\\])</(?P=tag)>', re.DOTALL
+    r'<(?P<tag>span|div) class="arithmatex">'
+    r"(?:\\\((?P<inline>.*?)\\\)|\\\[(?P<block>.*?)\\\])</(?P=tag)>",
+    re.DOTALL,
 )
 
 
@@ -12,7 +16,8 @@ def to_mathml(body: str) -> str:
     r"""Turn what the Markdown extension ``arithmatex`` leaves into MathML.
 
     Args:
-        body: HTML with ``<span class="arithmatex">\(...\)</span>`` and ``<div class="arithmatex">\[...\]</div>``.
+        body: HTML with ``<span class="arithmatex">\(...\)</span>`` and ``<div
+            class="arithmatex">\[...\]</div>``.
     """
     from latex2mathml.converter import convert
 

@@ -30,7 +30,8 @@ def place(path: str) -> str:
         path: relative to the repository.
 
     Returns:
-        Path on the site: a page for Markdown, Python and notebooks, the file itself for anything else.
+        Path on the site: a page for Markdown, Python and notebooks, the file itself for anything
+        else.
     """
     path = path.rstrip("/")
     if path in PAGES:

@@ -20,7 +20,9 @@ def modules(root: Path) -> dict[str, list[str]]:
         top = root / layer
         sources = top.glob("*.py") if layer == "arcade_torch" else top.rglob("*.py")
         names = (_dotted(path.relative_to(root)) for path in sources)
-        found[layer] = sorted(name for name in names if not any(part.startswith("_") for part in name.split(".")))
+        found[layer] = sorted(
+            name for name in names if not any(part.startswith("_") for part in name.split("."))
+        )
     return found
 
 
@@ -52,10 +54,18 @@ def pages(root: Path) -> dict[str, str]:
         for names in found.values()
         for name in names
     }
-    lines = ["# API", "", "From the docstrings. What is exported by a package stands on the page of the package.", ""]
+    lines = [
+        "# API",
+        "",
+        "From the docstrings. What is exported by a package stands on the page of the package.",
+        "",
+    ]
     for layer, names in found.items():
         lines += [f"## {layer}", "", "| module | |", "|---|---|"]
-        lines += [f"| [`{name}`]({name}.md) | {first_line(root, name).replace('|', chr(92) + '|')} |" for name in names]
+        lines += [
+            f"| [`{name}`]({name}.md) | {first_line(root, name).replace('|', chr(92) + '|')} |"
+            for name in names
+        ]
         lines.append("")
     return made | {"api/index.md": "\n".join(lines)}
 

@@ -1,4 +1,6 @@
-"""What MkDocs calls while it builds the site: pages from elsewhere in the repository, facts, links, formulas."""
+"""What MkDocs calls while it builds the site: pages from elsewhere in the repository, facts, links,
+formulas.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -12,19 +14,25 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES: dict[str, str] = {}
-"""Page of the site to the file of the repository that it was made from, for what does not lie in docs/."""
+"""Page of the site to the file of the repository that it was made from, for what does not lie in
+docs/.
+"""
 
 
 def on_config(config: Any) -> Any:
     """Add examples and the reference to the navigation."""
     books = [links.place(f"{links.NOTEBOOKS}{path.name}") for path in _notebooks()]
-    config.nav.append({"Examples": ["notebooks.md", *books, *(f"examples/{path.stem}.md" for path in _scripts())]})
+    config.nav.append(
+        {"Examples": ["notebooks.md", *books, *(f"examples/{path.stem}.md" for path in _scripts())]}
+    )
     config.nav.append({"API": reference.navigation(ROOT)})
     return config
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add what does not lie in docs/: pages of the repository, notebooks, linked scripts and files, the reference."""
+    """Add what does not lie in docs/: pages of the repository, notebooks, linked scripts and files,
+    the reference.
+    """
     for source, at in links.PAGES.items():
         if source.endswith(".md"):
             _add(files, config, at, (ROOT / source).read_text(encoding="utf-8"), source)
@@ -55,7 +63,9 @@ def on_page_content(html: str, **_: Any) -> str:
     return formulas.to_mathml(html)
 
 
-def _add(files: Files, config: Any, at: str, content: str | bytes, source: str | None = None) -> None:
+def _add(
+    files: Files, config: Any, at: str, content: str | bytes, source: str | None = None
+) -> None:
     if source is not None:
         SOURCES[at] = source
     files.append(File.generated(config, at, content=content))
@@ -65,7 +75,8 @@ def _add_notebooks(files: Files, config: Any) -> None:
     lines = [
         "# Notebooks",
         "",
-        "Each from training to figure in a few minutes on a CPU, shown with what it printed and drew.",
+        "Each from training to figure in a few minutes on a CPU, shown with what it printed and "
+        "drew.",
         "",
     ]
     for path in _notebooks():
@@ -95,5 +106,7 @@ def _linked(files: Files) -> list[str]:
         if not file.src_uri.startswith(("api/", "notebooks")):
             source = SOURCES.get(file.src_uri, f"docs/{file.src_uri}")
             text = facts.MARK.sub("", file.content_string)
-            found |= dict.fromkeys(path for path in links.targets(text, source) if not path.startswith("docs/"))
+            found |= dict.fromkeys(
+                path for path in links.targets(text, source) if not path.startswith("docs/")
+            )
     return list(found)

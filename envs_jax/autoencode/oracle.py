@@ -1,4 +1,6 @@
-"""Scripted players of AutoEncode: both name the top of the stack; one is shown the stack, one remembers it."""
+"""Scripted players of AutoEncode: both name the top of the stack; one is shown the stack, one
+remembers it.
+"""
 
 from typing import Any
 
@@ -17,9 +19,11 @@ def turn(selected: npt.NDArray[Any], wanted: npt.NDArray[Any]) -> npt.NDArray[np
 
 
 class StateOracle:
-    """Sees the cards; answers every one of them in at most three steps, and always reaches the highest return.
+    """Sees the cards; answers every one of them in at most three steps, and always reaches the
+    highest return.
 
-    It turns the selector to the last card during the watch, which the reference's forced first answer needs.
+    It turns the selector to the last card during the watch, which the reference's forced first
+    answer needs.
     """
 
     def __init__(self, game: Any) -> None:
@@ -30,25 +34,35 @@ class StateOracle:
         asked = np.maximum(self.cards - 1 - seen.given, 0)
         wanted = seen.cards[np.arange(len(is_init)), asked].astype(np.int32)
         action = turn(seen.selected, wanted)
-        return np.where((action == FIRE) & (seen.timestep < self.cards), UP, action).astype(np.int32)
+        return np.where((action == FIRE) & (seen.timestep < self.cards), UP, action).astype(
+            np.int32
+        )
 
 
 class FramesOracle:
-    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses nothing."""
+    """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses
+    nothing.
+    """
 
     def __init__(self, game: Any) -> None:
-        self.screen, self.cards, self.rules = game.screen, game.level.cards, game.rules
+        self.screen = game.screen
+        self.cards = game.level.cards
+        self.rules = game.rules
         self.stack: npt.NDArray[np.int64] = np.zeros((0, 0), np.int64)
         self.seen: npt.NDArray[np.int64] = np.zeros(0, np.int64)  # cards shown so far
         self.left: npt.NDArray[np.int64] = np.zeros(0, np.int64)  # cards shown and not yet named
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         envs = np.arange(len(seen))
         if len(self.stack) != len(seen):
             self.stack = np.zeros((len(seen), self.cards), np.int64)
-            self.seen, self.left = np.zeros_like(envs), np.zeros_like(envs)
-        self.seen[is_init], self.left[is_init] = 0, 0
+            self.seen = np.zeros_like(envs)
+            self.left = np.zeros_like(envs)
+        self.seen[is_init] = 0
+        self.left[is_init] = 0
         card = self.screen.card.read(seen)
         selected = self.screen.selector.read(seen) - 1
         watching = card != NO_CARD

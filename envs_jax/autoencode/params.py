@@ -21,4 +21,8 @@ class Params:
         return 10 * self.cards
 
 
-LEVELS = {"AutoEncodeEasy": Params(26), "AutoEncodeMedium": Params(52), "AutoEncodeHard": Params(78)}
+LEVELS = {
+    "AutoEncodeEasy": Params(26),
+    "AutoEncodeMedium": Params(52),
+    "AutoEncodeHard": Params(78),
+}

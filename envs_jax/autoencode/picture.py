@@ -1,4 +1,6 @@
-"""The screen of AutoEncode: the card on the table, the selector, and the stack of cards still to be named."""
+"""The screen of AutoEncode: the card on the table, the selector, and the stack of cards still to be
+named.
+"""
 
 import jax.numpy as jnp
 
@@ -20,9 +22,11 @@ class Screen:
     """
 
     def __init__(self, size: int, level: Params, mdp_marker: bool) -> None:
-        self.level, self.mdp_marker = level, mdp_marker
+        self.level = level
+        self.mdp_marker = mdp_marker
         background = titled_background(size, "AUTOENCODE", PALE_BLUE, HOT_PINK)
-        self.score = number_slot(size, level.cards + 1, PALE_BLUE, SCARLET)  # the reference can pay one card twice
+        # the reference can pay one card twice
+        self.score = number_slot(size, level.cards + 1, PALE_BLUE, SCARLET)
         shorter = 3 * (size // 128)
         self.card = corner_slot(size, False, PALE_BLUE, shorter)
         self.selector = corner_slot(size, True, PALE_BLUE, shorter)

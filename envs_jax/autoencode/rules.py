@@ -1,4 +1,6 @@
-"""The rules of AutoEncode: watch a row of cards, then name their suits from the last to the first."""
+"""The rules of AutoEncode: watch a row of cards, then name their suits from the last to the
+first.
+"""
 
 from typing import NamedTuple
 
@@ -32,9 +34,10 @@ def step(
 ) -> tuple[AutoEncodeState, Array, Array, Array]:
     """Turn the selector, or answer with the suit it points at.
 
-    By default only action 4 answers, and the game ends with the last answer or at the time limit. With
-    ``rules="reference"`` the first step after the last card always answers, and both ends are judged on the state
-    before the step: one more step follows the last answer, in which the first card can be paid twice.
+    By default only action 4 answers, and the game ends with the last answer or at the time limit.
+    With ``rules="reference"`` the first step after the last card always answers, and both ends are
+    judged on the state before the step: one more step follows the last answer, in which the first
+    card can be paid twice.
     """
     is_late = rules == "reference"
     selected = (state.selected + (action == LEFT) - (action == RIGHT)) % SUITS
@@ -47,7 +50,9 @@ def step(
         asked = jnp.where(state.given == level.cards, 0, asked)
     right = answers & ((jnp.arange(level.cards) == asked) & (state.cards == selected)).any()
 
-    new = AutoEncodeState(state.cards, state.timestep + 1, state.given + answers, selected, state.score + right)
+    new = AutoEncodeState(
+        state.cards, state.timestep + 1, state.given + answers, selected, state.score + right
+    )
     judged = state if is_late else new
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, judged.given >= level.cards, judged.timestep >= level.max_steps

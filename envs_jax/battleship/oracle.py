@@ -1,4 +1,6 @@
-"""Scripted players of BattleShip: one knows the ships, one infers them from the marks it has seen."""
+"""Scripted players of BattleShip: one knows the ships, one infers them from the marks it has
+seen.
+"""
 
 from typing import Any
 
@@ -10,18 +12,24 @@ from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
 from arcade_torch.envs_jax.minesweeper.oracle import towards
 
 Board = npt.NDArray[Any]
-UNKNOWN, WATER, SHIP = -1, 0, 1
+UNKNOWN = -1
+WATER = 0
+SHIP = 1
 
 
 def distances(x: Board, y: Board, side: int) -> npt.NDArray[np.int64]:
     """Moves from each cursor to every cell: int64 [N, column, row]."""
     cell = np.arange(side)
-    away: npt.NDArray[np.int64] = np.abs(cell[:, None] - x[:, None, None]) + np.abs(cell - y[:, None, None])
+    away: npt.NDArray[np.int64] = np.abs(cell[:, None] - x[:, None, None]) + np.abs(
+        cell - y[:, None, None]
+    )
     return away
 
 
 class StateOracle:
-    """Sees the ships: goes to the nearest ship cell that is not hit yet and fires. The return is always 1."""
+    """Sees the ships: goes to the nearest ship cell that is not hit yet and fires. The return is
+    always 1.
+    """
 
     def __init__(self, game: Any) -> None:
         self.side = game.level.side
@@ -37,9 +45,10 @@ class StateOracle:
 class FramesOracle:
     """Sees the POMDP's frames: remembers every mark and fires where a ship is likely and near.
 
-    The score of a cell counts the straight places of every ship that hold the cell and no known water; places that hold
-    known hits count more. The next shot goes to the cell with the highest score for its squared distance. In a few
-    episodes the time runs out before the last ship is found.
+    The score of a cell counts the straight places of every ship that hold the cell and no known
+    water; places that hold known hits count more. The next shot goes to the cell with the highest
+    score for its squared distance. In a few episodes the time runs out before the last ship is
+    found.
 
     Args:
         game: The BattleShip to play.
@@ -47,18 +56,24 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any, boost: float = 4.0) -> None:
-        self.screen, self.side, self.boost = game.screen, game.level.side, boost
+        self.screen = game.screen
+        self.side = game.level.side
+        self.boost = boost
         self.known: npt.NDArray[np.int64] = np.zeros((0, 0, 0), np.int64)
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        side, envs = self.side, np.arange(len(seen))
+        side = self.side
+        envs = np.arange(len(seen))
         if len(self.known) != len(seen):
             self.known = np.full((len(seen), side, side), UNKNOWN)
         self.known[is_init] = UNKNOWN
         codes = self.screen.board.read(seen, side, side).swapaxes(1, 2)  # [N, column, row]
         cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
-        x, y = cursor // side, cursor % side
+        x = cursor // side
+        y = cursor % side
         mark = codes[envs, x, y] - KINDS
         self.known[envs, x, y] = np.where(mark == 0, self.known[envs, x, y], mark == HIT)
 
@@ -68,7 +83,8 @@ class FramesOracle:
 
 
 def ship_scores(known: npt.NDArray[np.int64], boost: float) -> npt.NDArray[np.float64]:
-    """How well ships fit onto each cell of boards of ``UNKNOWN``, ``WATER`` and ``SHIP``: float64 [N, side, side].
+    """How well ships fit onto each cell of boards of ``UNKNOWN``, ``WATER`` and ``SHIP``: float64
+    [N, side, side].
 
     A known ship cell multiplies the weight of a place by ``boost``.
     """

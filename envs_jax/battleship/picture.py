@@ -1,4 +1,6 @@
-"""The screen of BattleShip: a lined board of grey tiles, red crosses, black rings, a golden cursor."""
+"""The screen of BattleShip: a lined board of grey tiles, red crosses, black rings, a golden
+cursor.
+"""
 
 import math
 
@@ -20,7 +22,17 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import BLACK, BRASS, GREY, NICKEL, ORANGE, RED, SKY, WHITE, Colour
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    BRASS,
+    GREY,
+    NICKEL,
+    ORANGE,
+    RED,
+    SKY,
+    WHITE,
+    Colour,
+)
 
 COVERED, HIT, MISS = range(3)
 KINDS = 3  # tile codes: covered, hit, miss; the same again under the cursor
@@ -36,7 +48,9 @@ def cross_tile(side: int, thickness: int, colour: Colour) -> Picture:
 def ring_tile(side: int, thickness: int, colour: Colour) -> Picture:
     """A tile with a black ring that touches its borders: uint8 [side, side, 3]."""
     radius = side / 2
-    return arc(blank(side, side, colour), radius, radius, radius - thickness, radius, 0, 2 * math.pi, BLACK)
+    return arc(
+        blank(side, side, colour), radius, radius, radius - thickness, radius, 0, 2 * math.pi, BLACK
+    )
 
 
 class Screen:
@@ -49,7 +63,8 @@ class Screen:
 
     def __init__(self, size: int, level: Params) -> None:
         self.layout = grid_layout(size, level.side)
-        side, thickness = self.layout.tile, size // 128
+        side = self.layout.tile
+        thickness = size // 128
         tiles = []
         for colour in (NICKEL, BRASS):
             tiles += [
@@ -63,7 +78,9 @@ class Screen:
         self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: BattleShipState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the mark under the cursor alone."""
+        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the mark under the cursor
+        alone.
+        """
         cursor = cell_mask(state.x, state.y, self.layout.cells)
         shown = (state.guesses == 1) & (cursor | ~jnp.asarray(partial))
         mark = jnp.where(state.board == 1, HIT, MISS)

@@ -1,4 +1,6 @@
-"""The rules of BattleShip: a cursor fires at cells of a sea that hides ships; boards are indexed [x, y]."""
+"""The rules of BattleShip: a cursor fires at cells of a sea that hides ships; boards are indexed
+[x, y].
+"""
 
 from functools import reduce
 from operator import or_
@@ -27,7 +29,8 @@ class BattleShipState(NamedTuple):
 
 
 def free_places(occupied: Array, length: int) -> Array:
-    """Where a ship of ``length`` cells fits: bool [2, side, side], its first cell if it lies along x, then along y.
+    """Where a ship of ``length`` cells fits: bool [2, side, side], its first cell if it lies along
+    x, then along y.
 
     ``occupied``, bool [side, side], are cells that are taken; touching them is allowed.
     """
@@ -41,14 +44,16 @@ def free_places(occupied: Array, length: int) -> Array:
 def place_ship(draw: Array, occupied: Array, length: int) -> Array:
     """Put a ship at one of the places where it fits, ``free_places``: bool [side, side], its cells.
 
-    ``draw``, uint32, is which of the places, counted round: a uniform draw picks each with equal chance (the remainder
-    favours some by less than one in ten million).
+    ``draw``, uint32, is which of the places, counted round: a uniform draw picks each with equal
+    chance (the remainder favours some by less than one in ten million).
     """
     side = occupied.shape[0]
     places = free_places(occupied, length).reshape(2 * side, side)
     in_line = places.sum(1)
-    line, cell = jnp.arange(2 * side), jnp.arange(side)
-    # First the line that holds the chosen place, then the place in it: far cheaper than ranking all places.
+    line = jnp.arange(2 * side)
+    cell = jnp.arange(side)
+    # First the line that holds the chosen place, then the place in it: far cheaper than ranking all
+    # places.
     before = jnp.sum(jnp.where(line < line[:, None], in_line, 0), 1)
     rest = (draw % in_line.sum().astype(jnp.uint32)).astype(jnp.int32) - before
     chosen = (rest >= 0) & (rest < in_line)
@@ -56,9 +61,12 @@ def place_ship(draw: Array, occupied: Array, length: int) -> Array:
     rank = jnp.sum((cell < cell[:, None]) & open_cells, 1)
     y = jnp.sum(jnp.where(open_cells & (rank == jnp.sum(jnp.where(chosen, rest, 0))), cell, 0))
     first = jnp.sum(jnp.where(chosen, line, 0))
-    x, lies_along_y = first % side, first >= side
-    columns, rows = cell[:, None] - x, cell - y
-    end_x, end_y = jnp.where(lies_along_y, 1, length), jnp.where(lies_along_y, length, 1)
+    x = first % side
+    lies_along_y = first >= side
+    columns = cell[:, None] - x
+    rows = cell - y
+    end_x = jnp.where(lies_along_y, 1, length)
+    end_y = jnp.where(lies_along_y, length, 1)
     return (columns >= 0) & (columns < end_x) & (rows >= 0) & (rows < end_y)
 
 
@@ -79,7 +87,8 @@ def reset(key: Array, level: Params, rules: Rules) -> BattleShipState:
     for_ships, for_cursor = jax.random.split(key)
     span = level.side if rules == "default" else level.side - 1
     x, y = jax.random.randint(for_cursor, (2,), 0, span, dtype=jnp.int32)
-    board, zero = draw_board(for_ships, level), jnp.int32(0)
+    board = draw_board(for_ships, level)
+    zero = jnp.int32(0)
     return BattleShipState(x, y, board, jnp.zeros_like(board), zero, zero, zero)
 
 
@@ -88,8 +97,9 @@ def step(
 ) -> tuple[BattleShipState, Array, Array, Array]:
     """Move the cursor, or fire at the cell under it.
 
-    By default the game ends when all ship cells are hit or the repeats reach their limit, and is cut at the time limit.
-    With ``rules="reference"`` a shot judges the repeats before it, one shot late, and a move never looks at them.
+    By default the game ends when all ship cells are hit or the repeats reach their limit, and is
+    cut at the time limit. With ``rules="reference"`` a shot judges the repeats before it, one shot
+    late, and a move never looks at them.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
 
@@ -100,7 +110,8 @@ def step(
     again = fire & shot_before
 
     guesses = jnp.where(here & fire, jnp.int8(1), state.guesses)
-    hits, repeats = state.hits + hit, state.repeats + again
+    hits = state.hits + hit
+    repeats = state.repeats + again
     new = BattleShipState(x, y, state.board, guesses, hits, repeats, state.timestep + 1)
     reward = jnp.where(hit, 1.0 / SHIP_CELLS, jnp.where(again, -2.0 / level.cells, 0.0))
     repeat_limit = new.repeats >= level.max_repeats

@@ -8,7 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.breakout import rules
-from arcade_torch.envs_jax.breakout.params import COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
+from arcade_torch.envs_jax.breakout.params import (
+    COLUMNS,
+    PADDLE_ROW,
+    ROWS,
+    WALL_ROWS,
+    WALL_TOP,
+    Params,
+)
 from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
 from arcade_torch.envs_jax.settings import compiled, fixed
@@ -34,12 +41,13 @@ class StateOracle:
 class FramesOracle:
     """Sees the POMDP's frames: carries the ball on by the known rules while it is hidden.
 
-    Bricks and paddle are always seen. The ball is seen on its way up, the first of it in the first frame, so that two
-    frames tell all there is to know.
+    Bricks and paddle are always seen. The ball is seen on its way up, the first of it in the first
+    frame, so that two frames tell all there is to know.
     """
 
     def __init__(self, game: Any) -> None:
-        self.level, self.board = game.level, game.screen.board
+        self.level = game.level
+        self.board = game.screen.board
         self.belief: Any = None  # a BreakoutState with numpy leaves
         self.action = np.zeros(0, np.int32)
 
@@ -49,13 +57,18 @@ class FramesOracle:
         self._carry_on = compiled(jax.vmap(carry_on))
 
     @fixed
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         codes = self.board.read(seen, ROWS, COLUMNS)
-        kinds, marks = codes % KINDS, codes // KINDS
+        kinds = codes % KINDS
+        marks = codes // KINDS
         ball = (marks == BALL).reshape(len(seen), -1)
-        shown, cell = ball.any(1), ball.argmax(1)
-        x, y = cell % COLUMNS, cell // COLUMNS
+        shown = ball.any(1)
+        cell = ball.argmax(1)
+        x = cell % COLUMNS
+        y = cell // COLUMNS
         pos = (kinds[:, PADDLE_ROW] > 0).argmax(1)
         bricks = kinds[:, WALL_TOP : WALL_TOP + WALL_ROWS] > 0
 
@@ -65,12 +78,16 @@ class FramesOracle:
             entries = [zero] * 6 + [bricks, no, zero, zero, no, no]
             self.belief = rules.BreakoutState._make(entries)
         else:
-            self.belief = jax.tree.map(np.asarray, self._carry_on(self.belief, jnp.asarray(self.action)))
+            self.belief = jax.tree.map(
+                np.asarray, self._carry_on(self.belief, jnp.asarray(self.action))
+            )
         belief = self.belief
         # At first sight the ball is taken to make for the nearer wall; the second tells.
         guess = np.where(x * 2 >= COLUMNS, rules.UP_RIGHT, rules.UP_LEFT)
         wrong = shown & ((x != belief.ball_x) | (y != belief.ball_y))
-        turned = np.where(is_init, guess, np.where(wrong, belief.ball_dir ^ rules.SIDEWAYS, belief.ball_dir))
+        turned = np.where(
+            is_init, guess, np.where(wrong, belief.ball_dir ^ rules.SIDEWAYS, belief.ball_dir)
+        )
         self.belief = belief._replace(
             ball_x=np.where(shown, x, belief.ball_x).astype(np.int32),
             ball_y=np.where(shown, y, belief.ball_y).astype(np.int32),

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-ROWS, COLUMNS = 20, 10
+ROWS = 20
+COLUMNS = 10
 WALL_TOP = 1  # row of the uppermost bricks
 WALL_ROWS = 6
 BRICKS = WALL_ROWS * COLUMNS
@@ -12,7 +13,8 @@ START_COLUMN = 5  # of the paddle's left end, where that leaves all of it on the
 MAX_STEPS = 2000
 
 _WEIGHTS = (15, 13, 11, 9, 7, 5)
-BRICK_REWARD = tuple(weight / (sum(_WEIGHTS) * COLUMNS) for weight in _WEIGHTS)  # by row; all bricks sum to 1
+# by row; all bricks sum to 1
+BRICK_REWARD = tuple(weight / (sum(_WEIGHTS) * COLUMNS) for weight in _WEIGHTS)
 
 
 @dataclass(frozen=True)

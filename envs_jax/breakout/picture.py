@@ -1,11 +1,21 @@
-"""The screen of Breakout: rows of coloured bricks, a paddle, a ball, and a tail that tells where the ball goes."""
+"""The screen of Breakout: rows of coloured bricks, a paddle, a ball, and a tail that tells where
+the ball goes.
+"""
 
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.breakout.params import BRICKS, COLUMNS, PADDLE_ROW, ROWS, WALL_ROWS, WALL_TOP, Params
+from arcade_torch.envs_jax.breakout.params import (
+    BRICKS,
+    COLUMNS,
+    PADDLE_ROW,
+    ROWS,
+    WALL_ROWS,
+    WALL_TOP,
+    Params,
+)
 from arcade_torch.envs_jax.breakout.rules import DOWN_RIGHT, BreakoutState, velocity
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
@@ -40,7 +50,8 @@ TAILS: tuple[Tail, ...] = ("direction", "previous")
 WALL_COLOURS: tuple[Colour, ...] = (BRICK_RED, RUST, TANGERINE, OLIVE, LIME, INDIGO)
 PADDLE = 1 + WALL_ROWS
 KINDS = PADDLE + 1  # what fills a cell: nothing, a brick of row 1 to 6, the paddle
-# What is drawn over it; a code is kind + KINDS * mark. A tail beyond the board is drawn at the edge before it.
+# What is drawn over it; a code is kind + KINDS * mark. A tail beyond the board is drawn at the edge
+# before it.
 MARKS = (
     "",
     "ball",
@@ -52,7 +63,9 @@ MARKS = (
     "ball, tail top left",
     "ball, tail top right",
 )
-NO_MARK, BALL, TAIL, TAIL_LEFT, TAIL_RIGHT, TAIL_TOP, BALL_TAIL, BALL_TOP_LEFT, BALL_TOP_RIGHT = range(len(MARKS))
+NO_MARK, BALL, TAIL, TAIL_LEFT, TAIL_RIGHT, TAIL_TOP, BALL_TAIL, BALL_TOP_LEFT, BALL_TOP_RIGHT = (
+    range(len(MARKS))
+)
 
 
 def _dot(picture: Picture, x: int, y: int, radius: int, colour: Colour) -> None:
@@ -63,7 +76,8 @@ def _dot(picture: Picture, x: int, y: int, radius: int, colour: Colour) -> None:
 def cell_pictures(size: int) -> Picture:
     """Every cell that can be: uint8 [KINDS * marks, h, w, 3]."""
     unit = size // 128
-    height, width = 5 * unit, 10 * unit
+    height = 5 * unit
+    width = 10 * unit
     ball, tail = {128: (1, 1), 256: (3, 2)}[size]
     pictures = []
     for mark in MARKS:
@@ -88,7 +102,8 @@ class Screen:
     """
 
     def __init__(self, size: int, level: Params, tail: Tail) -> None:
-        self.paddle, self.tail = level.paddle, tail
+        self.paddle = level.paddle
+        self.tail = tail
         atlas = cell_pictures(size)
         field = atlas.shape[2] * COLUMNS
         low = centred(size, field)
@@ -99,7 +114,9 @@ class Screen:
         self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: BreakoutState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no tail, and the ball only on its way up."""
+        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no tail, and the ball only on
+        its way up.
+        """
         hidden = jnp.asarray(partial)
         columns = np.arange(COLUMNS)
         wall = jnp.where(state.bricks, np.arange(1, PADDLE)[:, None], 0)
@@ -110,7 +127,9 @@ class Screen:
         (tail_x, tail_y), mark = self._tail(state)
         ball = _cell(state.ball_x, state.ball_y) & (~hidden | (state.ball_dir < DOWN_RIGHT))
         tail = _cell(tail_x, tail_y) & ~hidden
-        both = jnp.where(mark == TAIL_TOP, jnp.where(state.ball_x == 0, BALL_TOP_LEFT, BALL_TOP_RIGHT), BALL_TAIL)
+        both = jnp.where(
+            mark == TAIL_TOP, jnp.where(state.ball_x == 0, BALL_TOP_LEFT, BALL_TOP_RIGHT), BALL_TAIL
+        )
         marks = jnp.where(ball & tail, both, jnp.where(ball, BALL, jnp.where(tail, mark, NO_MARK)))
         return self.layers.draw(state.score, kinds + KINDS * marks)
 
@@ -119,9 +138,12 @@ class Screen:
         if self.tail == "previous":
             return (state.last_x, state.last_y), jnp.int32(TAIL)
         dx, dy = velocity(state.ball_dir)
-        x, y = state.ball_x - dx, state.ball_y - dy
+        x = state.ball_x - dx
+        y = state.ball_y - dy
         beside = jnp.where(x < 0, TAIL_LEFT, jnp.where(x >= COLUMNS, TAIL_RIGHT, TAIL))
-        return (jnp.clip(x, 0, COLUMNS - 1), jnp.clip(y, 0, ROWS - 1)), jnp.where(y < 0, TAIL_TOP, beside)
+        return (jnp.clip(x, 0, COLUMNS - 1), jnp.clip(y, 0, ROWS - 1)), jnp.where(
+            y < 0, TAIL_TOP, beside
+        )
 
 
 def _cell(x: Array, y: Array) -> Array:

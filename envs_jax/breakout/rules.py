@@ -1,4 +1,6 @@
-"""The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed [row, column]."""
+"""The rules of Breakout: a ball moves one cell along a diagonal at every step; boards are indexed
+[row, column].
+"""
 
 from typing import NamedTuple
 
@@ -21,7 +23,10 @@ from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
 
 UP_LEFT, UP_RIGHT, DOWN_RIGHT, DOWN_LEFT = range(4)
 # A direction is turned round by changing these bits of it.
-SIDEWAYS, AROUND, UPRIGHT = 1, 2, 3  # left and right, both, up and down
+# left and right, both, up and down
+SIDEWAYS = 1
+AROUND = 2
+UPRIGHT = 3
 
 
 class BreakoutState(NamedTuple):
@@ -48,36 +53,45 @@ def velocity(direction: Array) -> tuple[Array, Array]:
 
 
 def reset(key: Array, level: Params, rules: Rules, random_start: bool) -> BreakoutState:
-    """All bricks, and the ball at one side wall, about to hit it; with ``random_start`` anywhere in its row."""
+    """All bricks, and the ball at one side wall, about to hit it; with ``random_start`` anywhere in
+    its row.
+    """
     for_side, for_column = jax.random.split(key)
     right = jax.random.bernoulli(for_side)
     x = jnp.where(right, COLUMNS - 1, 0)
     if random_start:
         x = jax.random.randint(for_column, (), 0, COLUMNS, dtype=jnp.int32)
-    y, zero = jnp.int32(START_ROW), jnp.int32(0)
+    y = jnp.int32(START_ROW)
+    zero = jnp.int32(0)
     pos = START_COLUMN if rules == "reference" else min(START_COLUMN, level.right)
     direction = jnp.where(right, UP_RIGHT, UP_LEFT)
     bricks = jnp.ones((WALL_ROWS, COLUMNS), bool)
-    return BreakoutState(x, y, direction, x, y, jnp.int32(pos), bricks, jnp.bool_(False), zero, zero)
+    return BreakoutState(
+        x, y, direction, x, y, jnp.int32(pos), bricks, jnp.bool_(False), zero, zero
+    )
 
 
-def step(state: BreakoutState, action: Array, level: Params, rules: Rules) -> tuple[BreakoutState, Array, Array, Array]:
+def step(
+    state: BreakoutState, action: Array, level: Params, rules: Rules
+) -> tuple[BreakoutState, Array, Array, Array]:
     """Move the paddle, then the ball.
 
-    A brick that is touched vanishes and turns the ball round, unless the step before touched one as well: then the ball
-    flies on through the gap. By default both pay; with ``rules="reference"`` the second pays nothing and does not
-    count.
+    A brick that is touched vanishes and turns the ball round, unless the step before touched one as
+    well: then the ball flies on through the gap. By default both pay; with ``rules="reference"``
+    the second pays nothing and does not count.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     # Only a move brings a paddle back that sticks out, as it can at the start of the reference.
     pos = jnp.where(sideways == 0, state.pos, jnp.clip(state.pos + sideways, 0, level.right))
 
     dx, dy = velocity(state.ball_dir)
-    beside, y = state.ball_x + dx, state.ball_y + dy
+    beside = state.ball_x + dx
+    y = state.ball_y + dy
     x = jnp.clip(beside, 0, COLUMNS - 1)
     direction = state.ball_dir ^ jnp.where(beside != x, SIDEWAYS, 0)
 
-    rows, columns = jnp.arange(WALL_TOP, WALL_TOP + WALL_ROWS)[:, None], jnp.arange(COLUMNS)
+    rows = jnp.arange(WALL_TOP, WALL_TOP + WALL_ROWS)[:, None]
+    columns = jnp.arange(COLUMNS)
     touched = state.bricks & (rows == y) & (columns == x)
     touch = touched.any()
     bounce = touch & ~state.strike
@@ -95,7 +109,16 @@ def step(state: BreakoutState, action: Array, level: Params, rules: Rules) -> tu
     value = jnp.sum(touched * jnp.array(BRICK_REWARD, jnp.float32)[:, None])
     reward = jnp.where(paid, value, 0.0) - jnp.where(lost, left / jnp.float32(BRICKS), 0.0)
     new = BreakoutState(
-        x, y, direction, state.ball_x, state.ball_y, pos, bricks, touch, state.score + paid, state.time + 1
+        x,
+        y,
+        direction,
+        state.ball_x,
+        state.ball_y,
+        pos,
+        bricks,
+        touch,
+        state.score + paid,
+        state.time + 1,
     )
     return new, reward, lost | (left == 0), new.time >= MAX_STEPS
 

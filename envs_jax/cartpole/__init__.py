@@ -1,5 +1,7 @@
 """CartPole and NoisyCartPole: keep the pole up, seen as a picture with velocity arrows."""
 
+from typing import ClassVar
+
 from arcade_torch.envs_jax.cartpole import rules
 from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.cartpole.params import LEVELS, Params
@@ -12,28 +14,34 @@ from arcade_torch.envs_jax.validation import check_choice
 class CartPole(LevelGame[CartPoleState]):
     """Push a cart left and right so that its pole stays up.
 
-    Actions 2 and 3 push with 10 N to the left and right, the others not at all. Each step that begins within the limits
-    (2.4 m, 12 degrees) pays ``1 / max_steps``; leaving them terminates, ``max_steps`` truncates. Returns lie in (0, 1].
+    Actions 2 and 3 push with 10 N to the left and right, the others not at all. Each step that
+    begins within the limits (2.4 m, 12 degrees) pays ``1 / max_steps``; leaving them terminates,
+    ``max_steps`` truncates. Returns lie in (0, 1].
 
-    The MDP twin shows cart, pole and two velocity arrows; the POMDP twin shows cart and pole in the first frame only.
-    ``NoisyCartPole`` adds normal noise to what is drawn, never to the dynamics; the same noise in both twins.
+    The MDP twin shows cart, pole and two velocity arrows; the POMDP twin shows cart and pole in the
+    first frame only. ``NoisyCartPole`` adds normal noise to what is drawn, never to the dynamics;
+    the same noise in both twins.
 
     Args:
         rules: ``"reference"`` judges reward and end one step late, on the state before the step.
-        arrow: ``"log"`` draws arrows whose size grows with the logarithm of the speed, in eight classes for speeds up
-            to 4 (as published); ``"linear"`` draws lengths proportional to the speed, from which the position can be
-            integrated.
+        arrow: ``"log"`` draws arrows whose size grows with the logarithm of the speed, in eight
+            classes for speeds up to 4 (as published); ``"linear"`` draws lengths proportional to
+            the speed, from which the position can be integrated.
 
-    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: ends are not one step late, the pole has one
+    Source: POPGym Arcade (ICML 2026). Differs from popgym-arcade 0.0.7 in: ends are not one step
+        late, the pole has one
     colour, noise is part of the state.
 
     Raises:
         ValueError: Unknown ``arrow``.
     """
 
-    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+    levels = LEVELS
+    oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
-    def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log") -> None:
+    def __init__(
+        self, level: Params, *, id: str, obs_size: int, rules: Rules, arrow: Arrow = "log"
+    ) -> None:
         check_choice("arrow", arrow, ARROWS)
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
         self.arrow = arrow
@@ -45,6 +53,8 @@ class CartPole(LevelGame[CartPoleState]):
         """See :meth:`Game.reset`."""
         return rules.reset(key, self.level)
 
-    def step(self, key: Array, state: CartPoleState, action: Array) -> tuple[CartPoleState, Array, Array, Array]:
+    def step(
+        self, key: Array, state: CartPoleState, action: Array
+    ) -> tuple[CartPoleState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules)

@@ -1,4 +1,6 @@
-"""Scripted players of CartPole: linear feedback on the state, and the same on a belief kept by a particle filter."""
+"""Scripted players of CartPole: linear feedback on the state, and the same on a belief kept by a
+particle filter.
+"""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +16,8 @@ from arcade_torch.envs_jax.cartpole.picture import LINEAR_TOP, LOG_CLASSES
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array
 from arcade_torch.envs_jax.settings import compiled, fixed
 
-GAINS = (0.1, 0.2, 1.0, 0.3)  # on x, x_dot, theta, theta_dot; the sign of the sum is the side to push to
+# on x, x_dot, theta, theta_dot; the sign of the sum is the side to push to
+GAINS = (0.1, 0.2, 1.0, 0.3)
 
 
 def feedback(pose: Any) -> Any:
@@ -45,9 +48,9 @@ class Belief(NamedTuple):
 class FramesOracle:
     """Sees the POMDP's frames: reads the two arrows, and keeps a belief over poses.
 
-    The dynamics are known and deterministic, the start is known to 0.05, and every picture tells in which of eight
-    classes each velocity lies. A particle filter turns that into a belief, whose mean is fed back as if it were the
-    state.
+    The dynamics are known and deterministic, the start is known to 0.05, and every picture tells in
+    which of eight classes each velocity lies. A particle filter turns that into a belief, whose
+    mean is fed back as if it were the state.
 
     Args:
         game: The CartPole to play.
@@ -55,14 +58,17 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any, particles: int = 400) -> None:
-        self.game, self.particles = game, particles
+        self.game = game
+        self.particles = particles
         self.belief: Belief | None = None
         self.action = np.zeros(0, np.int32)
         update = partial(_update, edges=_arrow_edges(game), sigma=game.level.sigma)
         self._update = compiled(jax.vmap(update))
 
     @fixed
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         codes = np.stack([slot.read(seen) for slot in self.game.screen.arrows], -1)
         if self.belief is None or len(self.action) != len(seen):
@@ -102,9 +108,12 @@ def _update(
     log_weight = jnp.where(is_init, 0.0, belief.log_weight)
 
     spread = jnp.sqrt(sigma**2 + 0.01**2)
-    low, high = edges[codes][:, 0], edges[codes][:, 1]
+    low = edges[codes][:, 0]
+    high = edges[codes][:, 1]
     velocity = pose[:, 1::2]
-    chance = jax.scipy.stats.norm.cdf((high - velocity) / spread) - jax.scipy.stats.norm.cdf((low - velocity) / spread)
+    chance = jax.scipy.stats.norm.cdf((high - velocity) / spread) - jax.scipy.stats.norm.cdf(
+        (low - velocity) / spread
+    )
     log_weight += jnp.log(chance + 1e-6).sum(-1)
     alive = (jnp.abs(pose[:, 0]) <= X_LIMIT) & (jnp.abs(pose[:, 2]) <= THETA_LIMIT)
     log_weight += jnp.where(alive, 0.0, -20.0)  # the episode goes on, so the limits hold

@@ -22,7 +22,15 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK, SILVER, SKY, SPRING_GREEN, Colour
+from arcade_torch.envs_jax.render.palette import (
+    CHARCOAL,
+    COPPER,
+    PINK,
+    SILVER,
+    SKY,
+    SPRING_GREEN,
+    Colour,
+)
 
 Arrow = Literal["log", "linear"]
 ARROWS: tuple[Arrow, ...] = ("log", "linear")
@@ -45,10 +53,14 @@ class Geometry:
         self.pole_length = 32 * unit
         self.pole_radius = {128: 3, 256: 5}[size]
         self.box = 22 * unit  # side of an arrow's box
-        self.boxes = ((5 * unit, 69 * unit), (69 * unit, 69 * unit))  # (x, y) of the two arrows' boxes
+        # (x, y) of the two arrows' boxes
+        self.boxes = ((5 * unit, 69 * unit), (69 * unit, 69 * unit))
         self.head = {128: 6, 256: 8}[size]  # length of the smallest arrow head
         self.pivot_y = self.cart_top + self.cart[1] // 2
-        self.strip = (self.pivot_y - self.pole_length - self.pole_radius, self.cart_top + self.cart[1])
+        self.strip = (
+            self.pivot_y - self.pole_length - self.pole_radius,
+            self.cart_top + self.cart[1],
+        )
 
 
 def thickness_of(level: int) -> int:
@@ -57,44 +69,63 @@ def thickness_of(level: int) -> int:
 
 
 def _flat_arrow(geo: Geometry, length: int, head: int, thickness: int, right: bool) -> Picture:
-    """A horizontal arrow ``length`` px long from one side of its box, with a triangular head of ``head`` px."""
-    box, middle = geo.box, geo.box // 2
+    """A horizontal arrow ``length`` px long from one side of its box, with a triangular head of
+    ``head`` px.
+    """
+    box = geo.box
+    middle = geo.box // 2
     picture = blank(box, box, CHARCOAL)
-    base = length - head if length >= head else length  # what is shorter than a head is a bare shaft
+    # what is shorter than a head is a bare shaft
+    base = length - head if length >= head else length
     rectangle(picture, 0, middle - thickness // 2, base, middle + thickness // 2, SILVER)
     if base < length:
-        polygon(picture, [(base, middle - head / 2), (length, middle), (base, middle + head / 2)], SILVER)
+        polygon(
+            picture,
+            [(base, middle - head / 2), (length, middle), (base, middle + head / 2)],
+            SILVER,
+        )
     return picture if right else picture[:, ::-1]
 
 
 def _bent_arrow(geo: Geometry, share: float, head: int, thickness: int, clockwise: bool) -> Picture:
-    """A quarter ring in the upper right of its box, ``share`` of it drawn, with the head at its leading end.
+    """A quarter ring in the upper right of its box, ``share`` of it drawn, with the head at its
+    leading end.
 
-    Drawn clockwise, from the top to the right; the other way round is its mirror image in the diagonal.
+    Drawn clockwise, from the top to the right; the other way round is its mirror image in the
+    diagonal.
     """
     centre = outer = geo.box / 2
     picture = blank(geo.box, geo.box, CHARCOAL)
     ring = outer - thickness / 2
-    start, tip = math.pi / 2, math.pi / 2 * (1 - share)
-    base = tip + head / ring if tip + head / ring <= start else tip  # what is shorter than a head is a bare ring
+    start = math.pi / 2
+    tip = math.pi / 2 * (1 - share)
+    # what is shorter than a head is a bare ring
+    base = tip + head / ring if tip + head / ring <= start else tip
     arc(picture, centre, centre, outer - thickness, outer, base, start, SILVER)
     if base > tip:
         corners = [(base, ring - head / 2), (base, min(ring + head / 2, outer)), (tip, ring)]
-        polygon(picture, [(centre + r * math.cos(a), centre - r * math.sin(a)) for a, r in corners], SILVER)
+        polygon(
+            picture,
+            [(centre + r * math.cos(a), centre - r * math.sin(a)) for a, r in corners],
+            SILVER,
+        )
     return picture if clockwise else picture.transpose(1, 0, 2)[::-1, ::-1]
 
 
 def arrow_pictures(geo: Geometry, arrow: Arrow) -> tuple[Picture, Picture]:
-    """Both arrows for every code: first all that point left (or turn counter-clockwise), then right.
+    """Both arrows for every code: first all that point left (or turn counter-clockwise), then
+    right.
 
     Returns:
         The flat and the bent arrow, uint8 [2 * levels, box, box, 3].
     """
-    flat, bent = [], []
+    flat = []
+    bent = []
     for forward in (False, True):
         for level in range(arrow_levels(geo, arrow)):
             if arrow == "log":
-                head, thickness = geo.head + level, thickness_of(level)
+                head = geo.head + level
+                thickness = thickness_of(level)
                 flat.append(_flat_arrow(geo, geo.box, head, thickness, forward))
                 bent.append(_bent_arrow(geo, 1.0, head, thickness, forward))
             else:  # the length says it all; a broad ring tells every angle apart
@@ -118,8 +149,8 @@ def arrow_level(speed: Array, arrow: Arrow, box: int) -> Array:
 def pole_span(geo: Geometry, pivot_x: Array, theta: Array, rows: Array) -> tuple[Array, Array]:
     """First and last column that the pole covers in each row.
 
-    The pole is a segment with round ends, the convex hull of two discs. In any row it is therefore one interval,
-    bounded by an arc of either disc or by the tangent between them.
+    The pole is a segment with round ends, the convex hull of two discs. In any row it is therefore
+    one interval, bounded by an arc of either disc or by the tangent between them.
 
     Args:
         geo: Lengths.
@@ -130,9 +161,12 @@ def pole_span(geo: Geometry, pivot_x: Array, theta: Array, rows: Array) -> tuple
     Returns:
         float32 [R] twice; where the pole covers nothing the first exceeds the last.
     """
-    radius, sin, cos = float(geo.pole_radius), jnp.sin(theta), jnp.cos(theta)
+    radius = float(geo.pole_radius)
+    sin = jnp.sin(theta)
+    cos = jnp.cos(theta)
     y = rows.astype(jnp.float32)
-    low, high = jnp.full(rows.shape, jnp.inf), jnp.full(rows.shape, -jnp.inf)
+    low = jnp.full(rows.shape, jnp.inf)
+    high = jnp.full(rows.shape, -jnp.inf)
     for along in (0.0, float(geo.pole_length)):
         height = radius**2 - (y - (geo.pivot_y - along * cos)) ** 2
         reach = jnp.where(height >= 0, jnp.sqrt(jnp.maximum(height, 0.0)), -jnp.inf)
@@ -169,13 +203,16 @@ class Screen:
         self.layers = Layers(background, self.score, *self.arrows, *self._cart_and_pole())
 
     def _cart_and_pole(self) -> list[TileGrid]:
-        """The cart, and both ends of the pole, above the cart and upon it: a code for every line of the field.
+        """The cart, and both ends of the pole, above the cart and upon it: a code for every line of
+        the field.
 
-        Codes of the cart are the column where it begins; the last one is for no cart. Codes of an end are the column
-        from which on colours change, so that two ends leave the pole between them.
+        Codes of the cart are the column where it begins; the last one is for no cart. Codes of an
+        end are the column from which on colours change, so that two ends leave the pole between
+        them.
         """
         geo = self.geo
-        columns, starts = np.arange(geo.field), np.arange(geo.cart_range + 2)[:, None]
+        columns = np.arange(geo.field)
+        starts = np.arange(geo.cart_range + 2)[:, None]
         cart = (columns >= starts) & (columns < starts + geo.cart[0]) & (starts <= geo.cart_range)
         end = columns >= np.arange(geo.field + 1)[:, None]
 
@@ -183,25 +220,35 @@ class Screen:
             change = np.bitwise_xor(below, colour).astype(np.uint8)
             return TileGrid(mask[:, None, :, None] * change, geo.offset, geo.offset + y, mixed=True)
 
-        above, upon = (lines(y, end, colour, COPPER) for y, colour in ((geo.strip[0], CHARCOAL), (geo.cart_top, PINK)))
+        above, upon = (
+            lines(y, end, colour, COPPER)
+            for y, colour in ((geo.strip[0], CHARCOAL), (geo.cart_top, PINK))
+        )
         return [lines(geo.cart_top, cart, CHARCOAL, PINK), above, above, upon, upon]
 
     def draw(self, state: CartPoleState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows arrows and score alone."""
+        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows arrows and
+        score alone.
+        """
         geo = self.geo
         seen = jnp.stack([state.x, state.x_dot, state.theta, state.theta_dot]) + state.noise
         hidden = jnp.asarray(partial) & (state.time > 0)
         arrows = []
         for slot, velocity in zip(self.arrows, (seen[1], seen[3]), strict=True):
             levels = len(slot.pictures) // 2
-            arrows.append(arrow_level(jnp.abs(velocity), self.arrow, geo.box) + jnp.where(velocity > 0, levels, 0))
+            arrows.append(
+                arrow_level(jnp.abs(velocity), self.arrow, geo.box)
+                + jnp.where(velocity > 0, levels, 0)
+            )
 
         x = jnp.clip(seen[0], -X_LIMIT, X_LIMIT)
         theta = jnp.clip(seen[2], -THETA_LIMIT, THETA_LIMIT)
         left = jnp.trunc((x / X_LIMIT + 1) * (geo.cart_range / 2))
         low, high = pole_span(geo, left + geo.cart[0] // 2, theta, jnp.arange(*geo.strip))
         low = jnp.ceil(jnp.clip(low, 0, geo.field))
-        high = jnp.where(hidden, low, jnp.maximum(low, jnp.floor(jnp.clip(high, -1, geo.field - 1)) + 1))
+        high = jnp.where(
+            hidden, low, jnp.maximum(low, jnp.floor(jnp.clip(high, -1, geo.field - 1)) + 1)
+        )
         cart = jnp.full((geo.cart[1], 1), jnp.where(hidden, geo.cart_range + 1, left))
         ends = jnp.stack([low, high])[:, :, None]
         above = geo.cart_top - geo.strip[0]

@@ -1,7 +1,7 @@
 """The rules of CartPole: Euler steps of the classic cart and pole, paid by survival.
 
-Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole; limits and rewards of POPGym Arcade
-(ICML 2026).
+Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole; limits and rewards
+of POPGym Arcade (ICML 2026).
 """
 
 from typing import NamedTuple
@@ -58,7 +58,9 @@ def reset(key: Array, level: Params) -> CartPoleState:
 
 
 def at_pose(pose: Array, noise: Array) -> CartPoleState:
-    """The first state of an episode at a pose (x, x_dot, theta, theta_dot), float32 [4] or [4, ...]."""
+    """The first state of an episode at a pose (x, x_dot, theta, theta_dot), float32 [4] or [4,
+    ...].
+    """
     zero = jnp.zeros(pose.shape[1:], jnp.int32)
     return CartPoleState(pose[0], pose[1], pose[2], pose[3], zero, zero, noise)
 
@@ -66,9 +68,12 @@ def at_pose(pose: Array, noise: Array) -> CartPoleState:
 def accelerations(state: CartPoleState, action: Array) -> tuple[Array, Array]:
     """Accelerations of cart (m/s^2) and pole (rad/s^2) under an action."""
     force = jnp.where(action == LEFT, -FORCE, jnp.where(action == RIGHT, FORCE, 0.0))
-    sin, cos = jnp.sin(state.theta), jnp.cos(state.theta)
+    sin = jnp.sin(state.theta)
+    cos = jnp.cos(state.theta)
     push = (force + POLE_MASS * HALF_POLE * state.theta_dot**2 * sin) / TOTAL_MASS
-    theta_acc = (GRAVITY * sin - cos * push) / (HALF_POLE * (4.0 / 3.0 - POLE_MASS * cos**2 / TOTAL_MASS))
+    theta_acc = (GRAVITY * sin - cos * push) / (
+        HALF_POLE * (4.0 / 3.0 - POLE_MASS * cos**2 / TOTAL_MASS)
+    )
     return push - POLE_MASS * HALF_POLE * theta_acc * cos / TOTAL_MASS, theta_acc
 
 
@@ -89,8 +94,9 @@ def step(
 ) -> tuple[CartPoleState, Array, Array, Array]:
     """One step: reward ``1 / max_steps`` for every step that began within the limits.
 
-    By default the episode ends with the step that crosses a limit or reaches the time limit. With ``rules="reference"``
-    both are judged on the state before the step, so that one unpaid step follows.
+    By default the episode ends with the step that crosses a limit or reaches the time limit. With
+    ``rules="reference"`` both are judged on the state before the step, so that one unpaid step
+    follows.
     """
     new = move(state, action)._replace(noise=draw_noise(key, level))
     judged = new if rules == "default" else state

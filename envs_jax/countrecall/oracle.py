@@ -1,4 +1,6 @@
-"""Scripted players of CountRecall: a clairvoyant who spends the counter moves best, and one who counts."""
+"""Scripted players of CountRecall: a clairvoyant who spends the counter moves best, and one who
+counts.
+"""
 
 from typing import Any
 
@@ -24,7 +26,8 @@ def right_answers(cards: Ints, queries: Ints) -> Ints:
 def best_plan(wanted: Ints, budget: int) -> Ints:
     """Which turns to answer so that as many as possible are right within a budget of counter moves.
 
-    ``cost[t][k, v]`` is the least number of moves that ends turn t with k right answers and the counter at v.
+    ``cost[t][k, v]`` is the least number of moves that ends turn t with k right answers and the
+    counter at v.
 
     Args:
         wanted: int64 [N, turns], the right answers.
@@ -34,7 +37,8 @@ def best_plan(wanted: Ints, budget: int) -> Ints:
         int64 [N, turns]: the value to show in each turn, ``SKIP`` where any will do.
     """
     envs, turns = wanted.shape
-    every, values = np.arange(envs), np.arange(wanted.max() + 1)
+    every = np.arange(envs)
+    values = np.arange(wanted.max() + 1)
     cost = np.full((turns + 1, envs, turns + 1, len(values)), NEVER, np.int16)
     cost[0, :, 0] = values
     for t in range(turns):
@@ -62,9 +66,11 @@ def towards(answer: npt.NDArray[Any], goal: npt.NDArray[Any]) -> npt.NDArray[np.
 
 
 class StateOracle:
-    """Sees both packs, future turns included: reaches the highest return that the step limit leaves.
+    """Sees both packs, future turns included: reaches the highest return that the step limit
+    leaves.
 
-    That is 1 for every deal on Easy and for most on Medium, but for a minority on Hard; the mean is near 0.96 there.
+    That is 1 for every deal on Easy and for most on Medium, but for a minority on Hard; the mean is
+    near 0.96 there.
     """
 
     def __init__(self, game: Any) -> None:
@@ -85,19 +91,24 @@ class StateOracle:
 class FramesOracle:
     """Sees the POMDP's frames: counts the cards of each suit as they are dealt.
 
-    It always knows the right answer. What it cannot know is which answers will be asked for, and so whether the moves
-    to a far one are better saved: it answers what is within ``3.5`` times the moves left per turn left, and a half.
+    It always knows the right answer. What it cannot know is which answers will be asked for, and so
+    whether the moves to a far one are better saved: it answers what is within ``3.5`` times the
+    moves left per turn left, and a half.
     """
 
     def __init__(self, game: Any) -> None:
-        self.screen, self.level, self.budget = game.screen, game.level, game.move_budget
+        self.screen = game.screen
+        self.level = game.level
+        self.budget = game.move_budget
         self.counts: Ints = np.zeros((0, 0), np.int64)  # cards dealt before, by suit
         self.turns: Ints = np.zeros(0, np.int64)  # turns left, this one included
         self.moves: Ints = np.zeros(0, np.int64)  # counter moves left
         self.goal: Ints = np.zeros(0, np.int64)
         self.fresh: npt.NDArray[np.bool_] = np.zeros(0, bool)  # whether this frame begins a turn
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         envs = np.arange(len(seen))
         if len(self.goal) != len(seen):
@@ -105,10 +116,15 @@ class FramesOracle:
             self.turns, self.moves, self.goal = np.zeros((3, len(seen)), np.int64)
             self.fresh = np.ones(len(seen), bool)
         self.counts[is_init] = 0
-        self.turns[is_init], self.moves[is_init], self.fresh[is_init] = self.level.cards, self.budget, True
+        self.turns[is_init], self.moves[is_init], self.fresh[is_init] = (
+            self.level.cards,
+            self.budget,
+            True,
+        )
 
         screen = self.screen
-        card, query = screen.card.read(seen), screen.query.read(seen)
+        card = screen.card.read(seen)
+        query = screen.query.read(seen)
         answer = screen.counter.read(seen) + screen.counter_range[0]
         wanted = self.counts[envs, np.maximum(query - 1, 0)]
         distance = np.abs(wanted - answer)

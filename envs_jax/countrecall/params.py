@@ -18,4 +18,8 @@ class Params:
         return -(-self.cards // self.suits)
 
 
-LEVELS = {"CountRecallEasy": Params(26, 2), "CountRecallMedium": Params(52, 2), "CountRecallHard": Params(78, 4)}
+LEVELS = {
+    "CountRecallEasy": Params(26, 2),
+    "CountRecallMedium": Params(52, 2),
+    "CountRecallHard": Params(78, 4),
+}

@@ -1,4 +1,6 @@
-"""The screen of CountRecall: the card dealt, the suit asked for, the counter, and the cards dealt before."""
+"""The screen of CountRecall: the card dealt, the suit asked for, the counter, and the cards dealt
+before.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,13 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.palette import AZURE, CRIMSON, PALE_GREEN, SLATE_BLUE, SMOKE
-from arcade_torch.envs_jax.render.suits import FIELD, NO_CARD, corner_slot, history_codes, history_grid
+from arcade_torch.envs_jax.render.suits import (
+    FIELD,
+    NO_CARD,
+    corner_slot,
+    history_codes,
+    history_grid,
+)
 
 MINUS = ("00000", "00000", "11111", "00000", "00000")
 COUNTER_X = {128: (68, 123), 256: (136, 246)}  # columns in which the counter is centred
@@ -28,9 +36,11 @@ SHORTER = 6  # rows by which black suits end above the others, at both sizes
 
 
 def counter_slot(size: int, lowest: int, highest: int) -> Slot:
-    """The counter to the right of the score, for values ``lowest`` to ``highest``; code 0 is ``lowest``.
+    """The counter to the right of the score, for values ``lowest`` to ``highest``; code 0 is
+    ``lowest``.
 
-    The place is as wide as the widest value, not as the whole field, which reaches into that of the score.
+    The place is as wide as the widest value, not as the whole field, which reaches into that of the
+    score.
     """
     layout = TEXT[size]
     across, down = layout.digit_scale
@@ -39,7 +49,13 @@ def counter_slot(size: int, lowest: int, highest: int) -> Slot:
     low, high = COUNTER_X[size]
     starts = [low + centred(high - low, len(text) * step - layout.digit_gap) for text in texts]
     left = min(starts)
-    width = max(start + len(text) * step - layout.digit_gap for start, text in zip(starts, texts, strict=True)) - left
+    width = (
+        max(
+            start + len(text) * step - layout.digit_gap
+            for start, text in zip(starts, texts, strict=True)
+        )
+        - left
+    )
     pictures = []
     for start, text in zip(starts, texts, strict=True):
         picture = blank(PATTERN * down, width, SMOKE)
@@ -60,7 +76,8 @@ class Screen:
     """
 
     def __init__(self, size: int, level: Params, counter: tuple[int, int]) -> None:
-        self.level, self.counter_range = level, counter
+        self.level = level
+        self.counter_range = counter
         offset, side = (length * (size // 128) for length in FIELD)
         background = titled_background(size, "COUNTRECALL", SMOKE, AZURE)
         rectangle(background, offset, offset, offset + side, offset + side, SLATE_BLUE)
@@ -69,7 +86,9 @@ class Screen:
         self.card = corner_slot(size, False, SMOKE, SHORTER)
         self.query = corner_slot(size, True, SMOKE, SHORTER)
         self.history = history_grid(size, SLATE_BLUE)
-        self.layers = Layers(background, self.score, self.counter, self.card, self.query, self.history)
+        self.layers = Layers(
+            background, self.score, self.counter, self.card, self.query, self.history
+        )
 
     def draw(self, state: CountRecallState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows no cards dealt before."""
@@ -77,6 +96,8 @@ class Screen:
         now = index == state.timestep
         lowest, highest = self.counter_range
         answer = jnp.clip(state.answer, lowest, highest) - lowest
-        card, query = (jnp.where(now, 1 + pack, NO_CARD).sum() for pack in (state.cards, state.queries))
+        card, query = (
+            jnp.where(now, 1 + pack, NO_CARD).sum() for pack in (state.cards, state.queries)
+        )
         history = history_codes(state.cards, (index < state.timestep) & ~jnp.asarray(partial))
         return self.layers.draw(state.score, answer, card, query, history)

@@ -14,7 +14,8 @@ class CountRecallState(NamedTuple):
 
     cards: Array  # int8 [cards], suits in the order they are dealt
     queries: Array  # int8 [cards], suit asked for in each turn
-    timestep: Array  # int32, turns confirmed; card and query `timestep` are on the table while there are any
+    # int32, turns confirmed; card and query `timestep` are on the table while there are any
+    timestep: Array
     answer: Array  # int32, what the counter shows
     score: Array  # int32, right answers
     moves: Array  # int32, steps taken
@@ -23,7 +24,9 @@ class CountRecallState(NamedTuple):
 
 
 def reset(key: Array, level: Params) -> CountRecallState:
-    """Two independent uniformly random orders of a pack with suits as even as can be; the counter at 0."""
+    """Two independent uniformly random orders of a pack with suits as even as can be; the counter
+    at 0.
+    """
     cards, queries = deal(key, 2, level.cards, level.suits)
     zero = jnp.int32(0)
     return CountRecallState(cards, queries, zero, zero, zero, zero)
@@ -34,8 +37,9 @@ def step(
 ) -> tuple[CountRecallState, Array, Array, Array]:
     """Move the counter, or confirm what it shows.
 
-    The card on the table does not count yet: the right answer of the first turn is 0. By default the counter stays
-    between 0 and the size of the largest suit; with ``rules="reference"`` it goes anywhere.
+    The card on the table does not count yet: the right answer of the first turn is 0. By default
+    the counter stays between 0 and the size of the largest suit; with ``rules="reference"`` it goes
+    anywhere.
     """
     answer = state.answer + (action == UP) - (action == DOWN)
     if rules == "default":
@@ -48,7 +52,8 @@ def step(
     dealt = ((index < state.timestep) & (state.cards == query)).sum()
     right = confirm & now.any() & (answer == dealt)
 
-    turn, score = state.timestep + confirm, state.score + right
+    turn = state.timestep + confirm
+    score = state.score + right
     new = CountRecallState(state.cards, state.queries, turn, answer, score, state.moves + 1)
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, new.timestep >= level.cards, new.moves >= max_steps

@@ -1,4 +1,6 @@
-"""Scripted players of MineSweeper: one walks a known board, one infers it from the numbers it has seen."""
+"""Scripted players of MineSweeper: one walks a known board, one infers it from the numbers it has
+seen.
+"""
 
 from typing import Any
 
@@ -13,22 +15,29 @@ Board = npt.NDArray[Any]
 
 
 def snake(side: int) -> npt.NDArray[np.int64]:
-    """A walk over the whole board from the top left, row by row in turns: (x, y), int64 [side**2, 2]."""
-    return np.array([(x if y % 2 == 0 else side - 1 - x, y) for y in range(side) for x in range(side)])
+    """A walk over the whole board from the top left, row by row in turns: (x, y), int64 [side**2,
+    2].
+    """
+    return np.array(
+        [(x if y % 2 == 0 else side - 1 - x, y) for y in range(side) for x in range(side)]
+    )
 
 
 def towards(x: Board, y: Board, goal_x: Board, goal_y: Board) -> npt.NDArray[np.int32]:
-    """The move that brings each cursor nearer to its goal, first sideways; ``FIRE`` where it is there."""
+    """The move that brings each cursor nearer to its goal, first sideways; ``FIRE`` where it is
+    there.
+    """
     sideways = np.where(goal_x > x, RIGHT, LEFT)
     along = np.where(goal_y > y, DOWN, UP)
     return np.where(goal_x != x, sideways, np.where(goal_y != y, along, FIRE)).astype(np.int32)
 
 
 class StateOracle:
-    """Sees the mines: goes to the nearest corner, then walks the board in turns and sweeps what is safe.
+    """Sees the mines: goes to the nearest corner, then walks the board in turns and sweeps what is
+    safe.
 
-    The walk takes at most ``side - 2`` steps to a corner, ``cells - 1`` over the board and ``safe`` sweeps, which fits
-    in the time limit at every difficulty: the return is always 1.
+    The walk takes at most ``side - 2`` steps to a corner, ``cells - 1`` over the board and ``safe``
+    sweeps, which fits in the time limit at every difficulty: the return is always 1.
     """
 
     def __init__(self, game: Any) -> None:
@@ -54,10 +63,10 @@ class StateOracle:
 class FramesOracle:
     """Sees the POMDP's frames: remembers every number seen and infers where mines may lie.
 
-    Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen and to the number of
-    mines (iterative proportional fitting), sweeps the nearest cell that is surely safe, and otherwise the least likely
-    mine. Its return stays below 1 for two reasons that no memory mends: the first sweeps are guesses, and the time
-    limit.
+    Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen
+    and to the number of mines (iterative proportional fitting), sweeps the nearest cell that is
+    surely safe, and otherwise the least likely mine. Its return stays below 1 for two reasons that
+    no memory mends: the first sweeps are guesses, and the time limit.
 
     Args:
         game: The MineSweeper to play.
@@ -65,18 +74,24 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any, rounds: int = 30) -> None:
-        self.screen, self.level, self.rounds = game.screen, game.level, rounds
+        self.screen = game.screen
+        self.level = game.level
+        self.rounds = rounds
         self.known: npt.NDArray[np.int64] = np.zeros((0, 0, 0), np.int64)
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        side, envs = self.level.side, np.arange(len(seen))
+        side = self.level.side
+        envs = np.arange(len(seen))
         if len(self.known) != len(seen):
             self.known = np.full((len(seen), side, side), -1)
         self.known[is_init] = -1
         codes = self.screen.board.read(seen, side, side)  # [N, row, column]
         cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
-        y, x = cursor // side, cursor % side
+        y = cursor // side
+        x = cursor % side
         number = codes[envs, y, x] - KINDS - 1
         self.known[envs, y, x] = np.maximum(number, self.known[envs, y, x])
 
@@ -98,7 +113,8 @@ def block_sum(values: Board) -> Board:
 
 
 def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.NDArray[np.float64]:
-    """Chance of a mine in each covered cell, fitted to the numbers seen: float64 [N, side, side], 0 in swept cells.
+    """Chance of a mine in each covered cell, fitted to the numbers seen: float64 [N, side, side], 0
+    in swept cells.
 
     ``known``, int64 [N, side, side], is the number of each swept cell, -1 where covered.
     """
@@ -113,6 +129,8 @@ def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.N
         near = np.maximum(block_sum((~covered).astype(float)), 1.0)
         chance = covered * np.clip(chance * np.exp(block_sum(log_factor) / near), 0.0, 1.0)
         chance[block_sum(((known == 0) & ~covered).astype(float)) > 0] = 0.0
-        chance *= np.clip(mines / np.maximum(chance.sum((1, 2), keepdims=True), 1e-9), 0.5, 2.0) ** 0.5
+        chance *= (
+            np.clip(mines / np.maximum(chance.sum((1, 2), keepdims=True), 1e-9), 0.5, 2.0) ** 0.5
+        )
         chance = np.minimum(chance, 1.0)
     return chance

@@ -31,4 +31,8 @@ class Params:
         return self.cells // 2
 
 
-LEVELS = {"MineSweeperEasy": Params(4, 2), "MineSweeperMedium": Params(6, 6), "MineSweeperHard": Params(8, 10)}
+LEVELS = {
+    "MineSweeperEasy": Params(4, 2),
+    "MineSweeperMedium": Params(6, 6),
+    "MineSweeperHard": Params(8, 10),
+}

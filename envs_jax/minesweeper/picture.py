@@ -19,7 +19,16 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import BLACK, GREY, MIST, NAVY, ORANGE, PURPLE, WHITE, Colour
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    GREY,
+    MIST,
+    NAVY,
+    ORANGE,
+    PURPLE,
+    WHITE,
+    Colour,
+)
 
 NUMBERS = 10  # a swept cell shows 0 to 8, a mine just hit 1 to 9
 KINDS = 1 + NUMBERS  # tile codes: covered, then the numbers; the same again under the cursor
@@ -45,14 +54,18 @@ class Screen:
         side = self.layout.tile
         tiles = []
         for colour in (BLACK, ORANGE):
-            tiles += [blank(side, side, colour)] + [number_tile(side, number, colour) for number in range(NUMBERS)]
+            tiles += [blank(side, side, colour)] + [
+                number_tile(side, number, colour) for number in range(NUMBERS)
+            ]
         background = titled_background(size, "MINESWEEPER", MIST, NAVY)
         background, self.board = lined_board(background, self.layout, tiles, GREY)
         self.score = number_slot(size, level.safe, MIST, PURPLE)
         self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: MineSweeperState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the number under the cursor alone."""
+        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows the number under the cursor
+        alone.
+        """
         cursor = cell_mask(state.x, state.y, self.layout.cells)
         shown = (state.grid == SWEPT) & (cursor | ~jnp.asarray(partial))
         codes = jnp.where(shown, 1 + state.neighbours, 0) + jnp.where(cursor, KINDS, 0)

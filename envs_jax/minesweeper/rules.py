@@ -10,7 +10,9 @@ from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 from arcade_torch.envs_jax.minesweeper.params import Params
 
-COVERED_SAFE, COVERED_MINE, SWEPT = 0, 1, 2
+COVERED_SAFE = 0
+COVERED_MINE = 1
+SWEPT = 2
 
 
 class MineSweeperState(NamedTuple):
@@ -19,7 +21,8 @@ class MineSweeperState(NamedTuple):
     x: Array  # int32, column of the cursor
     y: Array  # int32, row of the cursor
     grid: Array  # int8 [side, side], COVERED_SAFE, COVERED_MINE or SWEPT
-    neighbours: Array  # int8 [side, side], mines in the 3 x 3 block around each cell, itself included
+    # int8 [side, side], mines in the 3 x 3 block around each cell, itself included
+    neighbours: Array
     score: Array  # int32, safe cells swept
     repeats: Array  # int32, sweeps of swept cells
     timestep: Array  # int32, steps taken
@@ -28,7 +31,9 @@ class MineSweeperState(NamedTuple):
 
 
 def count_neighbours(mines: Array) -> Array:
-    """Mines in the 3 x 3 block around each cell (int8 [side, side]); cells beyond the border count 0."""
+    """Mines in the 3 x 3 block around each cell (int8 [side, side]); cells beyond the border count
+    0.
+    """
     padded = jnp.pad(mines, 1)
     side = mines.shape[0]
     columns = padded[:side] + padded[1 : side + 1] + padded[2:]
@@ -37,7 +42,11 @@ def count_neighbours(mines: Array) -> Array:
 
 def draw_mines(key: Array, level: Params) -> Array:
     """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies."""
-    return (random_ranks(key, level.cells) < level.mines).astype(jnp.int8).reshape(level.side, level.side)
+    return (
+        (random_ranks(key, level.cells) < level.mines)
+        .astype(jnp.int8)
+        .reshape(level.side, level.side)
+    )
 
 
 def reset(key: Array, level: Params, rules: Rules) -> MineSweeperState:
@@ -58,24 +67,32 @@ def step(
 ) -> tuple[MineSweeperState, Array, Array, Array]:
     """Move the cursor, or sweep the cell under it.
 
-    By default the game ends when a mine is hit, all safe cells are swept, or the repeats reach their limit, and is cut
-    at the time limit. With ``rules="reference"`` a sweep judges repeats and time on the state before it, one sweep
-    late, and a move never looks at the repeats.
+    By default the game ends when a mine is hit, all safe cells are swept, or the repeats reach
+    their limit, and is cut at the time limit. With ``rules="reference"`` a sweep judges repeats and
+    time on the state before it, one sweep late, and a move never looks at the repeats.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
     here = cell_mask(state.x, state.y, level.side)
     cell = jnp.sum(jnp.where(here, state.grid, 0))
-    safe, mine, again = fire & (cell == COVERED_SAFE), fire & (cell == COVERED_MINE), fire & (cell == SWEPT)
+    safe = fire & (cell == COVERED_SAFE)
+    mine = fire & (cell == COVERED_MINE)
+    again = fire & (cell == SWEPT)
 
     grid = jnp.where(here & fire, jnp.int8(SWEPT), state.grid)
-    score, repeats = state.score + safe, state.repeats + again
+    score = state.score + safe
+    repeats = state.repeats + again
     new = MineSweeperState(x, y, grid, state.neighbours, score, repeats, state.timestep + 1)
-    reward = jnp.where(safe, 1.0 / level.safe, jnp.where(mine, mine_reward, jnp.where(again, -2.0 / level.cells, 0.0)))
+    reward = jnp.where(
+        safe,
+        1.0 / level.safe,
+        jnp.where(mine, mine_reward, jnp.where(again, -2.0 / level.cells, 0.0)),
+    )
     cleared = new.score >= level.safe
     if rules == "default":
-        repeat_limit, time_limit = new.repeats >= level.max_repeats, new.timestep >= level.max_steps
+        repeat_limit = new.repeats >= level.max_repeats
+        time_limit = new.timestep >= level.max_steps
     else:
         repeat_limit = fire & (state.repeats >= level.max_repeats)
         time_limit = jnp.where(fire, state.timestep, new.timestep) >= level.max_steps

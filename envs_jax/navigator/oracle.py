@@ -1,4 +1,6 @@
-"""Scripted players of Navigator: both walk a shortest path, one of them on a map that it saw once."""
+"""Scripted players of Navigator: both walk a shortest path, one of them on a map that it saw
+once.
+"""
 
 from typing import Any
 
@@ -14,13 +16,18 @@ FAR = 10_000  # more moves than any path has
 
 
 def _beside(values: Board) -> Board:
-    """The four neighbours' values in the order of the actions up, down, left, right: [4, N, x, y]; FAR outside."""
+    """The four neighbours' values in the order of the actions up, down, left, right: [4, N, x, y];
+    FAR outside.
+    """
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=FAR)
-    return np.stack([padded[:, 1:-1, :-2], padded[:, 1:-1, 2:], padded[:, :-2, 1:-1], padded[:, 2:, 1:-1]])
+    return np.stack(
+        [padded[:, 1:-1, :-2], padded[:, 1:-1, 2:], padded[:, :-2, 1:-1], padded[:, 2:, 1:-1]]
+    )
 
 
 def path_lengths(board: Board) -> npt.NDArray[np.int64]:
-    """Moves to the treasure from every cell, around the TNT: int64 [N, x, y], FAR where there is no way.
+    """Moves to the treasure from every cell, around the TNT: int64 [N, x, y], FAR where there is no
+    way.
 
     Args:
         board: int [N, side, side] of ``FREE``, ``TNT`` and ``TREASURE``.
@@ -34,7 +41,9 @@ def path_lengths(board: Board) -> npt.NDArray[np.int64]:
 
 
 class _Walker:
-    """Follows the shortest path on a remembered map; opens where it stands if that is the treasure or walled in."""
+    """Follows the shortest path on a remembered map; opens where it stands if that is the treasure
+    or walled in.
+    """
 
     def __init__(self, side: int) -> None:
         self.length: npt.NDArray[np.int64] = np.zeros((0, side, side), np.int64)
@@ -75,9 +84,12 @@ class FramesOracle(_Walker):
 
     def __init__(self, game: Any) -> None:
         super().__init__(game.level.side)
-        self.screen, self.side = game.screen, game.level.side
+        self.screen = game.screen
+        self.side = game.level.side
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         codes = self.screen.board.read(seen, self.side, self.side).swapaxes(1, 2)  # [N, x, y]
         self.remember(codes % KINDS, is_init)

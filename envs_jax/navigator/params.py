@@ -13,8 +13,8 @@ class Params:
 
     side: int  # cells per side of the map
     usual_place: tuple[int, int]
-    """Places in the list of free cells (x-major) from which the reference takes the treasure's x and y in every
-    episode. They are inferred from the measured distribution of its treasures.
+    """Places in the list of free cells (x-major) from which the reference takes the treasure's x
+    and y in every episode. They are inferred from the measured distribution of its treasures.
     """
 
     @property

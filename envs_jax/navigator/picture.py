@@ -1,4 +1,6 @@
-"""The screen of Navigator: a lined map with blocks of TNT, a hexagonal treasure, and the agent as a yellow square."""
+"""The screen of Navigator: a lined map with blocks of TNT, a hexagonal treasure, and the agent as a
+yellow square.
+"""
 
 import math
 
@@ -21,14 +23,33 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import BLACK, MAUVE, MIDNIGHT, PLUM, RED, SKY, SLATE, WHITE, YELLOW
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    MAUVE,
+    MIDNIGHT,
+    PLUM,
+    RED,
+    SKY,
+    SLATE,
+    WHITE,
+    YELLOW,
+)
 
 KINDS = 3  # tile codes: free, TNT, treasure; the same again under the agent
 AGENT_SHARE = 0.6  # side of the agent's square in tiles
 
 # "TNT" for tiles of at least the given side; what is smaller has room for strokes only.
 _LETTERS = (
-    (21, ("11111010001011111", "00100011001000100", "00100010101000100", "00100010011000100", "00100010001000100")),
+    (
+        21,
+        (
+            "11111010001011111",
+            "00100011001000100",
+            "00100010101000100",
+            "00100010011000100",
+            "00100010001000100",
+        ),
+    ),
     (13, ("1110100010111", "0100110010010", "0100101010010", "0100100110010", "0100100010010")),
     (9, ("1001001", "1001001", "1001001")),
     (7, ("10101", "10101", "10101")),
@@ -42,12 +63,15 @@ def _nearest(length: float, side: int) -> int:
 
 
 def tnt_tile(side: int) -> Picture:
-    """A red tile with black letters on a white band over its middle third: uint8 [side, side, 3]."""
+    """A red tile with black letters on a white band over its middle third: uint8 [side, side,
+    3].
+    """
     letters = next(rows for least, rows in _LETTERS if side >= least)
     band = _nearest(side / 3, side)
     top = centred(side, band)
     picture = rectangle(blank(side, side, RED), 0, top, side, top + band, WHITE)
-    x, y = centred(side, len(letters[0])), centred(side, len(letters))
+    x = centred(side, len(letters[0]))
+    y = centred(side, len(letters))
     return bitmap(picture, letters, x, y, 1, 1, BLACK)
 
 
@@ -88,7 +112,9 @@ class Screen:
         self.layers = Layers(background, self.board)
 
     def draw(self, state: NavigatorState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows the agent on an empty map."""
+        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows the agent on
+        an empty map.
+        """
         agent = cell_mask(state.x, state.y, self.layout.cells)
         hidden = jnp.asarray(partial) & (state.timestep > 0)
         codes = jnp.where(hidden, FREE, state.board) + jnp.where(agent, KINDS, 0)

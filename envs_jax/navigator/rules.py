@@ -1,4 +1,6 @@
-"""The rules of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x, y]."""
+"""The rules of Navigator: an agent walks to a treasure among blocks of TNT; boards are indexed [x,
+y].
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +11,9 @@ from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 from arcade_torch.envs_jax.navigator.params import DEATH_REWARD, TNTS, TREASURE_REWARD, Params
 
-FREE, TNT, TREASURE = 0, 1, 2
+FREE = 0
+TNT = 1
+TREASURE = 2
 
 
 class NavigatorState(NamedTuple):
@@ -26,7 +30,8 @@ class NavigatorState(NamedTuple):
 def draw_distinct(key: Array, count: int, cells: int) -> Array:
     """A uniformly random set of cells, by Floyd's algorithm: int32 [count], in no useful order.
 
-    The remainder that maps 32 random bits to so few favours some cells by less than one in ten million.
+    The remainder that maps 32 random bits to so few favours some cells by less than one in ten
+    million.
     """
     draws = jax.random.bits(key, (count,))
     chosen: list[Array] = []
@@ -42,7 +47,9 @@ def reset(key: Array, level: Params, rules: Rules) -> NavigatorState:
     place = place_apart if rules == "default" else place_as_published
     tnt, treasure, agent = place(key, level)
     cell = jnp.arange(level.cells)
-    board = jnp.where(cell == treasure, TREASURE, jnp.where((cell == tnt[:, None]).any(0), TNT, FREE))
+    board = jnp.where(
+        cell == treasure, TREASURE, jnp.where((cell == tnt[:, None]).any(0), TNT, FREE)
+    )
     board = board.astype(jnp.int8).reshape(level.side, level.side)
     return NavigatorState(agent // level.side, agent % level.side, board, jnp.int32(0))
 
@@ -59,8 +66,11 @@ def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
     index = jnp.arange(TNTS + 2)
     treasure = (draw[0] % jnp.uint32(TNTS + 2)).astype(jnp.int32)
     agent = (treasure + 1 + (draw[1] % jnp.uint32(TNTS + 1)).astype(jnp.int32)) % (TNTS + 2)
-    treasure_cell, agent_cell = (jnp.sum(jnp.where(index == role, cells, 0)) for role in (treasure, agent))
-    # What is neither treasure nor agent is TNT; their own places in the list are filled with a block's cell.
+    treasure_cell, agent_cell = (
+        jnp.sum(jnp.where(index == role, cells, 0)) for role in (treasure, agent)
+    )
+    # What is neither treasure nor agent is TNT; their own places in the list are filled with a
+    # block's cell.
     spare = (index != treasure) & (index != agent)
     some_block = jnp.max(jnp.where(spare, cells, -1))
     return jnp.where(spare, cells, some_block), treasure_cell, agent_cell
@@ -69,8 +79,9 @@ def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
 def place_as_published(key: Array, level: Params) -> tuple[Array, Array, Array]:
     """The reference: x and y of the treasure, and of the agent, are taken from two free cells each.
 
-    The treasure's are always the same two entries of the list of free cells, so that it hardly moves from one episode
-    to the next. It may replace a block of TNT, and the agent may start on a block or on the treasure.
+    The treasure's are always the same two entries of the list of free cells, so that it hardly
+    moves from one episode to the next. It may replace a block of TNT, and the agent may start on a
+    block or on the treasure.
 
     Returns:
         As :func:`place_apart`.
@@ -95,8 +106,9 @@ def step(
 ) -> tuple[NavigatorState, Array, Array, Array]:
     """Move the agent, or open what it stands on.
 
-    A move that ends on TNT kills, also one against the border; opening the treasure wins; either ends the game. With
-    ``rules="reference"`` the step that reaches the time limit pays nothing, whatever happened.
+    A move that ends on TNT kills, also one against the border; opening the treasure wins; either
+    ends the game. With ``rules="reference"`` the step that reaches the time limit pays nothing,
+    whatever happened.
     """
     x, y = move_cursor(state.x, state.y, action, level.side)
     new = NavigatorState(x, y, state.board, state.timestep + 1)
@@ -104,7 +116,8 @@ def step(
     here = cell_mask(x, y, level.side)
     cell = jnp.sum(jnp.where(here, state.board, 0))
     fire = action == FIRE
-    dead, won = ~fire & (cell == TNT), fire & (cell == TREASURE)
+    dead = ~fire & (cell == TNT)
+    won = fire & (cell == TREASURE)
     time_limit = new.timestep >= level.max_steps
     reward = jnp.where(won, TREASURE_REWARD, jnp.where(dead, DEATH_REWARD, level.step_reward))
     if rules == "reference":

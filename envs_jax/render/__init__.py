@@ -1,6 +1,17 @@
-"""Drawing for games: host-side primitives, text, and the atlas renderer. Users may build games of their own with it."""
+"""Drawing for games: host-side primitives, text, and the atlas renderer. Users may build games of
+their own with it.
+"""
 
-from arcade_torch.envs_jax.render.canvas import arc, bitmap, blank, disc, paint, pixel_centres, polygon, rectangle
+from arcade_torch.envs_jax.render.canvas import (
+    arc,
+    bitmap,
+    blank,
+    disc,
+    paint,
+    pixel_centres,
+    polygon,
+    rectangle,
+)
 from arcade_torch.envs_jax.render.screen import (
     GRID_LINE,
     GridLayout,
@@ -12,7 +23,15 @@ from arcade_torch.envs_jax.render.screen import (
     number_slot,
     titled_background,
 )
-from arcade_torch.envs_jax.render.text import DIGITS, LETTERS, PATTERN, TEXT, centred, draw_name, number_pictures
+from arcade_torch.envs_jax.render.text import (
+    DIGITS,
+    LETTERS,
+    PATTERN,
+    TEXT,
+    centred,
+    draw_name,
+    number_pictures,
+)
 
 __all__ = [
     "DIGITS",

@@ -1,7 +1,7 @@
 """Drawing primitives on the host: they paint numpy pictures once, before anything is compiled.
 
-A picture is uint8 [height, width, 3]. Points are (x, y), x to the right and y downwards; upper bounds are exclusive.
-Shapes are given by masks, so every primitive overwrites and none blends.
+A picture is uint8 [height, width, 3]. Points are (x, y), x to the right and y downwards; upper
+bounds are exclusive. Shapes are given by masks, so every primitive overwrites and none blends.
 """
 
 import numpy as np
@@ -37,7 +37,9 @@ def rectangle(picture: Picture, x0: int, y0: int, x1: int, y1: int, colour: Colo
 
 
 def disc(picture: Picture, x: float, y: float, radius: float, colour: Colour) -> Picture:
-    """Fill the pixels whose centre lies within ``radius`` of (x, y) in place; returns the picture."""
+    """Fill the pixels whose centre lies within ``radius`` of (x, y) in place; returns the
+    picture.
+    """
     px, py = pixel_centres(picture)
     return paint(picture, (px - x) ** 2 + (py - y) ** 2 <= radius**2, colour)
 
@@ -59,7 +61,14 @@ def polygon(picture: Picture, points: list[tuple[float, float]], colour: Colour)
 
 
 def arc(
-    picture: Picture, x: float, y: float, inner: float, outer: float, start: float, stop: float, colour: Colour
+    picture: Picture,
+    x: float,
+    y: float,
+    inner: float,
+    outer: float,
+    start: float,
+    stop: float,
+    colour: Colour,
 ) -> Picture:
     """Fill a piece of a ring in place; returns the picture.
 
@@ -74,13 +83,18 @@ def arc(
         colour: Its colour.
     """
     px, py = pixel_centres(picture)
-    dx, dy = px - x, y - py
+    dx = px - x
+    dy = y - py
     radius2 = dx**2 + dy**2
     angle = np.mod(np.arctan2(dy, dx) - start, 2 * np.pi)
-    return paint(picture, (radius2 >= inner**2) & (radius2 <= outer**2) & (angle <= stop - start), colour)
+    return paint(
+        picture, (radius2 >= inner**2) & (radius2 <= outer**2) & (angle <= stop - start), colour
+    )
 
 
-def bitmap(picture: Picture, rows: tuple[str, ...], x: int, y: int, width: int, height: int, colour: Colour) -> Picture:
+def bitmap(
+    picture: Picture, rows: tuple[str, ...], x: int, y: int, width: int, height: int, colour: Colour
+) -> Picture:
     """Enlarge a pattern of ``"0"`` and ``"1"`` onto the picture in place; returns the picture.
 
     Args:

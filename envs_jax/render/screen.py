@@ -1,9 +1,10 @@
 """From codes to a frame: a fixed background, and places that each show one of several pictures.
 
-All pictures are cut into lines on the host, once, each as long as a line of the screen and zero beside the picture.
-What runs at each step is one pass over the frame: a line of it is the exclusive or of the lines that stand there, one a
-picture. So no byte needs an index of its own, lines are read and written as whole vectors, and a compiler can give the
-frames of a batch to all cores. A game only says which pictures it has and which code it wants shown.
+All pictures are cut into lines on the host, once, each as long as a line of the screen and zero
+beside the picture. What runs at each step is one pass over the frame: a line of it is the exclusive
+or of the lines that stand there, one a picture. So no byte needs an index of its own, lines are
+read and written as whole vectors, and a compiler can give the frames of a batch to all cores. A
+game only says which pictures it has and which code it wants shown.
 """
 
 import functools
@@ -27,7 +28,8 @@ class Slot:
     pictures: Picture  # uint8 [codes, h, w, 3]
     x: int  # left edge on the screen
     y: int  # top edge on the screen
-    mixed: bool = False  # the pictures are combined with what lies below, by exclusive or, instead of covering it
+    # the pictures are combined with what lies below, by exclusive or, instead of covering it
+    mixed: bool = False
 
     @property
     def area(self) -> tuple[slice, slice]:
@@ -40,7 +42,9 @@ class Slot:
         return [self]
 
     def read(self, frames: Picture) -> npt.NDArray[np.int64]:
-        """Which picture each frame (uint8 [N, S, S, 3]) shows: int64 [N], -1 where none; on the host."""
+        """Which picture each frame (uint8 [N, S, S, 3]) shows: int64 [N], -1 where none; on the
+        host.
+        """
         height, width = self.pictures.shape[1:3]
         shown = frames[:, self.y : self.y + height, self.x : self.x + width]
         return recognise(shown.reshape(len(frames), -1), self.pictures)
@@ -59,7 +63,9 @@ class TileGrid:
         """The places for codes of a shape (rows, columns): of all cells, row by row."""
         height, width = self.atlas.shape[1:3]
         cells = np.ndindex(*shape)
-        return [Slot(self.atlas, self.x + width * c, self.y + height * r, self.mixed) for r, c in cells]
+        return [
+            Slot(self.atlas, self.x + width * c, self.y + height * r, self.mixed) for r, c in cells
+        ]
 
     def read(self, frames: Picture, rows: int, columns: int) -> npt.NDArray[np.int64]:
         """Which tiles frames show, by comparing them with the atlas; on the host.
@@ -75,7 +81,9 @@ class TileGrid:
         height, width = self.atlas.shape[1:3]
         area = frames[:, self.y : self.y + rows * height, self.x : self.x + columns * width]
         tiles = area.reshape(len(frames), rows, height, columns, width, 3).swapaxes(2, 3)
-        return recognise(np.ascontiguousarray(tiles).reshape(len(frames), rows, columns, -1), self.atlas)
+        return recognise(
+            np.ascontiguousarray(tiles).reshape(len(frames), rows, columns, -1), self.atlas
+        )
 
 
 def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
@@ -89,7 +97,8 @@ def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np
         int64 [...]: the lowest code that looks like this, -1 where none does.
     """
     known = pictures.reshape(len(pictures), -1)
-    # Random weights give every picture a number of its own; whole numbers are summed without rounding.
+    # Random weights give every picture a number of its own; whole numbers are summed without
+    # rounding.
     weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
     numbers = known @ weights
     order = numbers.argsort(kind="stable")
@@ -99,7 +108,8 @@ def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np
 
 
 class Layers:
-    """A whole screen: a background and the places on it, of which a later one covers those before it.
+    """A whole screen: a background and the places on it, of which a later one covers those before
+    it.
 
     Args:
         background: uint8 [S, S, 3].
@@ -113,26 +123,39 @@ class Layers:
     """
 
     def __init__(self, background: Picture, *places: Slot | TileGrid) -> None:
-        self.background, self.places = background, places
+        self.background = background
+        self.places = places
         self._tables = functools.cache(self._make_tables)
 
     def draw(self, *codes: Array | int) -> Array:
-        """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S, 3]."""
+        """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S,
+        3].
+        """
         arrays = [jnp.asarray(code) for code in codes]
         lines, (slot, start, stride) = self._tables(tuple(array.shape for array in arrays))
-        known = jnp.concatenate([*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)])
+        known = jnp.concatenate(
+            [*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)]
+        )
         index = start + stride * known.at[slot].get(mode="promise_in_bounds")
-        pictures = [jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index]
+        pictures = [
+            jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index
+        ]
         return functools.reduce(operator.xor, pictures).reshape(self.background.shape)
 
-    def _make_tables(self, shapes: tuple[tuple[int, ...], ...]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint32]]:
+    def _make_tables(
+        self, shapes: tuple[tuple[int, ...], ...]
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint32]]:
         """Cut the pictures into lines; the background is part of the first picture of each line.
 
         Returns:
-            Lines, uint8 [M, 3 S], and uint32 [3, J, S], of J pictures in each line of the screen: the slot, and the
-            numbers of the line for its code 0 and from there to the next code.
+            Lines, uint8 [M, 3 S], and uint32 [3, J, S], of J pictures in each line of the screen:
+            the slot, and the numbers of the line for its code 0 and from there to the next code.
         """
-        slots = [slot for place, shape in zip(self.places, shapes, strict=True) for slot in place.slots(shape)]
+        slots = [
+            slot
+            for place, shape in zip(self.places, shapes, strict=True)
+            for slot in place.slots(shape)
+        ]
         below = self.background.reshape(len(self.background), -1)
         on_top = np.full(below.shape, -1)
         for number, slot in enumerate(slots):
@@ -148,7 +171,9 @@ class Layers:
             rows, across = slot.area
             changes = slot.pictures.reshape(*slot.pictures.shape[:2], -1)
             if not slot.mixed:
-                changes = np.where(on_top[slot.area] == number, changes ^ below[slot.area], 0).astype(np.uint8)
+                changes = np.where(
+                    on_top[slot.area] == number, changes ^ below[slot.area], 0
+                ).astype(np.uint8)
             seen = np.asarray(changes.any((0, 2)))
             block = np.zeros((len(changes), *below[rows].shape), np.uint8)
             block[:, :, across] = changes
@@ -162,18 +187,26 @@ class Layers:
                 entries.append((0, add(line), 0))
         nothing = (0, add(np.zeros_like(below[0])), 0)
         most = max(map(len, shown))
-        table = np.array([entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32)
-        return np.frombuffer(b"".join(known), np.uint8).reshape(-1, below.shape[1]), table.transpose(2, 1, 0)
+        table = np.array(
+            [entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32
+        )
+        return np.frombuffer(b"".join(known), np.uint8).reshape(
+            -1, below.shape[1]
+        ), table.transpose(2, 1, 0)
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:
     """The number at the top of a screen, for values 0 to ``highest``."""
     layout = TEXT[size]
-    return Slot(number_pictures(size, highest, background, colour), layout.field_x[0], layout.field_y[0])
+    return Slot(
+        number_pictures(size, highest, background, colour), layout.field_x[0], layout.field_y[0]
+    )
 
 
 def titled_background(size: int, name: str, outer: Colour, name_colour: Colour) -> Picture:
-    """A screen of one colour with the game's name in the band at the bottom: uint8 [size, size, 3]."""
+    """A screen of one colour with the game's name in the band at the bottom: uint8 [size, size,
+    3].
+    """
     return draw_name(blank(size, size, outer), name, name_colour)
 
 
@@ -212,7 +245,8 @@ def grid_layout(size: int, cells: int) -> GridLayout:
 def lined_board(
     background: Picture, layout: GridLayout, tiles: list[Picture], line: Colour
 ) -> tuple[Picture, TileGrid]:
-    """A board with grid lines: every tile carries the line before it, the closing lines belong to the background.
+    """A board with grid lines: every tile carries the line before it, the closing lines belong to
+    the background.
 
     Args:
         background: The screen, uint8 [S, S, 3]; changed in place.
@@ -223,7 +257,8 @@ def lined_board(
     Returns:
         The background with the board's square filled with the line colour, and the grid of tiles.
     """
-    low, high = layout.offset, layout.offset + layout.side
+    low = layout.offset
+    high = layout.offset + layout.side
     rectangle(background, low, low, high, high, line)
     atlas = np.stack([blank(layout.pitch, layout.pitch, line) for _ in tiles])
     for picture, tile in zip(atlas, tiles, strict=True):

@@ -36,7 +36,9 @@ def _heart(x: Plane, y: Plane) -> Mask:
 def _foot(x: Plane, y: Plane) -> Mask:
     """A stem on a broad foot."""
     stem = (np.abs(x) <= 0.15) & (y >= -0.3)
-    mask: Mask = stem | ((y >= 0.4) & (np.abs(x) <= 0.15 + 0.4 * np.maximum((y - 0.4) / 0.6, 0) ** 3))
+    mask: Mask = stem | (
+        (y >= 0.4) & (np.abs(x) <= 0.15 + 0.4 * np.maximum((y - 0.4) / 0.6, 0) ** 3)
+    )
     return mask
 
 
@@ -54,11 +56,18 @@ def _diamond(x: Plane, y: Plane) -> Mask:
     return mask
 
 
-_SHAPES: dict[int, Callable[[Plane, Plane], Mask]] = {HEART: _heart, SPADE: _spade, CLUB: _club, DIAMOND: _diamond}
+_SHAPES: dict[int, Callable[[Plane, Plane], Mask]] = {
+    HEART: _heart,
+    SPADE: _spade,
+    CLUB: _club,
+    DIAMOND: _diamond,
+}
 
 
 def suit_mask(suit: int, height: int, width: int) -> Mask:
-    """The pixels at least half covered by a suit's symbol stretched to a box: bool [height, width]."""
+    """The pixels at least half covered by a suit's symbol stretched to a box: bool [height,
+    width].
+    """
     x = (np.arange(width * _FINE) + 0.5) / (width * _FINE) * 2 - 1
     y = (np.arange(height * _FINE) + 0.5) / (height * _FINE) * 2 - 1
     inside = _SHAPES[suit](x[None, :], y[:, None])
@@ -67,19 +76,23 @@ def suit_mask(suit: int, height: int, width: int) -> Mask:
     return mask
 
 
-def suit_pictures(side: tuple[int, int], box: tuple[int, int], background: Colour, shorter: int = 0) -> Picture:
+def suit_pictures(
+    side: tuple[int, int], box: tuple[int, int], background: Colour, shorter: int = 0
+) -> Picture:
     """No card and the four suits, each on its own ground.
 
     Args:
         side: Height and width of a picture.
-        box: Height and width of the symbol, centred in the picture (rounded towards the upper left).
+        box: Height and width of the symbol, centred in the picture (rounded towards the upper
+            left).
         background: Colour behind it.
         shorter: Rows by which the black suits end above the others.
 
     Returns:
         uint8 [5, height, width, 3], by code: ``NO_CARD``, then 1 + suit.
     """
-    top, left = centred(side[0], box[0]), centred(side[1], box[1])
+    top = centred(side[0], box[0])
+    left = centred(side[1], box[1])
     pictures = [blank(*side, background)]
     for suit, colour in SUIT_COLOURS.items():
         mask = np.zeros(side, bool)
@@ -96,7 +109,8 @@ _SYMBOL = {128: (9, 8), 256: (18, 12)}  # height and width of its symbols
 
 
 def corner_slot(size: int, right: bool, background: Colour, shorter: int) -> Slot:
-    """The place of one large card in an upper corner of the screen; codes as in :func:`suit_pictures`.
+    """The place of one large card in an upper corner of the screen; codes as in
+    :func:`suit_pictures`.
 
     Args:
         size: Side of the screen, 128 or 256.

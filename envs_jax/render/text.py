@@ -50,7 +50,9 @@ _LETTERS = {
     "Z": "11111 00010 00100 01000 11111",
 }
 DIGITS: tuple[tuple[str, ...], ...] = tuple(tuple(rows.split()) for rows in _DIGITS)
-LETTERS: dict[str, tuple[str, ...]] = {letter: tuple(rows.split()) for letter, rows in _LETTERS.items()}
+LETTERS: dict[str, tuple[str, ...]] = {
+    letter: tuple(rows.split()) for letter, rows in _LETTERS.items()
+}
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,15 @@ def draw_name(picture: Picture, name: str, colour: Colour) -> Picture:
     step = PATTERN * layout.letter_scale + layout.letter_gap
     x = centred(size, len(name) * step - layout.letter_gap)
     for letter in name.upper():
-        bitmap(picture, LETTERS[letter], x, layout.letter_y, layout.letter_scale, layout.letter_scale, colour)
+        bitmap(
+            picture,
+            LETTERS[letter],
+            x,
+            layout.letter_y,
+            layout.letter_scale,
+            layout.letter_scale,
+            colour,
+        )
         x += step
     return picture
 
@@ -110,7 +120,8 @@ def number_pictures(size: int, highest: int, background: Colour, colour: Colour)
     """
     layout = TEXT[size]
     across, down = layout.digit_scale
-    height, width = layout.field_y[1] - layout.field_y[0], layout.field_x[1] - layout.field_x[0]
+    height = layout.field_y[1] - layout.field_y[0]
+    width = layout.field_x[1] - layout.field_x[0]
     step = PATTERN * across + layout.digit_gap
     pictures = []
     for value in range(highest + 1):
@@ -118,7 +129,15 @@ def number_pictures(size: int, highest: int, background: Colour, colour: Colour)
         digits = str(value)
         x = centred(width, len(digits) * step - layout.digit_gap)
         for digit in digits:
-            bitmap(field, DIGITS[int(digit)], x, layout.digit_y - layout.field_y[0], across, down, colour)
+            bitmap(
+                field,
+                DIGITS[int(digit)],
+                x,
+                layout.digit_y - layout.field_y[0],
+                across,
+                down,
+                colour,
+            )
             x += step
         pictures.append(field)
     return np.stack(pictures)

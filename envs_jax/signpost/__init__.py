@@ -1,4 +1,8 @@
-"""Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten games."""
+"""Signpost: the smallest task that cannot be played without memory. A probe, not one of the ten
+games.
+"""
+
+from typing import ClassVar
 
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.signpost import rules
@@ -11,20 +15,22 @@ from arcade_torch.envs_jax.signpost.rules import SignpostState
 class Signpost(LevelGame[SignpostState]):
     """Read the sign, walk to the gate, press the direction that the sign showed.
 
-    Every action walks one cell along the corridor, and every one but 3 (right) stumbles and costs ``1 / corridor``. At
-    the gate the action is the answer: the sign's direction opens the gate and pays 1, anything else pays 0, and the
-    game ends. Returns lie in [-1, 1]. Without memory no player can expect more than 1/4; random play expects
-    ``1/5 - 4/5``.
+    Every action walks one cell along the corridor, and every one but 3 (right) stumbles and costs
+    ``1 / corridor``. At the gate the action is the answer: the sign's direction opens the gate and
+    pays 1, anything else pays 0, and the game ends. Returns lie in [-1, 1]. Without memory no
+    player can expect more than 1/4; random play expects ``1/5 - 4/5``.
 
     The MDP twin shows the sign all the time; the POMDP twin shows it in the first frame alone.
 
     Args:
         rules: ``"default"`` and ``"reference"`` are the same here: no rules were published.
 
-    Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory") with four ways on.
+    Source: our own; a T-maze (Bakker 2001, "Reinforcement Learning with Long Short-Term Memory")
+        with four ways on.
     """
 
-    levels, oracles = LEVELS, {"state": StateOracle, "frames": FramesOracle}
+    levels = LEVELS
+    oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
         super().__init__(level, id=id, obs_size=obs_size, rules=rules)
@@ -36,6 +42,8 @@ class Signpost(LevelGame[SignpostState]):
         """See :meth:`Game.reset`."""
         return rules.reset(key)
 
-    def step(self, key: Array, state: SignpostState, action: Array) -> tuple[SignpostState, Array, Array, Array]:
+    def step(
+        self, key: Array, state: SignpostState, action: Array
+    ) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level)

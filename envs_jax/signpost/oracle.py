@@ -1,4 +1,6 @@
-"""Scripted players of Signpost: one is told the sign, one reads it off the first frame and remembers it."""
+"""Scripted players of Signpost: one is told the sign, one reads it off the first frame and
+remembers it.
+"""
 
 from typing import Any
 
@@ -26,7 +28,8 @@ class FramesOracle:
     """Sees the POMDP's frames: the sign stands on the first of them alone; return 1."""
 
     def __init__(self, game: Any) -> None:
-        self.screen, self.gate = game.screen, game.level.corridor
+        self.screen = game.screen
+        self.gate = game.level.corridor
         self.sign: npt.NDArray[np.int64] = np.zeros(0, np.int64)
 
     def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> Actions:

@@ -17,18 +17,31 @@ from arcade_torch.envs_jax.render import (
     titled_background,
 )
 from arcade_torch.envs_jax.render.canvas import Picture
-from arcade_torch.envs_jax.render.palette import BLACK, GREY, NAVY, ORANGE, SPRING_GREEN, WHITE, YELLOW
+from arcade_torch.envs_jax.render.palette import (
+    BLACK,
+    GREY,
+    NAVY,
+    ORANGE,
+    SPRING_GREEN,
+    WHITE,
+    YELLOW,
+)
 from arcade_torch.envs_jax.signpost.params import Params
 from arcade_torch.envs_jax.signpost.rules import SIGNS, SignpostState
 
-FLOOR, GATE, OPEN, KINDS = 0, 1, 2, 3  # tile codes; the same again under the walker
+# tile codes; the same again under the walker
+FLOOR = 0
+GATE = 1
+OPEN = 2
+KINDS = 3
 BLANK = SIGNS  # picture of the sign with nothing on it
 
 
 def sign_pictures(side: int) -> Picture:
     """Arrows up, down, left, right, and an empty sign: uint8 [5, side, side, 3]."""
     empty = rectangle(blank(side, side, WHITE), 1, 1, side - 1, side - 1, NAVY)
-    up, half = empty.copy(), side / 2
+    up = empty.copy()
+    half = side / 2
     polygon(up, [(half, side / 8), (side * 7 / 8, half), (side / 8, half)], YELLOW)
     rectangle(up, side * 3 // 8, side // 2, side - side * 3 // 8, side * 7 // 8, YELLOW)
     left = np.rot90(up)
@@ -37,7 +50,10 @@ def sign_pictures(side: int) -> Picture:
 
 def tiles(side: int) -> Picture:
     """Floor, gate, open gate, and each with the walker on it: uint8 [6, side, side, 3]."""
-    plain = [rectangle(blank(side, side, GREY), 1, 1, side - 1, side - 1, c) for c in (BLACK, ORANGE, SPRING_GREEN)]
+    plain = [
+        rectangle(blank(side, side, GREY), 1, 1, side - 1, side - 1, c)
+        for c in (BLACK, ORANGE, SPRING_GREEN)
+    ]
     walked = [disc(tile.copy(), side / 2, side / 2, side * 0.3, WHITE) for tile in plain]
     return np.stack(plain + walked)
 
@@ -60,8 +76,12 @@ class Screen:
         self.layers = Layers(background, self.score, self.sign, self.corridor)
 
     def draw(self, state: SignpostState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows an empty sign."""
+        """The frame of a state: uint8 [S, S, 3]. From step 1 on, the POMDP twin shows an empty
+        sign.
+        """
         hidden = jnp.asarray(partial) & (state.timestep > 0)
         cell = jnp.arange(self.cells)
-        codes = jnp.where(cell == self.cells - 1, GATE + state.score, FLOOR) + KINDS * (cell == state.x)
+        codes = jnp.where(cell == self.cells - 1, GATE + state.score, FLOOR) + KINDS * (
+            cell == state.x
+        )
         return self.layers.draw(state.score, jnp.where(hidden, BLANK, state.sign), codes[None])

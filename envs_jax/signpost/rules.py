@@ -28,15 +28,20 @@ def reset(key: Array) -> SignpostState:
     return SignpostState(jax.random.randint(key, (), 0, SIGNS, dtype=jnp.int32), zero, zero, zero)
 
 
-def step(state: SignpostState, action: Array, level: Params) -> tuple[SignpostState, Array, Array, Array]:
+def step(
+    state: SignpostState, action: Array, level: Params
+) -> tuple[SignpostState, Array, Array, Array]:
     """Walk one cell; at the gate, answer.
 
-    Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents are told their last
-    action, so a player without memory could carry the sign to the gate by repeating it; stumbling all the way costs as
-    much as the gate pays, so that nobody without memory can expect more than 1/4. Nothing truncates.
+    Every action walks on, and every action but right stumbles, which costs ``1 / corridor``. Agents
+    are told their last action, so a player without memory could carry the sign to the gate by
+    repeating it; stumbling all the way costs as much as the gate pays, so that nobody without
+    memory can expect more than 1/4. Nothing truncates.
     """
     at_gate = state.x == level.corridor
     opened = at_gate & (action == state.sign)
     stumbled = ~at_gate & (action != RIGHT)
-    new = SignpostState(state.sign, state.x + ~at_gate, opened.astype(jnp.int32), state.timestep + 1)
+    new = SignpostState(
+        state.sign, state.x + ~at_gate, opened.astype(jnp.int32), state.timestep + 1
+    )
     return new, opened - stumbled / jnp.float32(level.corridor), at_gate, jnp.bool_(False)

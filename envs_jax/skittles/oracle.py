@@ -1,4 +1,6 @@
-"""Scripted players of Skittles: both plan nine steps ahead, one on all blocks, one on those it has ever seen."""
+"""Scripted players of Skittles: both plan nine steps ahead, one on all blocks, one on those it has
+ever seen.
+"""
 
 from typing import Any
 
@@ -15,7 +17,9 @@ MOVES = np.array([LEFT, UP, RIGHT], np.int32)
 
 
 def beside(values: npt.NDArray[Any], fill: Any) -> npt.NDArray[Any]:
-    """Values [..., width] in the column to the left, in the same and in that to the right: [3, ..., width]."""
+    """Values [..., width] in the column to the left, in the same and in that to the right: [3, ...,
+    width].
+    """
     padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)], constant_values=fill)
     return np.stack([padded[..., :-2], values, padded[..., 2:]])
 
@@ -28,8 +32,9 @@ def outlook(width: int, rounds: int = 5) -> npt.NDArray[np.float64]:
         rounds: Blocks to look ahead.
 
     Returns:
-        float64 [2**width, width + 1]: for a set of columns (column ``c`` is bit ``c``) and the newest block's column
-        (``width`` for none), the chance that ``rounds`` random blocks leave a way through from some column of the set.
+        float64 [2**width, width + 1]: for a set of columns (column ``c`` is bit ``c``) and the
+        newest block's column (``width`` for none), the chance that ``rounds`` random blocks leave a
+        way through from some column of the set.
     """
     bits = 1 << np.arange(width)
     sets = (np.arange(2**width)[:, None] & bits) > 0
@@ -47,7 +52,8 @@ class Planner:
     """Chooses moves with a known or a partly known grid."""
 
     def __init__(self, level: Params) -> None:
-        self.level, self.worth = level, outlook(level.width)
+        self.level = level
+        self.worth = outlook(level.width)
 
     def plan(self, x: npt.NDArray[Any], column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
         """The move with the best chance to live, and then with the best choice of columns.
@@ -66,9 +72,11 @@ class Planner:
         here = np.clip(x[:, None] + np.array([-1, 0, 1]), lane[0], lane[-1])
         ways = here[..., None] == lane  # [N, moves, width], the columns each first move leads to
         alive = ways.astype(float)  # the best chance to be there alive
-        for row in range(CELLS - 1, 0, -1):  # the block of this row leaves, that of the row above arrives
+        # the block of this row leaves, that of the row above arrives
+        for row in range(CELLS - 1, 0, -1):
             if row < CELLS - 1:
-                ways, alive = beside(ways, False).any(0), beside(alive, 0.0).max(0)
+                ways = beside(ways, False).any(0)
+                alive = beside(alive, 0.0).max(0)
             ways = ways & ~(block[:, row] | block[:, row - 1])[:, None]
             alive = alive * (clear[:, row] * clear[:, row - 1])[:, None]
         newest = np.where(column[:, 0] < 0, width, column[:, 0] - self.level.first)
@@ -92,15 +100,18 @@ class StateOracle:
 class FramesOracle:
     """Sees the POMDP's frames: every block seen once is remembered while it falls.
 
-    A block has nine looks before it can hit; the one in 512 that is never seen is what the player cannot avoid but by
-    luck.
+    A block has nine looks before it can hit; the one in 512 that is never seen is what the player
+    cannot avoid but by luck.
     """
 
     def __init__(self, game: Any) -> None:
-        self.planner, self.board = Planner(game.level), game.screen.board
+        self.planner = Planner(game.level)
+        self.board = game.screen.board
         self.column: npt.NDArray[np.int64] = np.zeros((0, CELLS), np.int64)
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    def act(
+        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.int32]:
         """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
         if len(self.column) != len(seen):
             self.column = np.full((len(seen), CELLS), NO_BLOCK)

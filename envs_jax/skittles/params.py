@@ -20,4 +20,8 @@ class Params:
         return self.first + self.width - 1
 
 
-LEVELS = {"SkittlesEasy": Params(8, 1), "SkittlesMedium": Params(7, 2), "SkittlesHard": Params(6, 2)}
+LEVELS = {
+    "SkittlesEasy": Params(8, 1),
+    "SkittlesMedium": Params(7, 2),
+    "SkittlesHard": Params(6, 2),
+}

@@ -51,7 +51,9 @@ class Screen:
         self.layers = Layers(background, self.score, self.board)
 
     def draw(self, state: SkittlesState, partial: Array | bool) -> Array:
-        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows each block in about half of the frames."""
+        """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows each block in about half of
+        the frames.
+        """
         visible = shown(state) | ~jnp.asarray(partial)
         columns = np.arange(CELLS)
         here = (columns == state.column[:, None]) & visible[:, None]

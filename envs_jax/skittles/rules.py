@@ -1,4 +1,6 @@
-"""The rules of Skittles: at every step a new row with one block falls in at the top; the agent dodges at the bottom."""
+"""The rules of Skittles: at every step a new row with one block falls in at the top; the agent
+dodges at the bottom.
+"""
 
 from typing import NamedTuple
 
@@ -14,10 +16,13 @@ NO_BLOCK = -1
 class SkittlesState(NamedTuple):
     """The falling rows, the agent, and what decides how the POMDP flickers."""
 
-    column: Array  # int32 [CELLS], column of the block in each row from the top, NO_BLOCK in an empty row
+    # int32 [CELLS], column of the block in each row from the top, NO_BLOCK in an empty row
+    column: Array
     colour: Array  # int32 [CELLS], 0 to COLOURS - 1
     x: Array  # int32, column of the agent; it stands in the bottom row
-    safe: Array  # bool [width], columns of the lane a survivor can be in when the newest row arrives at the bottom
+    # bool [width], columns of the lane a survivor can be in when the newest row arrives at the
+    # bottom
+    safe: Array
     flicker_key: Array  # uint32 [2], with the time it decides which cells the POMDP hides
     time: Array  # int32, steps taken, which is the score
     terminated: Array = UNSET  # bool, whether the game has ended
@@ -25,17 +30,21 @@ class SkittlesState(NamedTuple):
 
 
 def reset(key: Array, level: Params, rules: Rules) -> SkittlesState:
-    """An empty grid, the agent anywhere in the lane; with ``rules="reference"`` all episodes flicker alike."""
+    """An empty grid, the agent anywhere in the lane; with ``rules="reference"`` all episodes
+    flicker alike.
+    """
     for_agent, flicker_key = jax.random.split(key)
     if rules == "reference":
         flicker_key = jnp.zeros_like(flicker_key)
     x = level.first + jax.random.randint(for_agent, (), 0, level.width, dtype=jnp.int32)
-    empty, zeros = jnp.full(CELLS, NO_BLOCK, jnp.int32), jnp.zeros(CELLS, jnp.int32)
+    empty = jnp.full(CELLS, NO_BLOCK, jnp.int32)
+    zeros = jnp.zeros(CELLS, jnp.int32)
     return SkittlesState(empty, zeros, x, jnp.ones(level.width, bool), flicker_key, jnp.int32(0))
 
 
 def reachable(safe: Array, newest: Array, level: Params) -> Array:
-    """Where a survivor can be one step on, when the block of the newest row (or ``NO_BLOCK``) leaves: bool [width].
+    """Where a survivor can be one step on, when the block of the newest row (or ``NO_BLOCK``)
+    leaves: bool [width].
 
     ``safe``, bool [width], is where survivors can be when that row arrives.
     """
@@ -47,7 +56,8 @@ def reachable(safe: Array, newest: Array, level: Params) -> Array:
 def draw_block(key: Array, reach: Array, level: Params, rules: Rules) -> Array:
     """The column of a new block: int32, uniform among those that leave a survivor somewhere to be.
 
-    These are never none, as a lane has at least two columns. ``rules="reference"`` draws among all of the lane.
+    These are never none, as a lane has at least two columns. ``rules="reference"`` draws among all
+    of the lane.
     """
     if rules == "reference":
         return level.first + jax.random.randint(key, (), 0, level.width, dtype=jnp.int32)
@@ -61,8 +71,8 @@ def step(
 ) -> tuple[SkittlesState, Array, Array, Array]:
     """Move the agent, then let all rows fall by one.
 
-    The agent is hit by the block it walks into and by the block that falls on it. Every step pays ``1 / MAX_STEPS``,
-    also the one in which the agent is hit, which pays ``hit_reward`` on top.
+    The agent is hit by the block it walks into and by the block that falls on it. Every step pays
+    ``1 / MAX_STEPS``, also the one in which the agent is hit, which pays ``hit_reward`` on top.
     """
     sideways = (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     x = jnp.clip(state.x + sideways, level.first, level.last)
@@ -82,8 +92,9 @@ def step(
 def shown(state: SkittlesState) -> Array:
     """Which blocks the POMDP shows: bool [CELLS], one for each row.
 
-    At every time each cell of the grid is shown with probability 1/2, as a function of ``flicker_key`` and time; a row
-    holds one block, so only the cell of that block is looked up. Nothing is hidden at time 0.
+    At every time each cell of the grid is shown with probability 1/2, as a function of
+    ``flicker_key`` and time; a row holds one block, so only the cell of that block is looked up.
+    Nothing is hidden at time 0.
     """
     cells = jax.random.bits(jax.random.fold_in(state.flicker_key, state.time), (CELLS,))
     bit = (cells >> jnp.maximum(state.column, 0).astype(jnp.uint32)) & 1

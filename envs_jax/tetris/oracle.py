@@ -1,4 +1,6 @@
-"""Scripted players of Tetris: one sees the pile, one remembers every piece that it saw come to lie."""
+"""Scripted players of Tetris: one sees the pile, one remembers every piece that it saw come to
+lie.
+"""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, ROTATIONS, ROWS, SHAPES, SPAWN_X, SPAWN_Y
+from arcade_torch.envs_jax.tetris.params import (
+    BOX,
+    COLUMNS,
+    ROTATIONS,
+    ROWS,
+    SHAPES,
+    SPAWN_X,
+    SPAWN_Y,
+)
 from arcade_torch.envs_jax.tetris.picture import BAND
 
 Bools = npt.NDArray[np.bool_]
@@ -27,9 +37,12 @@ class Plans(NamedTuple):
 
 
 def room(pile: Bools, piece: Ints) -> Bools:
-    """Where a piece fits: bool [M, rotation, row, BORDER + column] for piles [M, 20, 10] and pieces [M]."""
+    """Where a piece fits: bool [M, rotation, row, BORDER + column] for piles [M, 20, 10] and pieces
+    [M].
+    """
     blocks = np.pad(pile, ((0, 0), (0, 2 * BOX), (BORDER, 2 * BORDER)), constant_values=True)
-    height, width = ROWS + BOX, COLUMNS + BORDER + 2
+    height = ROWS + BOX
+    width = COLUMNS + BORDER + 2
     hits = np.zeros((len(pile), ROTATIONS, height, width), bool)
     for row in range(BOX):
         for column in range(BOX):
@@ -39,7 +52,8 @@ def room(pile: Bools, piece: Ints) -> Bools:
 
 
 def plan(pile: Bools, piece: Ints, fall: int, drop: int, tunnels: bool) -> Plans:
-    """Try each way to turn a new piece, shift it, and drop it, obeying gravity from the first action on.
+    """Try each way to turn a new piece, shift it, and drop it, obeying gravity from the first
+    action on.
 
     Args:
         pile: bool [M, 20, 10].
@@ -52,8 +66,10 @@ def plan(pile: Bools, piece: Ints, fall: int, drop: int, tunnels: bool) -> Plans
     goals = np.array([(rot, px) for rot in range(ROTATIONS) for px in range(-BORDER, COLUMNS)])
     shape = (len(pile), len(goals))
     goal_rot, goal_px = (np.broadcast_to(goals[:, i], shape) for i in range(2))
-    rot, px = np.zeros(shape, np.int64), np.full(shape, SPAWN_X)
-    py, lies = np.full(shape, SPAWN_Y), np.zeros(shape, bool)
+    rot = np.zeros(shape, np.int64)
+    px = np.full(shape, SPAWN_X)
+    py = np.full(shape, SPAWN_Y)
+    lies = np.zeros(shape, bool)
     actions = np.full((*shape, LONGEST), FIRE, np.int8)
     board = np.arange(len(pile))[:, None]
 
@@ -65,9 +81,11 @@ def plan(pile: Bools, piece: Ints, fall: int, drop: int, tunnels: bool) -> Plans
         sideways = np.where(px < goal_px, RIGHT, LEFT)
         action = np.where(rot != goal_rot, UP, np.where(px != goal_px, sideways, DOWN))
         actions[:, :, step] = np.where(lies, FIRE, action)
-        turned, shifted = (rot + (action == UP)) % ROTATIONS, px + (action == RIGHT) - (action == LEFT)
+        turned = (rot + (action == UP)) % ROTATIONS
+        shifted = px + (action == RIGHT) - (action == LEFT)
         moves = fits(turned, shifted, py) & ~lies
-        rot, px = np.where(moves, turned, rot), np.where(moves, shifted, px)
+        rot = np.where(moves, turned, rot)
+        px = np.where(moves, shifted, px)
         length = np.where(action == DOWN, 1 if step == 0 else drop, fall)
         free_below = np.stack([fits(rot, px, np.minimum(py + down, ROWS)) for down in range(1, 4)])
         if tunnels:
@@ -82,7 +100,9 @@ def plan(pile: Bools, piece: Ints, fall: int, drop: int, tunnels: bool) -> Plans
 
 
 def drop_rows(pile: Bools, gone: Bools) -> Bools:
-    """Remove rows ``gone`` (bool [..., 20]) of piles [..., 20, 10]; those above fall straight down."""
+    """Remove rows ``gone`` (bool [..., 20]) of piles [..., 20, 10]; those above fall straight
+    down.
+    """
     order = np.argsort(~gone, axis=-1, kind="stable")
     return np.take_along_axis(pile & ~gone[..., None], order[..., None], -2)
 
@@ -100,7 +120,9 @@ def put(pile: Bools, piece: Ints, plans: Plans) -> Bools:
 
 
 def cost(pile: Bools) -> npt.NDArray[np.float64]:
-    """How bad piles [..., 20, 10] are: holes, broken rows and columns, height and wells; complete rows are good."""
+    """How bad piles [..., 20, 10] are: holes, broken rows and columns, height and wells; complete
+    rows are good.
+    """
     full: Bools = np.asarray(pile.all(-1))
     left = drop_rows(pile, full)
     roofed: Bools = np.logical_or.accumulate(left, -2)
@@ -108,7 +130,9 @@ def cost(pile: Bools) -> npt.NDArray[np.float64]:
     above = (np.cumsum(left, -2) * holes).sum((-2, -1))
     height = roofed.sum(-2)  # [..., 10]
     sides = np.pad(left, [(0, 0)] * (left.ndim - 1) + [(1, 1)], constant_values=True)
-    breaks = (np.not_equal(sides[..., 1:], sides[..., :-1]) & left.any(-1, keepdims=True)).sum((-2, -1))
+    breaks = (np.not_equal(sides[..., 1:], sides[..., :-1]) & left.any(-1, keepdims=True)).sum(
+        (-2, -1)
+    )
     edges = np.pad(height, [(0, 0)] * (height.ndim - 1) + [(1, 1)], constant_values=ROWS)
     depth = np.maximum(np.minimum(edges[..., :-2], edges[..., 2:]) - height, 0)
     return np.asarray(
@@ -125,7 +149,8 @@ class Planner:
     """Chooses a plan when a piece is about to appear, and carries it out blindly."""
 
     def __init__(self, game: Any) -> None:
-        self.level, self.tunnels = game.level, game.rules == "reference"
+        self.level = game.level
+        self.tunnels = game.rules == "reference"
         self.actions = np.zeros((0, LONGEST), np.int8)
         self.step = np.zeros(0, np.int64)
 
@@ -144,14 +169,17 @@ class Planner:
         if len(rows):
             plans = plan(pile[rows], piece[rows], self.level.fall, self.level.drop, self.tunnels)
             best = cost(put(pile[rows], piece[rows], plans)).argmin(1)
-            self.actions[rows], self.step[rows] = plans.actions[np.arange(len(rows)), best], 0
+            self.actions[rows] = plans.actions[np.arange(len(rows)), best]
+            self.step[rows] = 0
         action = self.actions[np.arange(len(appears)), np.minimum(self.step, LONGEST - 1)]
         self.step += 1
         return action.astype(np.int32)
 
 
 class StateOracle:
-    """Sees the pile: looks where the coming piece can be brought, and takes the place that leaves the best pile."""
+    """Sees the pile: looks where the coming piece can be brought, and takes the place that leaves
+    the best pile.
+    """
 
     def __init__(self, game: Any) -> None:
         self.planner = Planner(game)
@@ -165,14 +193,17 @@ class StateOracle:
 
 
 class FramesOracle:
-    """Sees the POMDP's frames: adds every piece to a remembered pile when it comes to lie, and plays as if it saw it.
+    """Sees the POMDP's frames: adds every piece to a remembered pile when it comes to lie, and
+    plays as if it saw it.
 
-    Nothing is lost: a piece lies when its cells have the floor or the remembered pile below them, or when a band
-    shows; the rows under a band are known to vanish, and the rest of the piece is drawn around it.
+    Nothing is lost: a piece lies when its cells have the floor or the remembered pile below them,
+    or when a band shows; the rows under a band are known to vanish, and the rest of the piece is
+    drawn around it.
     """
 
     def __init__(self, game: Any) -> None:
-        self.screen, self.planner = game.screen, Planner(game)
+        self.screen = game.screen
+        self.planner = Planner(game)
         self.pile = np.zeros((0, ROWS, COLUMNS), bool)
 
     def act(self, seen: npt.NDArray[np.uint8], is_init: Bools) -> npt.NDArray[np.int32]:
@@ -181,7 +212,8 @@ class FramesOracle:
             self.pile = np.zeros((len(seen), ROWS, COLUMNS), bool)
         self.pile[is_init] = False
         codes = read_board(seen, self.screen)
-        band, cells = (codes == BAND).all(-1), (codes > 0) & (codes < BAND)
+        band = (codes == BAND).all(-1)
+        cells = (codes > 0) & (codes < BAND)
         floor = np.ones((len(seen), 1, COLUMNS), bool)
         below = np.concatenate([self.pile[:, 1:], floor], 1)
         lies = band.any(-1) | (cells & below).any((1, 2))
@@ -191,9 +223,13 @@ class FramesOracle:
 
 
 def read_board(frames: npt.NDArray[np.uint8], screen: Any) -> Ints:
-    """Which tile each cell of frames [N, S, S, 3] shows: int64 [N, 20, 10], -1 for none; one pixel of a cell tells."""
-    grid, cell = screen.board, screen.cell
-    y, x = grid.y + cell // 2, grid.x + cell // 2
+    """Which tile each cell of frames [N, S, S, 3] shows: int64 [N, 20, 10], -1 for none; one pixel
+    of a cell tells.
+    """
+    grid = screen.board
+    cell = screen.cell
+    y = grid.y + cell // 2
+    x = grid.x + cell // 2
     middle = frames[:, y : y + ROWS * cell : cell, x : x + COLUMNS * cell : cell]
     codes = np.full(middle.shape[:3], -1, np.int64)
     for code, colour in enumerate(grid.atlas[:, cell // 2, cell // 2]):

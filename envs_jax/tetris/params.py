@@ -4,8 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ROWS, COLUMNS = 20, 10
-SPAWN_X, SPAWN_Y = 3, 0  # column and row of a new piece's box
+ROWS = 20
+COLUMNS = 10
+# column and row of a new piece's box
+SPAWN_X = 3
+SPAWN_Y = 0
 GOAL = 10  # lines that win
 LINE_REWARD = 0.1  # for each of them
 TOP_OUT_REWARD = -1.0
@@ -14,7 +17,8 @@ MAX_AGE = 10  # the counter of steps since the spawn stops here
 BOX = 4  # a piece lives in a box of 4 x 4 cells
 ROTATIONS = 4
 
-# Cells of each piece in its box, "12" for row 1 and column 2; one group for each rotation, clockwise.
+# Cells of each piece in its box, "12" for row 1 and column 2; one group for each rotation,
+# clockwise.
 _PIECES = {
     "I": "10 11 12 13 | 02 12 22 32 | 20 21 22 23 | 01 11 21 31",
     "O": "11 12 21 22 | 11 12 21 22 | 11 12 21 22 | 11 12 21 22",
@@ -49,4 +53,8 @@ class Params:
     drop: int  # cells it goes down by a soft drop
 
 
-LEVELS = {"TetrisEasy": Params(3, 1, 2), "TetrisMedium": Params(2, 1, 2), "TetrisHard": Params(1, 2, 3)}
+LEVELS = {
+    "TetrisEasy": Params(3, 1, 2),
+    "TetrisMedium": Params(2, 1, 2),
+    "TetrisHard": Params(1, 2, 3),
+}

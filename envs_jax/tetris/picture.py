@@ -33,8 +33,11 @@ from arcade_torch.envs_jax.render.palette import (
 from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, GOAL, ROWS, SHAPES, Params
 from arcade_torch.envs_jax.tetris.rules import TetrisState, complete_rows, covers
 
-PIECE_COLOURS: tuple[Colour, ...] = (LAGOON, GOLD, VIOLET, EMERALD, BLOOD, COBALT, AMBER)  # I O T S Z J L
-EMPTY, BAND = 0, 1 + len(PIECE_COLOURS)  # tile codes: empty, the pieces, a cell of a complete row
+# I O T S Z J L
+PIECE_COLOURS: tuple[Colour, ...] = (LAGOON, GOLD, VIOLET, EMERALD, BLOOD, COBALT, AMBER)
+# tile codes: empty, the pieces, a cell of a complete row
+EMPTY = 0
+BAND = 1 + len(PIECE_COLOURS)
 MOST_LINES = GOAL + 3  # nine lines, then a clear of four
 BAND_OVERHANG = 2  # pixels of a band beyond the board, on either side
 
@@ -45,7 +48,9 @@ def framed_cell(side: int, colour: Colour) -> Picture:
 
 
 def preview_picture(piece: int, side: int) -> Picture:
-    """A coming piece in its box, with cells of ``side`` pixels; those of two pixels have no room for a frame."""
+    """A coming piece in its box, with cells of ``side`` pixels; those of two pixels have no room
+    for a frame.
+    """
     colour = PIECE_COLOURS[piece]
     cell = framed_cell(side, colour) if side > 2 else blank(side, side, colour)
     picture = blank(BOX * side, BOX * side, BLACK)
@@ -66,31 +71,43 @@ class Screen:
         self.cell = cell = {128: 5, 256: 10}[size]
         field = ROWS * cell  # the black square is as wide as the board is high
         corner = centred(size, field)
-        left, right = corner + 5 * cell, corner + (5 + COLUMNS) * cell
+        left = corner + 5 * cell
+        right = corner + (5 + COLUMNS) * cell
         background = titled_background(size, "TETRIS", ASH, YELLOW)
         rectangle(background, corner, corner, corner + field, corner + field, BLACK)
         rectangle(background, left - 1, corner, left, corner + field, WHITE)
         rectangle(background, right, corner, right + 1, corner + field, WHITE)
 
-        tiles = [blank(cell, cell, BLACK), *(framed_cell(cell, c) for c in PIECE_COLOURS), blank(cell, cell, WHITE)]
+        tiles = [
+            blank(cell, cell, BLACK),
+            *(framed_cell(cell, c) for c in PIECE_COLOURS),
+            blank(cell, cell, WHITE),
+        ]
         self.board = TileGrid(np.stack(tiles), left, corner)
         # The ends of a band: what is there without it, and white.
         self.band_ends = [
-            TileGrid(np.stack([background[corner : corner + cell, x : x + BAND_OVERHANG], ends]), x, corner)
+            TileGrid(
+                np.stack([background[corner : corner + cell, x : x + BAND_OVERHANG], ends]),
+                x,
+                corner,
+            )
             for ends in [blank(cell, BAND_OVERHANG, WHITE)]
             for x in (left - BAND_OVERHANG, right)
         ]
         small = cell // 2
         pictures = np.stack([preview_picture(piece, small) for piece in range(len(PIECE_COLOURS))])
         self.previews = [
-            Slot(pictures, corner + 16 * cell, corner + 3 * cell + 2 + 3 * cell * k) for k in range(level.previews)
+            Slot(pictures, corner + 16 * cell, corner + 3 * cell + 2 + 3 * cell * k)
+            for k in range(level.previews)
         ]
         self.score = number_slot(size, MOST_LINES, ASH, SCARLET)
         # The number field reaches one or two rows into the well: the board is drawn over it.
         self.layers = Layers(background, self.score, self.board, *self.band_ends, *self.previews)
 
     def codes(self, state: TetrisState, partial: Array | bool) -> Array:
-        """What each cell shows, int8 [20, 10]. The POMDP twin shows the piece and complete rows alone."""
+        """What each cell shows, int8 [20, 10]. The POMDP twin shows the piece and complete rows
+        alone.
+        """
         pile = jnp.where(jnp.asarray(partial), EMPTY, state.board)
         shown = jnp.where(covers(state), (state.piece + 1).astype(jnp.int8), pile)
         return jnp.where(complete_rows(state.board)[:, None], jnp.int8(BAND), shown)

@@ -1,7 +1,7 @@
 """The rules of Tetris: one action, then gravity; a piece that cannot go further down locks at once.
 
-Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits beyond the board
-are set, so that walls and floor are blocks like any other."""
+Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column ``c``, and all bits
+beyond the board are set, so that walls and floor are blocks like any other."""
 
 from typing import NamedTuple
 
@@ -65,8 +65,9 @@ def shuffled(key: Array) -> Array:
 def deal_order(level: Params, rules: Rules) -> tuple[int, int]:
     """Which of the first bag is dealt first after the previews, and where a new bag begins.
 
-    By default that is the next one, and the end of the bag. The reference begins further on, and counts seven pieces
-    from there, so that with two or three previews some pieces of the first bag are left out and others come twice.
+    By default that is the next one, and the end of the bag. The reference begins further on, and
+    counts seven pieces from there, so that with two or three previews some pieces of the first bag
+    are left out and others come twice.
     """
     if rules == "default":
         return level.previews + 1, 0
@@ -76,7 +77,8 @@ def deal_order(level: Params, rules: Rules) -> tuple[int, int]:
 def reset(key: Array, level: Params, rules: Rules) -> TetrisState:
     """An empty board and a shuffled bag, whose first piece is at the top."""
     bag = shuffled(key)
-    zero, no = jnp.int32(0), jnp.bool_(False)
+    zero = jnp.int32(0)
+    no = jnp.bool_(False)
     return TetrisState(
         board=jnp.zeros((ROWS, COLUMNS), jnp.int8),
         piece=bag[0],
@@ -101,7 +103,8 @@ def complete_rows(board: Array) -> Array:
 
 def covers(state: TetrisState) -> Array:
     """The cells of the board that the piece covers: bool [20, 10]."""
-    row, column = jnp.arange(ROWS)[:, None] - state.py, jnp.arange(COLUMNS) - state.px
+    row = jnp.arange(ROWS)[:, None] - state.py
+    column = jnp.arange(COLUMNS) - state.px
     in_box = (row >= 0) & (row < BOX) & (column >= 0) & (column < BOX)
     bit = jnp.where(in_box, BOX * row + column, 0)
     return in_box & ((jnp.asarray(_MASKS)[state.piece, state.rot] >> bit) & 1 == 1)
@@ -122,13 +125,14 @@ def box_of_bits(piece: Array, rot: Array, px: Array) -> Array:
 def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
     """Remove the complete rows of a board on which a piece has just come to lie.
 
-    Rows above fall straight down. Each line pays 0.1, by default up to the goal alone: the reference pays the whole of
-    a clear that goes beyond it.
+    Rows above fall straight down. Each line pays 0.1, by default up to the goal alone: the
+    reference pays the whole of a clear that goes beyond it.
 
     Returns:
         The state with board and lines renewed, and the reward.
     """
-    board, row = state.board, jnp.arange(ROWS)
+    board = state.board
+    row = jnp.arange(ROWS)
     full = complete_rows(board) & state.just_locked
     for _ in range(BOX):  # a piece completes four rows at most; the topmost goes first
         top = jnp.min(jnp.where(full, row, ROWS))
@@ -143,7 +147,9 @@ def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
 
 
 def spawn(key: Array, state: TetrisState, level: Params, rules: Rules) -> TetrisState:
-    """Bring the next piece where one has just come to lie; the last preview is dealt from the bag."""
+    """Bring the next piece where one has just come to lie; the last preview is dealt from the
+    bag.
+    """
     dealt = state.bag[state.bag_index]
     index = (state.bag_index + 1) % PIECES
     bag = jnp.where(index == deal_order(level, rules)[1], shuffled(key), state.bag)
@@ -158,22 +164,29 @@ def spawn(key: Array, state: TetrisState, level: Params, rules: Rules) -> Tetris
         just_locked=jnp.zeros_like(state.just_locked),
         frames_since_spawn=jnp.zeros_like(state.frames_since_spawn),
     )
-    return TetrisState(*(jnp.where(state.just_locked, yes, no) for yes, no in zip(fresh, state, strict=True)))
+    return TetrisState(
+        *(jnp.where(state.just_locked, yes, no) for yes, no in zip(fresh, state, strict=True))
+    )
 
 
 def steer(state: TetrisState, action: Array, window: Array) -> TetrisState:
-    """Turn or shift the piece, unless something is in the way; a turn that is blocked is not tried elsewhere."""
+    """Turn or shift the piece, unless something is in the way; a turn that is blocked is not tried
+    elsewhere.
+    """
     rot = (state.rot + (action == UP)) % ROTATIONS
     px = state.px + (action == RIGHT).astype(jnp.int32) - (action == LEFT)
     free = (window[:BOX] & box_of_bits(state.piece, rot, px) == 0).all()
     return state._replace(rot=jnp.where(free, rot, state.rot), px=jnp.where(free, px, state.px))
 
 
-def fall(state: TetrisState, action: Array, window: Array, level: Params, rules: Rules) -> TetrisState:
+def fall(
+    state: TetrisState, action: Array, window: Array, level: Params, rules: Rules
+) -> TetrisState:
     """Let the piece go down, and lock it where it cannot go one further.
 
-    A soft drop replaces gravity; at the step of the spawn it goes down by one. What cannot go the whole way goes one
-    cell, if that is free. By default every cell on the way has to be free, in the reference the last one alone.
+    A soft drop replaces gravity; at the step of the spawn it goes down by one. What cannot go the
+    whole way goes one cell, if that is free. By default every cell on the way has to be free, in
+    the reference the last one alone.
     """
     box = box_of_bits(state.piece, state.rot, state.px)
     free = jnp.stack([(window[down : down + BOX] & box == 0).all() for down in range(_DEPTH + 1)])
@@ -196,8 +209,9 @@ def step(
 ) -> tuple[TetrisState, Array, Array, Array]:
     """Clear rows and bring the next piece where one lies, then act on the piece, then let it fall.
 
-    Ends with ten lines, or when a new piece overlaps the pile, which costs 1 (not if the goal is reached at that very
-    step; in the reference not at the time limit either). Cut at the time limit.
+    Ends with ten lines, or when a new piece overlaps the pile, which costs 1 (not if the goal is
+    reached at that very step; in the reference not at the time limit either). Cut at the time
+    limit.
     """
     cleared, reward = clear_rows(state, rules)
     new = spawn(key, cleared, level, rules)
@@ -209,6 +223,7 @@ def step(
     new = fall(new, action, window, level, rules)
     age = jnp.minimum(new.frames_since_spawn + 1, MAX_AGE)
     new = new._replace(terminal=terminal, frames_since_spawn=age, time=state.time + 1)
-    won, time_limit = new.lines >= GOAL, new.time >= MAX_STEPS
+    won = new.lines >= GOAL
+    time_limit = new.time >= MAX_STEPS
     lost = terminal & ~won if rules == "default" else terminal & ~won & ~time_limit
     return new, reward + jnp.where(lost, TOP_OUT_REWARD, 0.0), terminal | won, time_limit

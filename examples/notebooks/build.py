@@ -1,7 +1,9 @@
-"""Make the notebooks: run the sources beside this file and write each as ``.ipynb`` with what it printed and drew.
+"""Make the notebooks: run the sources beside this file and write each as ``.ipynb`` with what it
+printed and drew.
 
-A source is a Python file in the percent format: its docstring is the first cell, ``# %%`` opens a code cell, and
-``# %% [markdown]`` a text cell written as comments. Edit the sources, not the notebooks, then:
+A source is a Python file in the percent format: its docstring is the first cell, ``# %%`` opens a
+code cell, and ``# %% [markdown]`` a text cell written as comments. Edit the sources, not the
+notebooks, then:
 
     python examples/notebooks/build.py                 # all
     python examples/notebooks/build.py saliency        # one
@@ -51,7 +53,9 @@ def read_cells(path: Path) -> list[Cell]:
     return cells
 
 
-def run_cells(cells: list[Cell], frames: int | None = None) -> tuple[dict[str, Any], list[list[dict[str, Any]]]]:
+def run_cells(
+    cells: list[Cell], frames: int | None = None
+) -> tuple[dict[str, Any], list[list[dict[str, Any]]]]:
     """Run the code cells one after the other in one namespace.
 
     Args:
@@ -59,7 +63,8 @@ def run_cells(cells: list[Cell], frames: int | None = None) -> tuple[dict[str, A
         frames: another value for the line ``FRAMES = ...``.
 
     Returns:
-        The namespace, and for every cell its outputs: what it printed and the figures it drew, as a notebook has them.
+        The namespace, and for every cell its outputs: what it printed and the figures it drew, as a
+        notebook has them.
     """
     os.environ["MPLBACKEND"] = "agg"
     import matplotlib.pyplot as plt
@@ -69,7 +74,11 @@ def run_cells(cells: list[Cell], frames: int | None = None) -> tuple[dict[str, A
     for number, cell in enumerate(cells):
         found: list[dict[str, Any]] = []
         if cell.kind == "code":
-            text = cell.text if frames is None else re.sub(r"(?m)^FRAMES = [\d_]+", f"FRAMES = {frames}", cell.text)
+            text = (
+                cell.text
+                if frames is None
+                else re.sub(r"(?m)^FRAMES = [\d_]+", f"FRAMES = {frames}", cell.text)
+            )
             with contextlib.redirect_stdout(io.StringIO()) as printed:
                 exec(compile(text, f"<cell {number}>", "exec"), namespace)
             if printed.getvalue():
@@ -95,10 +104,18 @@ def notebook(cells: list[Cell], outputs: list[list[dict[str, Any]]]) -> str:
         entry = {"cell_type": cell.kind, "id": f"cell-{number}", "metadata": {}}
         entry["source"] = cell.text.splitlines(keepends=True)
         if cell.kind == "code":
-            entry |= {"execution_count": sum(c.kind == "code" for c in cells[: number + 1]), "outputs": found}
+            entry |= {
+                "execution_count": sum(c.kind == "code" for c in cells[: number + 1]),
+                "outputs": found,
+            }
         made.append(entry)
     metadata = {"kernelspec": KERNEL, "language_info": {"name": "python"}}
-    return json.dumps({"cells": made, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}, indent=1) + "\n"
+    return (
+        json.dumps(
+            {"cells": made, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}, indent=1
+        )
+        + "\n"
+    )
 
 
 def main(names: list[str]) -> int:

@@ -1,10 +1,10 @@
 """# A memory of your own, under the lens
 
-Any `torch.nn.Module` with `forward` and `initial_state` can be the memory of an agent. We write one whose behaviour is
-known, train an agent with it, and see whether the lens shows what we built.
+Any `torch.nn.Module` with `forward` and `initial_state` can be the memory of an agent. We write one
+whose behaviour is known, train an agent with it, and see whether the lens shows what we built.
 
-Ours remembers exactly two things: the first frame of the episode, and the present one. That is all that Signpost asks
-for: its sign is shown in the first frame alone.
+Ours remembers exactly two things: the first frame of the episode, and the present one. That is all
+that Signpost asks for: its sign is shown in the first frame alone.
 
 This takes about half a minute on one core.
 """
@@ -54,9 +54,10 @@ class FirstAndNow(nn.Module):
 
 
 # %% [markdown]
-# `check_memory` holds it against the laws of a memory: chunks equal single steps, nothing crosses a start, neither
-# values nor gradients, and so on. It raises if one is broken, and returns the largest discrepancy of each. (Leave out
-# `empty` above and see: a first step must be the same with its flag and without.)
+# `check_memory` holds it against the laws of a memory: chunks equal single steps, nothing crosses a
+# start, neither values nor gradients, and so on. It raises if one is broken, and returns the
+# largest discrepancy of each. (Leave out `empty` above and see: a first step must be the same with
+# its flag and without.)
 
 # %%
 for law, discrepancy in check_memory(FirstAndNow(4, 8)).items():
@@ -77,7 +78,10 @@ config = preset(
 )
 result = train(config, Path(scratch.name) / "run")
 agent = load(result.run_dir)
-print(f"return {result.evaluation.mean:.2f} in greedy episodes; without memory 0.25 is the most one can expect")
+print(
+    f"return {result.evaluation.mean:.2f} in greedy episodes; without memory 0.25 is the most one "
+    "can expect"
+)
 
 # %%
 density = recall_density(agent, episodes=64)
@@ -89,7 +93,9 @@ axis.set_ylabel("share of the gradient")
 print(" ".join(f"{share:.1%}" for share in shares))
 
 # %% [markdown]
-# Mass on the first and on the last frame, and nothing in between: not little, but zero, because no gradient can get
-# there. This is a good first check of a memory of your own: does it look back as you meant it to?
+# Mass on the first and on the last frame, and nothing in between: not little, but zero, because no
+# gradient can get there. This is a good first check of a memory of your own: does it look back as
+# you meant it to?
 #
-# `examples/own_memory.py` brings in `torch.nn.LSTM` the same way, with `arcade-torch train --import FILE`.
+# `examples/own_memory.py` brings in `torch.nn.LSTM` the same way, with `arcade-torch train --import
+# FILE`.

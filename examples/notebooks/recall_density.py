@@ -1,10 +1,11 @@
 """# How far back do decisions reach?
 
-A saliency map shows one decision. *Recall density* is the same over many episodes, without the pixels: for each
-episode, how is the gradient of the last decision spread over its frames?
+A saliency map shows one decision. *Recall density* is the same over many episodes, without the
+pixels: for each episode, how is the gradient of the last decision spread over its frames?
 
-We look at Signpost, where the answer is known. On the POMDP twin the sign is shown in the first frame alone, so an
-agent that succeeds must have brought it from there. On the MDP twin it stays in view, and nothing has to be remembered.
+We look at Signpost, where the answer is known. On the POMDP twin the sign is shown in the first
+frame alone, so an agent that succeeds must have brought it from there. On the MDP twin it stays in
+view, and nothing has to be remembered.
 
 This takes one to two minutes on one core.
 """
@@ -23,19 +24,29 @@ FRAMES = 80_000  # of training, for each agent
 scratch = TemporaryDirectory()  # the runs go here; name a folder to keep them
 
 # %%
-AGENTS = {"LRU, POMDP": ("lru", "partial"), "LRU, MDP": ("lru", "full"), "no memory, POMDP": ("mlp", "partial")}
+AGENTS = {
+    "LRU, POMDP": ("lru", "partial"),
+    "LRU, MDP": ("lru", "full"),
+    "no memory, POMDP": ("mlp", "partial"),
+}
 agents = {}
 for name, (memory, twin) in AGENTS.items():
-    what = {"env": "SignpostEasy", "observability": twin, "memory": memory, "total_frames": FRAMES, "eval_every": 0}
+    what = {
+        "env": "SignpostEasy",
+        "observability": twin,
+        "memory": memory,
+        "total_frames": FRAMES,
+        "eval_every": 0,
+    }
     config = preset("small", algorithm="pqn", **what)
     result = train(config, Path(scratch.name) / f"{memory}-{twin}")
     agents[name] = load(result.run_dir)
     print(f"{name:18} return {result.evaluation.mean:5.2f} in greedy episodes")
 
 # %% [markdown]
-# With $g_t = \sum_a \lVert \partial Q(s_n, a) / \partial o_t \rVert_1$, the density of an episode is
-# $\delta_t = g_t / \sum_i g_i$: shares that sum to 1. `recall_density` plays greedy episodes on held-out seeds and
-# keeps the shares of each.
+# With $g_t = \sum_a \lVert \partial Q(s_n, a) / \partial o_t \rVert_1$, the density of an episode
+# is $\delta_t = g_t / \sum_i g_i$: shares that sum to 1. `recall_density` plays greedy episodes on
+# held-out seeds and keeps the shares of each.
 
 # %%
 found = {name: recall_density(agent, episodes=64) for name, agent in agents.items()}
@@ -44,7 +55,8 @@ for name, density in found.items():
     print(f"{name:18} {len(density.shares)} episodes of {lengths[0]} to {lengths[-1]} frames")
 
 # %% [markdown]
-# Episodes have different lengths in most games, so time is cut into parts of each episode's own length. Here are five.
+# Episodes have different lengths in most games, so time is cut into parts of each episode's own
+# length. Here are five.
 
 # %%
 BINS = 5
@@ -60,15 +72,20 @@ for name, density in found.items():
 
 # %% [markdown]
 # * Without memory everything stands in the last part: a law, not a finding.
-# * With memory on the POMDP about half of the gradient lies on the past; on the MDP, where the sign is still in view,
-#   an eighth. The frame with the sign does not stand out from the empty corridor behind it: what the state carries
+# * With memory on the POMDP about half of the gradient lies on the past; on the MDP, where the sign
+# is still in view,
+#   an eighth. The frame with the sign does not stand out from the empty corridor behind it: what
+# the state carries
 #   along is as sensitive to the frames on the way.
-# * The dotted line is a memory that treats all frames alike. The last frame is always above it, because the network has
+# * The dotted line is a memory that treats all frames alike. The last frame is always above it,
+# because the network has
 #   a way past the memory, and because the gate is seen there.
-# * On the MDP a gradient on the past is not needed. What is there is what the memory mixes in all the same: see
+# * On the MDP a gradient on the past is not needed. What is there is what the memory mixes in all
+# the same: see
 #   `contamination.ipynb`.
 #
-# Two cautions. A gradient is what a *small* change would do: a sign that decides everything can have a small one. And
-# the last action is an input too, but no pixel, so what is remembered through it does not show here.
+# Two cautions. A gradient is what a *small* change would do: a sign that decides everything can
+# have a small one. And the last action is an input too, but no pixel, so what is remembered through
+# it does not show here.
 #
 # For whole studies: `arcade-torch analyze recall-density STUDY` (or run folders).

@@ -1,10 +1,11 @@
 """# Which pixels did the decision look at?
 
-Signpost is a corridor with a sign and a gate. The sign shows one of four arrows; at the gate the agent has to answer
-with it. On the **POMDP** twin the sign is shown in the first frame alone, on the **MDP** twin it stays in view.
+Signpost is a corridor with a sign and a gate. The sign shows one of four arrows; at the gate the
+agent has to answer with it. On the **POMDP** twin the sign is shown in the first frame alone, on
+the **MDP** twin it stays in view.
 
-We train three agents: with a memory (LRU) on each twin, and without any on the POMDP. Then we ask each of them, at the
-gate, which pixels of which past frame its action values depend on.
+We train three agents: with a memory (LRU) on each twin, and without any on the POMDP. Then we ask
+each of them, at the gate, which pixels of which past frame its action values depend on.
 
 This takes one to two minutes on one core.
 """
@@ -24,20 +25,31 @@ FRAMES = 80_000  # of training, for each agent
 scratch = TemporaryDirectory()  # the runs go here; name a folder to keep them
 
 # %%
-AGENTS = {"LRU, POMDP": ("lru", "partial"), "no memory, POMDP": ("mlp", "partial"), "LRU, MDP": ("lru", "full")}
+AGENTS = {
+    "LRU, POMDP": ("lru", "partial"),
+    "no memory, POMDP": ("mlp", "partial"),
+    "LRU, MDP": ("lru", "full"),
+}
 agents = {}
 for name, (memory, twin) in AGENTS.items():
-    what = {"env": "SignpostEasy", "observability": twin, "memory": memory, "total_frames": FRAMES, "eval_every": 0}
+    what = {
+        "env": "SignpostEasy",
+        "observability": twin,
+        "memory": memory,
+        "total_frames": FRAMES,
+        "eval_every": 0,
+    }
     config = preset("small", algorithm="pqn", **what)
     result = train(config, Path(scratch.name) / f"{memory}-{twin}")
     agents[name] = load(result.run_dir)
     print(f"{name:18} return {result.evaluation.mean:5.2f} in greedy episodes")
 
 # %% [markdown]
-# A return of 1 means: the right answer every time, without stumbling. Without memory nobody can expect more than 0.25.
+# A return of 1 means: the right answer every time, without stumbling. Without memory nobody can
+# expect more than 0.25.
 #
-# Each agent now plays one greedy episode. `saliency` differentiates every action value at the last decision by every
-# pixel of every frame before it, squares, and sums over actions and colours:
+# Each agent now plays one greedy episode. `saliency` differentiates every action value at the last
+# decision by every pixel of every frame before it, squares, and sums over actions and colours:
 #
 # $$S_t[y, x] = \sum_a \sum_c \left(\frac{\partial Q(s_n, a)}{\partial o_t[y, x, c]}\right)^2$$
 
@@ -52,9 +64,9 @@ for name, agent in agents.items():
 figure = saliency_figure(rows)
 
 # %% [markdown]
-# Bright is what the decision depends on; each row has its own scale. Look at the first column. The agent with memory
-# on the POMDP has heat there, on the arrow of the sign, although it sees the gate now. The agent without memory is dark
-# everywhere but in the last frame: nothing else can reach it.
+# Bright is what the decision depends on; each row has its own scale. Look at the first column. The
+# agent with memory on the POMDP has heat there, on the arrow of the sign, although it sees the gate
+# now. The agent without memory is dark everywhere but in the last frame: nothing else can reach it.
 #
 # The same as numbers, one bar a frame:
 
@@ -70,5 +82,5 @@ for name, share in shares.items():
     print(f"{name:18} first frame {share[0]:6.1%}, last frame {share[-1]:6.1%}")
 
 # %% [markdown]
-# One episode is an example, not a result: `recall_density.ipynb` averages over many. From the command line, on any
-# run: `arcade-torch analyze saliency RUN`.
+# One episode is an example, not a result: `recall_density.ipynb` averages over many. From the
+# command line, on any run: `arcade-torch analyze saliency RUN`.

@@ -1,8 +1,8 @@
 """# In a TorchRL pipeline
 
-The games are TorchRL environments and the memories are TensorDict modules, so everything of TorchRL works on them. We
-look at what comes out of the environment, put a memory between stock parts, train with TorchRL's PPO loss, and hand the
-result to the analyses of this package.
+The games are TorchRL environments and the memories are TensorDict modules, so everything of TorchRL
+works on them. We look at what comes out of the environment, put a memory between stock parts, train
+with TorchRL's PPO loss, and hand the result to the analyses of this package.
 
 This takes about a minute on one core.
 """
@@ -12,7 +12,12 @@ import matplotlib.pyplot as plt
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.modules import ActorValueOperator, ProbabilisticActor, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    ActorValueOperator,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -24,7 +29,8 @@ FRAMES = 40_000  # of training
 torch.manual_seed(0)
 
 # %% [markdown]
-# 64 games run side by side, drawn by JAX, seen by torch without a copy. `is_init` says where episodes begin.
+# 64 games run side by side, drawn by JAX, seen by torch without a copy. `is_init` says where
+# episodes begin.
 
 # %%
 env = arcade_torch.make("SignpostEasy", num_envs=64, observability="partial", seed=0)
@@ -37,8 +43,8 @@ for picture, axis in zip(first["pixels"], axes, strict=False):
     axis.set_axis_off()
 
 # %% [markdown]
-# Encoder, memory, heads. `MemoryModule` keeps the recurrent state in the tensordict and asks the collector for a
-# primer, as TorchRL's `LSTMModule` does. Another memory is another name.
+# Encoder, memory, heads. `MemoryModule` keeps the recurrent state in the tensordict and asks the
+# collector for a primer, as TorchRL's `LSTMModule` does. Another memory is another name.
 
 # %%
 WIDTH = 128
@@ -57,20 +63,25 @@ agent = ActorValueOperator(body, actor, ValueOperator(nn.Linear(WIDTH, 1), in_ke
 policy, critic = agent.get_policy_operator(), agent.get_value_operator()
 
 # %% [markdown]
-# Whatever reads a window of steps runs in recurrent mode: advantages, and the loss. The windows here are cut into
-# minibatches of whole environments, never of single steps, so that memory and experience stay together.
+# Whatever reads a window of steps runs in recurrent mode: advantages, and the loss. The windows
+# here are cut into minibatches of whole environments, never of single steps, so that memory and
+# experience stay together.
 
 # %%
 loss = ClipPPOLoss(policy, critic, entropy_coeff=0.01, critic_coeff=0.5)
 gae = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)
 optimizer = torch.optim.Adam(loss.parameters(), lr=5e-4)
 slower = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, total_iters=-(-FRAMES // 1280))
-collector = arcade_torch.ArcadeCollector(env, policy, 64 * 20, FRAMES, compress=encoder.compress, seed=0)
+collector = arcade_torch.ArcadeCollector(
+    env, policy, 64 * 20, FRAMES, compress=encoder.compress, seed=0
+)
 returns = []
 for window in collector:
     for _ in range(4):
         with set_recurrent_mode(True):
-            batch = gae(window.exclude("state_value", ("next", "state_value"), "advantage", "value_target"))
+            batch = gae(
+                window.exclude("state_value", ("next", "state_value"), "advantage", "value_target")
+            )
             for part in batch[torch.randperm(64)].split(16):
                 losses = loss(part)
                 optimizer.zero_grad()
@@ -79,13 +90,17 @@ for window in collector:
                 optimizer.step()
     slower.step()
     returns.append(float(window["next", "episode_reward"][window["next", "done"]].mean()))
-print(f"return of the last window {returns[-1]:.2f}; forgetting the sign, 0.25 is the most one can expect")
+print(
+    f"return of the last window {returns[-1]:.2f}; forgetting the sign, 0.25 is the most one can "
+    "expect"
+)
 
 # %% [markdown]
 # PPO samples its actions, so the returns here include exploration.
 #
-# The analyses ask for two functions: `encode` looks at single frames, `remember` is everything behind it. `read` says
-# what the outputs mean; here they are logits, and recall density differentiates the probabilities.
+# The analyses ask for two functions: `encode` looks at single frames, `remember` is everything
+# behind it. `read` says what the outputs mean; here they are logits, and recall density
+# differentiates the probabilities.
 
 # %%
 lens = Policy(
@@ -97,7 +112,9 @@ lens = Policy(
     initial_state=memory.initial_state,
     offers=("logits", "probs"),
 )
-density = recall_density(lens, arcade_torch.make("SignpostEasy", num_envs=16, observability="partial"), episodes=64)
+density = recall_density(
+    lens, arcade_torch.make("SignpostEasy", num_envs=16, observability="partial"), episodes=64
+)
 figure, axes = plt.subplots(1, 2, figsize=(8, 2.8), layout="constrained")
 axes[0].plot([1280 * (i + 1) for i in range(len(returns))], returns)
 axes[0].set(xlabel="frames", ylabel="return, exploration included")
@@ -107,5 +124,6 @@ axes[1].set_ylabel("share of the gradient")
 print(" ".join(f"{share:.1%}" for share in density.mass(5)))
 
 # %% [markdown]
-# `examples/torchrl_ppo_trainer.py` does the same through TorchRL's `PPOTrainer`, `examples/a2c_loop.py` with TorchRL's
-# own collector, and both print the one number that says whether the memory is replayed as it was lived.
+# `examples/torchrl_ppo_trainer.py` does the same through TorchRL's `PPOTrainer`,
+# `examples/a2c_loop.py` with TorchRL's own collector, and both print the one number that says
+# whether the memory is replayed as it was lived.

@@ -1,5 +1,5 @@
-"""What tests of losses share: toy recurrent networks, fabricated experience whose true next frames are known, and slow
-oracles that know nothing of windows.
+"""What tests of losses share: toy recurrent networks, fabricated experience whose true next frames
+are known, and slow oracles that know nothing of windows.
 """
 
 from dataclasses import dataclass, replace
@@ -63,12 +63,16 @@ def toy_network(seed: int = 0, outputs: int = ACTIONS, **keys) -> MemoryNetwork:
 def toy_actor_critic(seed: int = 0) -> ActorCriticNetwork:
     """Two toys behind the interface of an actor-critic."""
     actor = toy_network(seed, out_key="logits", state_key=("memory", "actor"))
-    return ActorCriticNetwork(actor, toy_network(seed + 1, 1, out_key="state_value", state_key=("memory", "critic")))
+    return ActorCriticNetwork(
+        actor, toy_network(seed + 1, 1, out_key="state_value", state_key=("memory", "critic"))
+    )
 
 
 @dataclass
 class Stream:
-    """Random experience; ``final`` is the true next frame of every step. A seam is a start without an end before it."""
+    """Random experience; ``final`` is the true next frame of every step. A seam is a start without
+    an end before it.
+    """
 
     pixels: Tensor
     final: Tensor
@@ -87,24 +91,37 @@ class Stream:
         return (self.truncated | seam) & ~self.terminated
 
     def sequences(self, final_frames: str = "truncated") -> TensorDict:
-        """As ``ArcadeCollector.collect()`` gives it, one place more than needed: unused ones hold white frames."""
+        """As ``ArcadeCollector.collect()`` gives it, one place more than needed: unused ones hold
+        white frames.
+        """
         rows, steps = self.action.shape
         batch = TensorDict(self._entries(), [rows])
         batch["initial_state"] = self.state
         if final_frames == "all":
             return batch.set(("next", "pixels"), self.final)
         wanted = self.cut.clone() if final_frames == "truncated" else torch.zeros_like(self.cut)
-        wanted[:, -1] = ~self.terminated[:, -1] & ((final_frames == "truncated") | ~self.truncated[:, -1])
+        wanted[:, -1] = ~self.terminated[:, -1] & (
+            (final_frames == "truncated") | ~self.truncated[:, -1]
+        )
         places = int(wanted.sum(1).max()) + 1
         frames = torch.full((rows, places, *self.final.shape[2:]), 255, dtype=torch.uint8)
-        index, mask = torch.full((rows, places), steps - 1), torch.zeros(rows, places, dtype=torch.bool)
+        index, mask = (
+            torch.full((rows, places), steps - 1),
+            torch.zeros(rows, places, dtype=torch.bool),
+        )
         for row in range(rows):
             at = wanted[row].nonzero().flatten()
-            frames[row, : len(at)], index[row, : len(at)], mask[row, : len(at)] = self.final[row, at], at, True
+            frames[row, : len(at)], index[row, : len(at)], mask[row, : len(at)] = (
+                self.final[row, at],
+                at,
+                True,
+            )
         return batch.update({"final_pixels": frames, "final_index": index, "final_mask": mask})
 
     def stock(self) -> TensorDict:
-        """As a TorchRL collector gives it: dense next frames; the state of a step, of which only the first counts."""
+        """As a TorchRL collector gives it: dense next frames; the state of a step, of which only
+        the first counts.
+        """
         batch = TensorDict(self._entries(), self.action.shape)
         batch["next"].update({"pixels": self.final, "last_action": self.action})
         for key, first in self.state.items(True, True):
@@ -115,8 +132,14 @@ class Stream:
         return batch
 
     def _entries(self) -> dict:
-        flags = {"terminated": self.terminated, "truncated": self.truncated, "done": self.terminated | self.truncated}
-        after = {key: value.unsqueeze(-1) for key, value in (flags | {"reward": self.reward}).items()}
+        flags = {
+            "terminated": self.terminated,
+            "truncated": self.truncated,
+            "done": self.terminated | self.truncated,
+        }
+        after = {
+            key: value.unsqueeze(-1) for key, value in (flags | {"reward": self.reward}).items()
+        }
         roots = {"pixels": self.pixels, "action": self.action, "last_action": self.last_action}
         return roots | {"is_init": self.is_init.unsqueeze(-1), "next": after}
 
@@ -124,7 +147,9 @@ class Stream:
 def stream(rows: int, steps: int, seed: int, ends: float = 0.3, seams: float = 0.0) -> Stream:
     """A random stream that starts in mid-episode in some rows."""
     g = torch.Generator().manual_seed(seed)
-    frames, final = (torch.randint(256, (rows, steps, 2, 2, 3), generator=g, dtype=torch.uint8) for _ in range(2))
+    frames, final = (
+        torch.randint(256, (rows, steps, 2, 2, 3), generator=g, dtype=torch.uint8) for _ in range(2)
+    )
     action = torch.randint(ACTIONS, (rows, steps), generator=g)
     terminated, truncated = (torch.rand(rows, steps, generator=g) < ends / 2 for _ in range(2))
     over = terminated | truncated | (torch.rand(rows, steps, generator=g) < seams)
@@ -153,7 +178,9 @@ def with_two_states(s: Stream) -> Stream:
 
 @torch.no_grad()
 def play(network: MemoryNetwork, s: Stream) -> tuple[Tensor, Tensor]:
-    """One step of one row at a time: outputs for every observation and for every true next one, both [B, T, A]."""
+    """One step of one row at a time: outputs for every observation and for every true next one,
+    both [B, T, A].
+    """
     here, after = [], []
     for b in range(s.action.shape[0]):
         row = s.state[b : b + 1]
@@ -177,8 +204,12 @@ def chosen(out: Tensor, action: Tensor) -> Tensor:
     return out.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
-def lambda_return(reward: Tensor, after: Tensor, terminated: Tensor, cut: Tensor, gamma: float, lam: float) -> Tensor:
-    """G[t] as a mixture of n-step returns, (1 - lam) lam^(n - 1), the last with what is left: no recursion."""
+def lambda_return(
+    reward: Tensor, after: Tensor, terminated: Tensor, cut: Tensor, gamma: float, lam: float
+) -> Tensor:
+    """G[t] as a mixture of n-step returns, (1 - lam) lam^(n - 1), the last with what is left: no
+    recursion.
+    """
     out = torch.zeros_like(reward)
     for b in range(reward.shape[0]):
         r, v, ends, cuts = (x[b].tolist() for x in (reward, after, terminated, cut))
@@ -197,9 +228,17 @@ def lambda_return(reward: Tensor, after: Tensor, terminated: Tensor, cut: Tensor
 
 
 def summed_errors(
-    reward: Tensor, value: Tensor, after: Tensor, terminated: Tensor, cut: Tensor, gamma: float, lam: float
+    reward: Tensor,
+    value: Tensor,
+    after: Tensor,
+    terminated: Tensor,
+    cut: Tensor,
+    gamma: float,
+    lam: float,
 ) -> Tensor:
-    """The generalised advantage estimate as the sum over future errors, written out for every step."""
+    """The generalised advantage estimate as the sum over future errors, written out for every
+    step.
+    """
     out = torch.zeros_like(reward)
     for b in range(reward.shape[0]):
         r, v, w, ends, cuts = (x[b].tolist() for x in (reward, value, after, terminated, cut))

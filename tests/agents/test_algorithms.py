@@ -1,4 +1,6 @@
-"""Every algorithm in its trainer: acting is learning, updates work, a saved moment goes on to the bit."""
+"""Every algorithm in its trainer: acting is learning, updates work, a saved moment goes on to the
+bit.
+"""
 
 import io
 import math
@@ -9,7 +11,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import DQNLoss, NonFiniteError, PPOLoss, PQNLoss, Trainer, averaging, make_actor, preset
+from arcade_torch.agents import (
+    DQNLoss,
+    NonFiniteError,
+    PPOLoss,
+    PQNLoss,
+    Trainer,
+    averaging,
+    make_actor,
+    preset,
+)
 from arcade_torch.agents.config import GROUPS
 from arcade_torch.agents.learner import Training
 from arcade_torch.agents.runs.checkpoint import Checkpoint
@@ -29,7 +40,13 @@ from tests.agents.fakes import (
 
 MEMORIES = [*memory_names(), "feedforward"]
 ENVS, STEPS = 4, 12
-NUMBERS = {"num_envs": ENVS, "num_steps": STEPS, "minibatches": 2, "warmup_steps": STEPS, "epochs": 1}
+NUMBERS = {
+    "num_envs": ENVS,
+    "num_steps": STEPS,
+    "minibatches": 2,
+    "warmup_steps": STEPS,
+    "epochs": 1,
+}
 REPLAY = {"replay_frames": 150, "batch_sequences": 4, "learning_starts": 4, "target_every": 2}
 MORE = {"pqn": {"overlap": 2}, "ppo": {}, "dqn": REPLAY}
 TIMES = ("seconds", "fps")
@@ -39,8 +56,14 @@ algorithms = pytest.mark.parametrize("algorithm", GROUPS)
 def config(algorithm, memory="gru", env="CartPoleEasy", **changes):
     numbers = NUMBERS | MORE[algorithm] | changes.pop(algorithm, {})
     options = {"hidden_size": 16, "feedforward_size": 16}
-    changes = {"total_frames": 10 * ENVS * STEPS, "observability": "partial", "network_options": options} | changes
-    return preset("smoke", algorithm=algorithm, memory=memory, env=env, **changes, **{algorithm: numbers})
+    changes = {
+        "total_frames": 10 * ENVS * STEPS,
+        "observability": "partial",
+        "network_options": options,
+    } | changes
+    return preset(
+        "smoke", algorithm=algorithm, memory=memory, env=env, **changes, **{algorithm: numbers}
+    )
 
 
 def saved(trainer):
@@ -57,7 +80,9 @@ def without_times(row):
 
 
 def assert_replays(loss, batch):
-    """What the loss computes from the stored window is what was acted, before the first gradient step."""
+    """What the loss computes from the stored window is what was acted, before the first gradient
+    step.
+    """
     if "action_log_prob" in batch:
         found = loss(loss.value_estimator(batch.clone()))
         assert found["clip_fraction"] == 0 and float(found["kl_approx"]) < 1e-9
@@ -68,13 +93,16 @@ def assert_replays(loss, batch):
 
 
 @pytest.mark.parametrize(
-    ("memory", "average_share"), [("attention", 0.0), ("gdn", 0.0), ("feedforward", 0.0), ("gru", 0.5)]
+    ("memory", "average_share"),
+    [("attention", 0.0), ("gdn", 0.0), ("feedforward", 0.0), ("gru", 0.5)],
 )
 @algorithms
 def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
     algorithm, memory, average_share, monkeypatch, tmp_path
 ):
-    greedy = {} if algorithm == "ppo" else {"epsilon_start": 0.0, "epsilon_end": 0.0, "warmup_steps": 0}
+    greedy = (
+        {} if algorithm == "ppo" else {"epsilon_start": 0.0, "epsilon_end": 0.0, "warmup_steps": 0}
+    )
     what = config(algorithm, memory, **{algorithm: greedy | {"average_share": average_share}})
     trainer, ends = Trainer(what, tmp_path), []
     trainer.warm_up()
@@ -92,7 +120,9 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
     moment, draws = saved(trainer), torch.get_rng_state()
     rows = [trainer.update() for _ in range(3)]
     assert any(ends), "a window must hold an episode's end"
-    torch.set_rng_state(torch.Generator().manual_seed(5).get_state())  # which is part of what is saved
+    torch.set_rng_state(
+        torch.Generator().manual_seed(5).get_state()
+    )  # which is part of what is saved
     again = Trainer(what, tmp_path)
     again.load(moment)
     assert torch.equal(torch.get_rng_state(), draws)
@@ -104,14 +134,25 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
 
 
 @algorithms
-def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(algorithm, monkeypatch, tmp_path):
+def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(
+    algorithm, monkeypatch, tmp_path
+):
     trainer = Trainer(config(algorithm, **{algorithm: {"average_share": 0.5}}), tmp_path)
     trainer.warm_up()
     wanted = {name: value.clone() for name, value in trainer.network.state_dict().items()}
-    assert all(torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items())
+    assert all(
+        torch.equal(value, wanted[name]) for name, value in trainer.acting.state_dict().items()
+    )
     monkeypatch.setattr(trainer.stats, "update", lambda *window: None)
     trainer.return_range = (0.0, 1.0)
-    for reached, newest in ((None, 1), (-1.0, 1), (0.5, 32 / 35), (1.0, 1 / 3), (7.0, 2 / 7)):  # shares of new weights
+    # Shares of new weights.
+    for reached, newest in (
+        (None, 1),
+        (-1.0, 1),
+        (0.5, 32 / 35),
+        (1.0, 1 / 3),
+        (7.0, 2 / 7),
+    ):
         trainer.stats.smooth = reached
         trainer.update()
         trained = trainer.network.state_dict()
@@ -148,7 +189,8 @@ def test_the_mean_goes_by_the_range_of_the_runs_own_game():
 @pytest.mark.parametrize("span", [(0.0, 0.0), (0.0, math.inf), (-math.inf, 1.0)])
 def test_a_mean_of_a_game_without_a_range_is_refused(span, monkeypatch):
     with pytest.raises(
-        ValueError, match=r"average_share goes by .* but MineEasy-v0 has return_range .* or set it to 0"
+        ValueError,
+        match=r"average_share goes by .* but MineEasy-v0 has return_range .* or set it to 0",
     ):
         averaging.check_return_range("MineEasy-v0", span)
 
@@ -159,7 +201,8 @@ def test_without_a_mean_the_same_weights_act_and_learn():
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "memory"), [*(("pqn", memory) for memory in MEMORIES), ("ppo", "gru"), ("dqn", "gru")]
+    ("algorithm", "memory"),
+    [*(("pqn", memory) for memory in MEMORIES), ("ppo", "gru"), ("dqn", "gru")],
 )
 def test_updates_of_another_game_are_finite_and_train_every_parameter(algorithm, memory):
     trainer = Trainer(config(algorithm, memory, "MineSweeperEasy"))
@@ -169,23 +212,40 @@ def test_updates_of_another_game_are_finite_and_train_every_parameter(algorithm,
         row = trainer.update()
     assert set(row) <= set(METRIC_COLUMNS)
     assert all(torch.tensor(float(value)).isfinite() for value in row.values() if value is not None)
-    still = [name for name, value in trainer.network.named_parameters() if torch.equal(value, before[name])]
+    still = [
+        name
+        for name, value in trainer.network.named_parameters()
+        if torch.equal(value, before[name])
+    ]
     assert not still
 
 
 UPDATE = {"num_envs": 4, "num_steps": 6, "epochs": 2, "minibatches": 2, "gamma": GAMMA, "lam": LAM}
-UPDATE |= {"learning_rate": 1e-2, "learning_rate_end": 1e-3, "lr_decay_fraction": 1.0, "max_grad_norm": 0.05}
+UPDATE |= {
+    "learning_rate": 1e-2,
+    "learning_rate_end": 1e-3,
+    "lr_decay_fraction": 1.0,
+    "max_grad_norm": 0.05,
+}
 UPDATE_OF = {
     "pqn": {"overlap": 1, "bootstrap": "last"},
     "ppo": {"clip": 0.1, "critic_coeff": 0.7, "entropy_coeff": 0.3, "entropy_end": 0.5},
-    "dqn": {"overlap": 0, "burn_in": 1, "batch_sequences": 4, "learning_starts": 4, "replay_frames": 24},
+    "dqn": {
+        "overlap": 0,
+        "burn_in": 1,
+        "batch_sequences": 4,
+        "learning_starts": 4,
+        "replay_frames": 24,
+    },
 }
 
 
 def written_out(algorithm, network, limits, burn_in=0):
     """The loss that an update should use, every number spelled out."""
     if algorithm == "ppo":
-        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=0.1, critic_coeff=0.7, **limits)
+        loss = PPOLoss(
+            make_actor(network.actor), network.critic, clip_epsilon=0.1, critic_coeff=0.7, **limits
+        )
     elif algorithm == "pqn":
         loss = PQNLoss(network, bootstrap="last", **limits)
     else:
@@ -195,26 +255,46 @@ def written_out(algorithm, network, limits, burn_in=0):
 
 
 @pytest.mark.parametrize("time_limit", ["bootstrap", "terminal"])
-@pytest.mark.parametrize(("algorithm", "targets"), [("pqn", ""), ("ppo", ""), ("dqn", "recompute"), ("dqn", "stored")])
-def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(algorithm, targets, time_limit):
-    """Rows in the order of the run's generator, fresh and clipped gradients, each step's own size, means of it all."""
+@pytest.mark.parametrize(
+    ("algorithm", "targets"), [("pqn", ""), ("ppo", ""), ("dqn", "recompute"), ("dqn", "stored")]
+)
+def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(
+    algorithm, targets, time_limit
+):
+    """Rows in the order of the run's generator, fresh and clipped gradients, each step's own size,
+    means of it all.
+    """
     limits, two = {"time_limit": time_limit}, algorithm == "ppo"
     numbers = UPDATE | UPDATE_OF[algorithm] | limits | ({"targets": targets} if targets else {})
-    s, (network, same) = stream(4, 6, seed=6), ((toy_actor_critic if two else toy_network)(3) for _ in range(2))
+    s, (network, same) = (
+        stream(4, 6, seed=6),
+        ((toy_actor_critic if two else toy_network)(3) for _ in range(2)),
+    )
     batch = (with_two_states(s) if two else s).sequences()
     if two:
         batch["action_log_prob"] = torch.full((4, 6), -1.6)
     training = Training(96, torch.Generator().manual_seed(3), torch.device("cpu"))
-    row = LEARNERS[algorithm](network, GROUPS[algorithm](**numbers), training).update(batch.clone(), 24)
+    row = LEARNERS[algorithm](network, GROUPS[algorithm](**numbers), training).update(
+        batch.clone(), 24
+    )
 
-    loss, generator = written_out(algorithm, same, limits, burn_in=1), torch.Generator().manual_seed(3)
-    optimizer = torch.optim.Adam(loss.parameters(), eps=1e-5) if two else torch.optim.RAdam(loss.parameters())
+    loss, generator = (
+        written_out(algorithm, same, limits, burn_in=1),
+        torch.Generator().manual_seed(3),
+    )
+    optimizer = (
+        torch.optim.Adam(loss.parameters(), eps=1e-5)
+        if two
+        else torch.optim.RAdam(loss.parameters())
+    )
     if targets:
         torch.randperm(4, generator=generator)  # the draw from the replay: all there is
     if targets == "stored":
         batch["stored_target"] = look_into(written_out("dqn", same, limits), batch)[1]
     data, steps = loss.value_estimator(batch) if two else batch, []
-    for k, rows in enumerate(rows for _ in range(2) for rows in torch.randperm(4, generator=generator).split(2)):
+    for k, rows in enumerate(
+        rows for _ in range(2) for rows in torch.randperm(4, generator=generator).split(2)
+    ):
         frames = 24 + 6 * k
         if two:
             loss.entropy_coeff.fill_(0.3 * 0.5 ** (frames / 96))
@@ -235,19 +315,30 @@ def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(algor
     wanted = {key: sum(step[key] for step in steps) / 4 for key in steps[0]}
     wanted["lr"] = 1e-2 + (1e-3 - 1e-2) * frames / 96
     if two:
-        wanted |= {"policy_loss": wanted["loss_objective"], "value_loss": wanted["loss_critic"] / 0.7}
+        wanted |= {
+            "policy_loss": wanted["loss_objective"],
+            "value_loss": wanted["loss_critic"] / 0.7,
+        }
         wanted |= {"kl": wanted["kl_approx"], "q_mean": float(data["state_value"].mean())}
         wanted["td_error"] = float(data["advantage"].abs().mean())
     assert {key: row[key] for key in wanted} == pytest.approx(wanted, rel=1e-3, abs=1e-6)
 
 
-def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is_counted_once(monkeypatch):
+def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is_counted_once(
+    monkeypatch,
+):
     trainer, seen = Trainer(config("pqn", pqn={"overlap": 6, "warmup_steps": STEPS + 7})), []
     collect = trainer.collector.collect
 
     def look(random=False):
         batch = collect(random=random)
-        seen.append((random, batch["pixels"][:, 6:].flatten(0, 1).clone(), int(batch["next", "done"][:, 6:].sum())))
+        seen.append(
+            (
+                random,
+                batch["pixels"][:, 6:].flatten(0, 1).clone(),
+                int(batch["next", "done"][:, 6:].sum()),
+            )
+        )
         return batch
 
     monkeypatch.setattr(trainer.collector, "collect", look)
@@ -258,7 +349,9 @@ def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is
     rows = [trainer.update() for _ in range(4)]
     assert rows[-1]["episodes"] == sum(ends for *_, ends in seen[2:]) > 0
     assert not any(random for random, *_ in seen[2:])
-    assert [float(explorer.eps) for explorer in trainer.explorers] == pytest.approx([rows[-1]["epsilon"]])
+    assert [float(explorer.eps) for explorer in trainer.explorers] == pytest.approx(
+        [rows[-1]["epsilon"]]
+    )
 
 
 @algorithms
@@ -278,7 +371,9 @@ def test_nan_is_found_in_the_update_in_which_it_appears(algorithm, what, monkeyp
 
         monkeypatch.setattr(trainer.collector, "collect", poisoned)
     words = "a reward is not finite" if what == "reward" else "nan"
-    with pytest.raises(NonFiniteError, match=rf"update 2 \(after {ENVS * STEPS} frames\): .*{words}"):
+    with pytest.raises(
+        NonFiniteError, match=rf"update 2 \(after {ENVS * STEPS} frames\): .*{words}"
+    ):
         trainer.update()
 
 
@@ -293,7 +388,9 @@ def test_weights_that_a_step_makes_infinite_are_named(algorithm, monkeypatch):
             trainer.learner.parameters[-1].data.view(-1)[0] = torch.inf
 
     monkeypatch.setattr(trainer.learner.optimizer, "step", explode)
-    with pytest.raises(NonFiniteError, match=r"update 1 \(after 0 frames\): the weights .* are not finite"):
+    with pytest.raises(
+        NonFiniteError, match=r"update 1 \(after 0 frames\): the weights .* are not finite"
+    ):
         trainer.update()
 
 
@@ -309,8 +406,16 @@ def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, tmp_path):
     numbers = {"overlap": 2, "learning_starts": 8, "target_every": 0, "targets": targets}
     trainer = Trainer(config("dqn", dqn=numbers), tmp_path)
     first, second = trainer.update(), trainer.update()
-    assert "loss" not in first and first["grad_steps"] == 0 and first["replay_frames"] == ENVS * (STEPS + 2)
-    assert second["loss"] > 0 and second["grad_steps"] == 2 and second["replay_frames"] == 2 * ENVS * (STEPS + 2)
+    assert (
+        "loss" not in first
+        and first["grad_steps"] == 0
+        and first["replay_frames"] == ENVS * (STEPS + 2)
+    )
+    assert (
+        second["loss"] > 0
+        and second["grad_steps"] == 2
+        and second["replay_frames"] == 2 * ENVS * (STEPS + 2)
+    )
     for _ in range(2):
         row = trainer.update()
     assert row["replay_frames"] == 2 * ENVS * (STEPS + 2)  # 150 frames hold two windows
@@ -321,7 +426,11 @@ def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, tmp_path):
 
 
 def test_stored_targets_are_those_of_the_network_that_collected_them():
-    trainer = Trainer(config("dqn", dqn={"overlap": 2, "target_every": 0, "targets": "stored", "learning_starts": 8}))
+    trainer = Trainer(
+        config(
+            "dqn", dqn={"overlap": 2, "target_every": 0, "targets": "stored", "learning_starts": 8}
+        )
+    )
     batch = trainer.collector.collect().clone()
     expected = look_into(trainer.learner.labels, batch)[1]
     trainer.learner.update(batch, 0)
@@ -356,7 +465,13 @@ def test_an_update_opens_at_most_nine_files_which_the_architecture_page_names(me
         trainer.learner.update(batch, 0)
     finally:
         sys.setprofile(None)
-    page = (root / "docs" / "architecture.md").read_text().partition("What an update of PQN reads")[2]
-    table = page.partition("\n\n|")[2].partition("\n\n")[0].replace("models/lru.py", f"models/{memory}.py")
+    page = (
+        (root / "docs" / "architecture.md").read_text().partition("What an update of PQN reads")[2]
+    )
+    table = (
+        page.partition("\n\n|")[2]
+        .partition("\n\n")[0]
+        .replace("models/lru.py", f"models/{memory}.py")
+    )
     named = re.findall(r"^\| `(\w+/\w+\.py)`", table, flags=re.MULTILINE)
     assert list(opened) == [file for file in named if file in opened] and 5 < len(opened) <= 9

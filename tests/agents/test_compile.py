@@ -26,7 +26,14 @@ from arcade_torch.agents import (
 )
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.policy import compile_network
-from arcade_torch.models import Encoder, PaperEncoder, SmallEncoder, make_actor_critic, make_network, memory_names
+from arcade_torch.models import (
+    Encoder,
+    PaperEncoder,
+    SmallEncoder,
+    make_actor_critic,
+    make_network,
+    memory_names,
+)
 from tests.agents.fakes import look_into
 from tests.agents.test_training import assert_goes_on_to_the_bit, assert_same_run
 
@@ -36,7 +43,9 @@ ENVS, STEPS = 4, 10
 
 @pytest.fixture(autouse=True)
 def _without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")  # captured as for inductor, then run as it stands
+    monkeypatch.setattr(
+        training, "COMPILE_BACKEND", "eager"
+    )  # captured as for inductor, then run as it stands
     torch.compiler.reset()
 
 
@@ -47,7 +56,12 @@ def batch() -> TensorDict:
     flags = torch.zeros(*shape, 1, dtype=torch.bool)
     truncated, is_init = flags.clone(), flags.clone()
     truncated[:, 5] = is_init[:, 6] = True
-    after = {"reward": torch.randn(*shape, 1), "terminated": flags, "truncated": truncated, "done": truncated}
+    after = {
+        "reward": torch.randn(*shape, 1),
+        "terminated": flags,
+        "truncated": truncated,
+        "done": truncated,
+    }
     frames = torch.randint(256, (ENVS, STEPS + 2, 32, 32, 3), dtype=torch.uint8)
     roots = {"pixels": frames[:, :STEPS], "final_pixels": frames[:, STEPS:], "is_init": is_init}
     index = torch.tensor([[5, STEPS - 1]]).expand(ENVS, -1)
@@ -62,7 +76,9 @@ def network_of(memory: str, seed: int = 0) -> Any:
 
 
 def with_state(batch: TensorDict, network: Any) -> TensorDict:
-    return batch.copy().set("initial_state", TensorDict({"memory": network.initial_state(ENVS)}, [ENVS]))
+    return batch.copy().set(
+        "initial_state", TensorDict({"memory": network.initial_state(ENVS)}, [ENVS])
+    )
 
 
 @pytest.mark.parametrize("memory", ["lru", pytest.param("attention", marks=pytest.mark.slow)])
@@ -70,7 +86,9 @@ def with_state(batch: TensorDict, network: Any) -> TensorDict:
 def test_loss_gradients_and_target_network_are_those_of_the_plain_network(
     batch: TensorDict, memory: str, backend: str
 ) -> None:
-    """In 0.1 ``--compile`` silently had no target network: the copy kept the bound method of the online one."""
+    """In 0.1 ``--compile`` silently had no target network: the copy kept the bound method of the
+    online one.
+    """
     plain, compiled, other = network_of(memory), network_of(memory), network_of(memory, 1)
     compile_network(compiled, backend)
     assert list(compiled.state_dict()) == list(plain.state_dict())
@@ -89,7 +107,9 @@ def test_loss_gradients_and_target_network_are_those_of_the_plain_network(
 
 
 @pytest.mark.parametrize("memory", ["lru", "gru", "attention"])
-def test_a_network_is_compiled_once_for_acting_and_once_for_learning(batch: TensorDict, memory: str) -> None:
+def test_a_network_is_compiled_once_for_acting_and_once_for_learning(
+    batch: TensorDict, memory: str
+) -> None:
     counter, network = CompileCounter(), network_of(memory)
     compile_network(network, counter)
     loss, data = PQNLoss(network), with_state(batch, network)
@@ -136,15 +156,22 @@ def test_a_compiled_run_goes_on_to_the_bit_and_its_agent_is_loaded_plain(tmp_pat
     assert load(folder).network.encoder._compiled_call_impl is None
 
 
-# -- cuda_graphs ------------------------------------------------------------------------------------------------------
+# -- cuda_graphs -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("memory", memory_names())
 @pytest.mark.parametrize("kind", ["q", "actor-critic"])
 def test_acting_asks_for_the_value_of_no_tensor(kind: str, memory: str) -> None:
     network = (make_network if kind == "q" else make_actor_critic)("small", memory, hidden_size=16)
-    with FakeTensorMode(allow_non_fake_inputs=True), torch.no_grad():  # tensors without values: a graph has none to ask
-        roots = {"pixels": torch.zeros(ENVS, 32, 32, 3, dtype=torch.uint8), "last_action": torch.zeros(ENVS).long()}
+    # Tensors without values: a graph has none to ask.
+    with (
+        FakeTensorMode(allow_non_fake_inputs=True),
+        torch.no_grad(),
+    ):
+        roots = {
+            "pixels": torch.zeros(ENVS, 32, 32, 3, dtype=torch.uint8),
+            "last_action": torch.zeros(ENVS).long(),
+        }
         step = TensorDict(roots | {"is_init": torch.zeros(ENVS, 1).bool()}, [ENVS])
         step["memory"] = network.initial_state(ENVS)
         out = network(step)["action_value" if kind == "q" else "logits"]
@@ -164,7 +191,9 @@ class Counted(CudaGraphModule):
         Counted.made.append(self)
 
     def __call__(self, data: TensorDict) -> Any:
-        self.shapes.append(tuple(sorted((str(key), tuple(value.shape)) for key, value in data.items(True, True))))
+        self.shapes.append(
+            tuple(sorted((str(key), tuple(value.shape)) for key, value in data.items(True, True)))
+        )
         return super().__call__(data)
 
 
@@ -173,8 +202,12 @@ class Counted(CudaGraphModule):
 def test_every_call_that_a_graph_would_replay_has_one_shape(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The eager twin of ``cuda_graphs``: the same calls without a graph give the run without the option."""
-    config = preset("smoke", algorithm=algorithm, env="CartPoleEasy-v0", memory="gru", total_frames=256)
+    """The eager twin of ``cuda_graphs``: the same calls without a graph give the run without the
+    option.
+    """
+    config = preset(
+        "smoke", algorithm=algorithm, env="CartPoleEasy-v0", memory="gru", total_frames=256
+    )
     train(config, tmp_path / "plain")
     Counted.made.clear()
     for module in (training, learner):
@@ -196,20 +229,30 @@ def _with_graphs(config: TrainConfig, folder: Path) -> Trainer:
 @pytest.mark.gpu
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
 def test_a_run_with_graphs_is_a_run(algorithm: str, tmp_path: Path, cuda: str) -> None:
-    config = preset("smoke", algorithm=algorithm, env="SignpostEasy", device=cuda, total_frames=1024)
-    results = [train(dataclasses.replace(config, cuda_graphs=on), tmp_path / str(on)) for on in (True, False)]
-    assert all(result.status == "finished" for result in results) and load(tmp_path / "True").config.cuda_graphs
+    config = preset(
+        "smoke", algorithm=algorithm, env="SignpostEasy", device=cuda, total_frames=1024
+    )
+    results = [
+        train(dataclasses.replace(config, cuda_graphs=on), tmp_path / str(on))
+        for on in (True, False)
+    ]
+    assert (
+        all(result.status == "finished" for result in results)
+        and load(tmp_path / "True").config.cuda_graphs
+    )
     one, other = (load(tmp_path / str(on)).network.state_dict() for on in (True, False))
     for name, weight in one.items():
         if algorithm != "ppo":  # which draws its actions inside the graph
             torch.testing.assert_close(weight, other[name], rtol=1e-2, atol=1e-3)
 
 
-# -- amp --------------------------------------------------------------------------------------------------------------
+# -- amp -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [PaperEncoder, SmallEncoder])
-def test_amp_features_and_gradients_are_float32_and_close_to_exact_ones(kind: type[Encoder]) -> None:
+def test_amp_features_and_gradients_are_float32_and_close_to_exact_ones(
+    kind: type[Encoder],
+) -> None:
     encoder = kind(128)  # type: ignore[call-arg]
     frames = torch.randint(256, (4, 128, 128, 3), dtype=torch.uint8)
     exact = encoder(frames)
@@ -231,4 +274,6 @@ def test_every_encoder_of_a_network_follows_the_config(algorithm: str) -> None:
 
 
 def test_an_amp_run_goes_on_to_the_bit_and_its_agent_acts_as_it_was_trained(tmp_path: Path) -> None:
-    assert load(assert_goes_on_to_the_bit(dataclasses.replace(RUN, amp=True), tmp_path)).network.encoder.amp
+    assert load(
+        assert_goes_on_to_the_bit(dataclasses.replace(RUN, amp=True), tmp_path)
+    ).network.encoder.amp

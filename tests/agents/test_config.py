@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from arcade_torch.agents.config import GROUPS, OF_ENV, OF_NETWORK, DQNConfig, PQNConfig, TrainConfig, differing_fields
+from arcade_torch.agents.config import (
+    GROUPS,
+    OF_ENV,
+    OF_NETWORK,
+    DQNConfig,
+    PQNConfig,
+    TrainConfig,
+    differing_fields,
+)
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
 from arcade_torch.envs_jax.registry import GAMES
@@ -17,8 +25,16 @@ def test_the_defaults_are_the_papers_numbers():
     c, p = TrainConfig(), PQNConfig()
     assert (p.num_envs, p.num_steps, p.overlap, p.epochs, p.minibatches) == (16, 128, 4, 4, 16)
     assert (p.gamma, p.lam, p.max_grad_norm, p.warmup_steps) == (0.99, 0.95, 0.5, 132)
-    assert (p.learning_rate, p.learning_rate_end, p.epsilon_start, p.epsilon_end) == (5e-5, 5e-7, 1.0, 0.05)
-    assert (p.lr_decay_fraction * c.total_frames, p.exploration_fraction * c.total_frames) == (2e6, 8e6)
+    assert (p.learning_rate, p.learning_rate_end, p.epsilon_start, p.epsilon_end) == (
+        5e-5,
+        5e-7,
+        1.0,
+        0.05,
+    )
+    assert (p.lr_decay_fraction * c.total_frames, p.exploration_fraction * c.total_frames) == (
+        2e6,
+        8e6,
+    )
     assert c.num_updates == 9_765
     assert c.num_updates * p.epochs * p.minibatches == 624_960
 
@@ -32,7 +48,9 @@ def test_the_defaults_are_the_papers_numbers():
         ("MineSweeperEasy", 2e7, 8e6, 2e6),
     ],
 )
-def test_the_paper_preset_knows_the_budget_of_each_game(env, frames, epsilon_frames, learning_rate_frames):
+def test_the_paper_preset_knows_the_budget_of_each_game(
+    env, frames, epsilon_frames, learning_rate_frames
+):
     c = preset("paper", env=env)
     assert c.total_frames == frames
     assert c.pqn.exploration_fraction * c.total_frames == pytest.approx(epsilon_frames)
@@ -45,7 +63,10 @@ def test_the_reference_preset_is_the_paper_with_the_published_quirks():
     changes = {"rules": "reference", "network_options": {"skip": "none"}, "pqn": quirks}
     assert differing_fields(c, preset("paper", env="CartPoleEasy", seed=3, **changes)) == []
     ppo = preset("reference", algorithm="ppo", env="CartPoleEasy")
-    assert (ppo.ppo.time_limit, ppo.network_options) == ("terminal", {"skip": "none", "use_last_action": False})
+    assert (ppo.ppo.time_limit, ppo.network_options) == (
+        "terminal",
+        {"skip": "none", "use_last_action": False},
+    )
     dqn = preset("reference", algorithm="dqn", env="CartPoleEasy").dqn
     assert (dqn.time_limit, dqn.targets) == ("terminal", "stored")
 
@@ -105,22 +126,38 @@ def test_a_preset_can_be_changed_down_to_its_learner():
         ({"ppo": {"gamma": "high"}}, r"ppo\.gamma must be a number"),
         ({"network_options": 3}, "network_options"),
         ({"total_frames": 10**30}, r"^total_frames must be at most 10\*\*15; got 1000"),
-        ({"network_options": {"memory_options": 3}}, r"network_options\.memory_options must be a table .*; got 3$"),
+        (
+            {"network_options": {"memory_options": 3}},
+            r"network_options\.memory_options must be a table .*; got 3$",
+        ),
         *[
-            ({"network_options": {name: "x"}}, rf"^network_options must be without {name}, which other fields decide")
+            (
+                {"network_options": {name: "x"}},
+                rf"^network_options must be without {name}, which other fields decide",
+            )
             for name in OF_NETWORK
         ],
         *[
-            ({"env_options": {name: 1}}, rf"^env_options must be without {name}, which other fields decide; got ")
+            (
+                {"env_options": {name: 1}},
+                rf"^env_options must be without {name}, which other fields decide; got ",
+            )
             for name in OF_ENV
         ],
         *[
-            ({"env_options": {"noise": value}}, r"^env_options\.noise must be a value that JSON gives back")
+            (
+                {"env_options": {"noise": value}},
+                r"^env_options\.noise must be a value that JSON gives back",
+            )
             for value in (abs, (1, 2), {1: 2}, float("nan"), np.zeros(2), torch.zeros(2))
         ],
         ({"env_options": {1: 2}}, r"^env_options\.1 must be a value"),
         *[
-            ({"device": device}, rf"^device must be 'cpu', 'cuda' or one of several such as 'cuda:0'; got {device!r}$")
+            (
+                {"device": device},
+                r"^device must be 'cpu', 'cuda' or one of several such as 'cuda:0'; got "
+                rf"{device!r}$",
+            )
             for device in ("foo", "mps", "xpu:0", "cpu:x", "cuda:", "cuda:01", "cuda:1000")
         ],
     ],
@@ -152,13 +189,27 @@ BAD = [
     ],
     *[(a, "warmup_steps", -1) for a in ("pqn", "ppo", "dqn")],
     *[(a, "average_share", 1.5) for a in ("pqn", "ppo", "dqn")],
-    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("gamma", "lam", "lr_decay_fraction") for v in (-0.1, 1.1)],
-    *[(a, f, v) for a in ("pqn", "ppo", "dqn") for f in ("learning_rate", "max_grad_norm") for v in (0.0, -1.0)],
+    *[
+        (a, f, v)
+        for a in ("pqn", "ppo", "dqn")
+        for f in ("gamma", "lam", "lr_decay_fraction")
+        for v in (-0.1, 1.1)
+    ],
+    *[
+        (a, f, v)
+        for a in ("pqn", "ppo", "dqn")
+        for f in ("learning_rate", "max_grad_norm")
+        for v in (0.0, -1.0)
+    ],
     *[(a, "gamma", float("nan")) for a in ("pqn", "ppo", "dqn")],
     *[(a, "learning_rate_end", -1e-9) for a in ("pqn", "ppo", "dqn")],
     *[(a, "time_limit", "never") for a in ("pqn", "ppo", "dqn")],
     *[(a, "minibatches", 7) for a in ("pqn", "ppo", "dqn")],
-    *[(a, f, 1.5) for a in ("pqn", "dqn") for f in ("epsilon_start", "epsilon_end", "exploration_fraction")],
+    *[
+        (a, f, 1.5)
+        for a in ("pqn", "dqn")
+        for f in ("epsilon_start", "epsilon_end", "exploration_fraction")
+    ],
     *[(a, "overlap", v) for a in ("pqn", "dqn") for v in (-1, 129)],
     ("pqn", "bootstrap", "first"),
     ("ppo", "clip", 0.0),
@@ -186,7 +237,9 @@ def test_every_number_out_of_range_gets_one_line_that_names_it(algorithm, field,
 
 def test_every_number_of_every_learner_is_tried_out_of_range():
     tried = {(algorithm, field) for algorithm, field, _ in BAD}
-    assert tried == {(name, f.name) for name, kind in GROUPS.items() for f in dataclasses.fields(kind)}
+    assert tried == {
+        (name, f.name) for name, kind in GROUPS.items() for f in dataclasses.fields(kind)
+    }
 
 
 def test_numbers_of_another_algorithm_are_refused_where_they_would_do_nothing():
@@ -197,7 +250,9 @@ def test_numbers_of_another_algorithm_are_refused_where_they_would_do_nothing():
 
 def test_mixed_twins_need_an_even_number_of_environments():
     with pytest.raises(ValueError, match=r"ppo\.num_envs must be even"):
-        preset("small", algorithm="ppo", observability="mixed", ppo={"num_envs": 3, "minibatches": 1})
+        preset(
+            "small", algorithm="ppo", observability="mixed", ppo={"num_envs": 3, "minibatches": 1}
+        )
 
 
 def test_stored_targets_and_a_target_network_exclude_each_other():
@@ -228,7 +283,10 @@ def test_a_schedule_is_counted_in_frames(algorithm):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"cuda_graphs": True}, "cuda_graphs must be false on device 'cpu'; it needs a CUDA device; got True"),
+        (
+            {"cuda_graphs": True},
+            "cuda_graphs must be false on device 'cpu'; it needs a CUDA device; got True",
+        ),
         ({"amp": 1}, "amp must be true or false; got 1"),
         ({"logger": "paper"}, "logger must be 'none', 'tensorboard' or 'wandb'"),
     ],
@@ -237,7 +295,9 @@ def test_what_a_machine_cannot_do_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         preset("smoke", **change)
     for field in ("amp", "compile"):  # they change numbers, so they make another run
-        assert differing_fields(preset("smoke"), preset("smoke", **{field: True})) == [f"{field} (False != True)"]
+        assert differing_fields(preset("smoke"), preset("smoke", **{field: True})) == [
+            f"{field} (False != True)"
+        ]
     config = preset("smoke", device="cuda", cuda_graphs=True)
     assert TrainConfig.from_dict(config.to_dict()) == config
 

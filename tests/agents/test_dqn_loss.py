@@ -59,7 +59,9 @@ def test_burn_in_steps_are_read_but_not_trained(ends, form):
 
 
 def test_burn_in_carries_no_gradient():
-    """R2D2's; 0.1 let it through. The gradient is that of a window that begins where the burn-in ends."""
+    """R2D2's; 0.1 let it through. The gradient is that of a window that begins where the burn-in
+    ends.
+    """
     network, s = toy_network(), stream(4, 8, seed=6, ends=0.3)
     burnt = make_loss(network, burn_in=3)
     wanted = torch.autograd.grad(
@@ -72,7 +74,10 @@ def test_burn_in_carries_no_gradient():
 
 def gru_of_torchrl():
     """A recurrent network without anything of ours."""
-    keys = {"in_keys": ["flat", ("memory", "h"), "is_init"], "out_keys": ["remembered", ("next", "memory", "h")]}
+    keys = {
+        "in_keys": ["flat", ("memory", "h"), "is_init"],
+        "out_keys": ["remembered", ("next", "memory", "h")],
+    }
     return TensorDictSequential(
         TensorDictModule(lambda pixels: pixels.flatten(-3) / 255, ["pixels"], ["flat"]),
         GRUModule(12, WIDTH, **keys),
@@ -84,14 +89,18 @@ def with_states(s, network):
     """A stock batch with a state at every step: random at the first, zeros behind it."""
     batch = s.stock()
     states = batch["memory", "h"].nan_to_num(0.0)
-    batch["memory", "h"] = states.unsqueeze(2) if isinstance(network, TensorDictSequential) else states
+    batch["memory", "h"] = (
+        states.unsqueeze(2) if isinstance(network, TensorDictSequential) else states
+    )
     return batch
 
 
 @pytest.mark.parametrize("start", [2, 3, 4])
 @pytest.mark.parametrize("kind", ["sequence", "step", "collected step", "TorchRL"])
 def test_nothing_of_the_episode_before_comes_through_a_burn_in(kind, start):
-    """Where an episode begins among the steps of the burn-in or right behind them; where one begins later, it does."""
+    """Where an episode begins among the steps of the burn-in or right behind them; where one begins
+    later, it does.
+    """
     network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind.split()[-1])
     s = stream(2, 8, seed=1, ends=0.0)
     s.is_init[:], s.is_init[:, start] = False, True
@@ -118,8 +127,13 @@ def test_a_slice_of_an_episode_starts_from_its_stored_state(kind, burn_in):
 
 
 def test_a_burn_in_of_memories_that_store_in_two_ways_is_refused():
-    towers = toy_network(store="step"), toy_network(state_key=("memory", "other"), out_key="other", store="sequence")
-    with pytest.raises(ValueError, match="burn_in must be 0 with memories that differ in store; got 1"):
+    towers = (
+        toy_network(store="step"),
+        toy_network(state_key=("memory", "other"), out_key="other", store="sequence"),
+    )
+    with pytest.raises(
+        ValueError, match="burn_in must be 0 with memories that differ in store; got 1"
+    ):
         DQNLoss(TensorDictSequential(*towers), burn_in=1)
 
 
@@ -143,13 +157,21 @@ def later(network, s, first):
 
 def test_the_defaults_are_those_of_the_published_code_but_for_fresh_targets():
     c = DQNConfig()
-    assert (c.lam, c.batch_sequences, c.learning_starts, c.minibatches, c.epochs) == (0.0, 32, 32, 16, 4)
+    assert (c.lam, c.batch_sequences, c.learning_starts, c.minibatches, c.epochs) == (
+        0.0,
+        32,
+        32,
+        16,
+        4,
+    )
     assert (c.targets, c.target_every, c.burn_in, c.time_limit) == ("recompute", 0, 0, "bootstrap")
     assert c.replay_sequences == 992  # of 1,000: whole windows of 16 environments
     assert epsilon_at(c, 0, 10**7) == 1.0 and epsilon_at(c, 4 * 10**6, 10**7) == 0.05
 
 
-@pytest.mark.parametrize("bad", [{"replay_frames": 4000}, {"replay_frames": 0}, {"learning_starts": 2000}])
+@pytest.mark.parametrize(
+    "bad", [{"replay_frames": 4000}, {"replay_frames": 0}, {"learning_starts": 2000}]
+)
 def test_a_replay_without_room_is_refused(bad):
     with pytest.raises(ValueError, match=r"dqn\.replay_frames must be >= \d+"):
         DQNConfig(**bad)

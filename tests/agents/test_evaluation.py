@@ -30,7 +30,9 @@ def env():
 
 def by_hand(observability):
     """The same through TorchRL's own stepping."""
-    env = arcade_torch.make("CartPoleEasy", num_envs=EPISODES, observability=observability, seed=held_out_seed(3))
+    env = arcade_torch.make(
+        "CartPoleEasy", num_envs=EPISODES, observability=observability, seed=held_out_seed(3)
+    )
     env.set_seed(held_out_seed(3), static_seed=True)
     returns, lengths = [0.0] * EPISODES, [0] * EPISODES
     done_before = torch.zeros(EPISODES, dtype=torch.bool)
@@ -58,7 +60,10 @@ def test_it_gives_the_first_episode_of_every_environment(env):
 
 def test_the_same_seed_plays_the_same_episodes_and_another_seed_others(env):
     first, second, other = (evaluate(Clock(), seed=s, env=env) for s in (3, 3, 4))
-    assert first.lengths.tolist() == second.lengths.tolist() and first.returns.tolist() == second.returns.tolist()
+    assert (
+        first.lengths.tolist() == second.lengths.tolist()
+        and first.returns.tolist() == second.returns.tolist()
+    )
     assert first.lengths.tolist() != other.lengths.tolist()
 
 
@@ -89,9 +94,20 @@ def test_numbers_about_the_returns(env):
 
 def test_an_environment_is_all_that_the_config_says_about_it(monkeypatch):
     options = {"obs_size": 256, "rules": "reference", "device": "cuda:1"}
-    config = preset("smoke", env="MineSweeperEasy", observability="mixed", env_options={"mine_reward": -1.0}, **options)
+    config = preset(
+        "smoke",
+        env="MineSweeperEasy",
+        observability="mixed",
+        env_options={"mine_reward": -1.0},
+        **options,
+    )
     monkeypatch.setattr(arcade_torch, "make", lambda *names, **asked: (names, asked))
     names, asked = make_env(config, 4, 7)
-    assert names == ("MineSweeperEasy",) and asked.pop("observability").tolist() == [False, False, True, True]
+    assert names == ("MineSweeperEasy",) and asked.pop("observability").tolist() == [
+        False,
+        False,
+        True,
+        True,
+    ]
     assert asked == {"num_envs": 4, "seed": 7, "mine_reward": -1.0} | options
     assert make_env(config, 4, 7, "partial")[1]["observability"] == "partial"

@@ -16,7 +16,9 @@ MODULUS = 2**31 - 1
 
 
 class RunningHash(nn.Module):
-    """A memory whose state is a hash of all that it read since the start: equal or not, nothing between."""
+    """A memory whose state is a hash of all that it read since the start: equal or not, nothing
+    between.
+    """
 
     def forward(self, x, state, is_init):
         h, out = state["h"], []
@@ -39,13 +41,20 @@ def experience(seed, rows, steps, ends, seams):
     """A stream whose frames are one number each, unknown states included."""
     s = stream(rows, steps, seed, ends, seams)
     s.pixels, s.final = (x.flatten(2).long().sum(-1, keepdim=True) for x in (s.pixels, s.final))
-    s.state = TensorDict({"memory": {"h": s.state["memory", "h"][:, :1].mul(1000).long().abs()}}, [rows])
+    s.state = TensorDict(
+        {"memory": {"h": s.state["memory", "h"][:, :1].mul(1000).long().abs()}}, [rows]
+    )
     return s
 
 
 def by_hand(s):
-    """Hash of every observation and of every true next one, step by step, with the state that led to each."""
-    here, after = torch.zeros_like(s.reward, dtype=torch.int64), torch.zeros_like(s.reward, dtype=torch.int64)
+    """Hash of every observation and of every true next one, step by step, with the state that led
+    to each.
+    """
+    here, after = (
+        torch.zeros_like(s.reward, dtype=torch.int64),
+        torch.zeros_like(s.reward, dtype=torch.int64),
+    )
     for row in range(len(here)):
         h = int(s.state["memory", "h"][row, 0])
         for t in range(here.shape[1]):
@@ -71,13 +80,23 @@ def form_of(s, form):
     frames = torch.full((len(final), places, 1), -1)
     for row in range(len(final)):
         at = final[row].nonzero().flatten()
-        index[row, : len(at)], mask[row, : len(at)], frames[row, : len(at)] = at, True, s.final[row, at]
+        index[row, : len(at)], mask[row, : len(at)], frames[row, : len(at)] = (
+            at,
+            True,
+            s.final[row, at],
+        )
     return batch.update({"final_pixels": frames, "final_index": index, "final_mask": mask})
 
 
 @pytest.mark.parametrize(
     ("form", "store"),
-    [("sequences", "sequence"), ("sequences", "step"), ("all", "sequence"), ("all", "step"), ("stock", "sequence")],
+    [
+        ("sequences", "sequence"),
+        ("sequences", "step"),
+        ("all", "sequence"),
+        ("all", "step"),
+        ("stock", "sequence"),
+    ],
 )
 @given(
     seed=st.integers(0, 10**6),
@@ -123,7 +142,9 @@ def test_rows_of_the_layout_are_the_layout_of_the_rows(seed, steps, ends):
 
 @pytest.mark.parametrize("burn_in", [0, 2, 5, 6])
 def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(burn_in):
-    """``store="step"``: a sampler may have cut an episode, then the state stored at the cut counts, not zeros."""
+    """``store="step"``: a sampler may have cut an episode, then the state stored at the cut counts,
+    not zeros.
+    """
     s, network = experience(1, 3, 8, 0.0, 0.0), hash_network("step")
     s.is_init[1, 5] = s.is_init[2, 0] = True
     batch, states = s.stock(), torch.randint(1000, (3, 8, 1))
@@ -141,14 +162,24 @@ def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(bur
 
 def test_only_memories_that_all_store_one_state_a_sequence_read_the_first_alone():
     for stores in (["sequence"] * 2, ["sequence", "step"], ["step", "sequence"], ["step"] * 2):
-        pair = [MemoryModule(RunningHash(), "pixels", f"out{i}", f"m{i}", store=s) for i, s in enumerate(stores)]
-        assert NetworkInputs(TensorDictSequential(*pair)).reads_first_state_only == ("step" not in stores)
+        pair = [
+            MemoryModule(RunningHash(), "pixels", f"out{i}", f"m{i}", store=s)
+            for i, s in enumerate(stores)
+        ]
+        assert NetworkInputs(TensorDictSequential(*pair)).reads_first_state_only == (
+            "step" not in stores
+        )
 
 
 def test_sequences_become_steps_that_begin_with_their_state():
     s = experience(2, 3, 6, 0.3, 0.0)
     steps = as_steps(form_of(s, "sequences"), NetworkInputs(hash_network()), "action")
-    assert steps.batch_size == (3, 6) and set(steps.keys()) == {"pixels", "is_init", "memory", "action"}
+    assert steps.batch_size == (3, 6) and set(steps.keys()) == {
+        "pixels",
+        "is_init",
+        "memory",
+        "action",
+    }
     assert torch.equal(steps["memory", "h"][:, 0], s.state["memory", "h"])
     stock = s.stock()
     assert as_steps(stock, NetworkInputs(hash_network())) is stock

@@ -1,6 +1,8 @@
-"""The end-to-end proof: agents with a memory solve a game that cannot be played without one, and the others do not.
+"""The end-to-end proof: agents with a memory solve a game that cannot be played without one, and
+the others do not.
 
-Signpost pays 1 to whoever remembers the sign of the first frame, and on average 0.25 at most to everybody else.
+Signpost pays 1 to whoever remembers the sign of the first frame, and on average 0.25 at most to
+everybody else.
 """
 
 import math
@@ -12,7 +14,9 @@ from arcade_torch.agents import evaluate, load, preset, train
 FRAMES = 100_000
 EPISODES = 256
 CHANCE = 0.25
-DEVIATION = math.sqrt(CHANCE * (1 - CHANCE) / EPISODES)  # of the mean return of somebody who guesses
+DEVIATION = math.sqrt(
+    CHANCE * (1 - CHANCE) / EPISODES
+)  # of the mean return of somebody who guesses
 
 
 def learned(folder, algorithm, memory, observability, env="SignpostEasy", frames=FRAMES):
@@ -56,7 +60,9 @@ def test_the_small_preset_counts_cards_better_than_the_papers_memory_free_agent(
 
 @pytest.mark.slow
 def test_in_minesweepers_pomdp_memory_pays(tmp_path):
-    """Sweeping blindly without repeats earns 1/3, the paper's agents .65 with memory and .45 without."""
+    """Sweeping blindly without repeats earns 1/3, the paper's agents .65 with memory and .45
+    without.
+    """
     with_memory = learned(tmp_path / "lru", "ppo", "lru", "partial", "MineSweeperEasy", 900_000)
     without = learned(tmp_path / "mlp", "ppo", "mlp", "partial", "MineSweeperEasy", 900_000)
     assert with_memory > 0.45 and with_memory > without + 0.05

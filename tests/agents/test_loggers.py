@@ -14,7 +14,9 @@ from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from tests.agents.test_training import assert_same_run, stop_after
 
-CONFIG = preset("smoke", env="SignpostEasy-v0", total_frames=256, eval_every=128, checkpoint_every=128)
+CONFIG = preset(
+    "smoke", env="SignpostEasy-v0", total_frames=256, eval_every=128, checkpoint_every=128
+)
 LOGGED = dataclasses.replace(CONFIG, logger="tensorboard")
 
 
@@ -70,16 +72,22 @@ def test_a_logger_gets_every_row_at_its_frame_count_and_changes_no_number(
     assert {"time/fps", "train/lr", "train/epsilon"} <= learned[0][1].keys()
 
 
-def test_a_logger_that_fails_ends_and_the_run_does_not(plain: Path, tmp_path: Path, memo: Memo) -> None:
+def test_a_logger_that_fails_ends_and_the_run_does_not(
+    plain: Path, tmp_path: Path, memo: Memo
+) -> None:
     memo.fails_at = 128
-    with pytest.warns(UserWarning, match="logging ends here, .*: OSError: the disk is full") as warned:
+    with pytest.warns(
+        UserWarning, match="logging ends here, .*: OSError: the disk is full"
+    ) as warned:
         result = train(LOGGED, tmp_path / "run")
     assert result.status == "finished" and len(warned) == 1
     assert_same_run(plain, tmp_path / "run")
     assert memo.rows[-1][0] == 64
 
 
-def test_a_logger_may_be_changed_when_a_run_goes_on(plain: Path, tmp_path: Path, memo: Memo) -> None:
+def test_a_logger_may_be_changed_when_a_run_goes_on(
+    plain: Path, tmp_path: Path, memo: Memo
+) -> None:
     def stop() -> None:
         raise KeyboardInterrupt
 
@@ -97,7 +105,10 @@ def test_a_logger_that_is_not_installed_is_named_before_anything_is_written(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     words = ["--preset", "smoke", "--logger", "wandb", "--out", str(tmp_path / "run")]
     assert cli.main(["train", *words]) == cli.EXIT_BAD_INPUT
-    said = "arcade-torch: logger='wandb' needs a package that is missing: pip install 'arcade-torch[loggers]'\n"
+    said = (
+        "arcade-torch: logger='wandb' needs a package that is missing: pip install "
+        "'arcade-torch[loggers]'\n"
+    )
     assert capsys.readouterr().err == said
     assert not (tmp_path / "run").exists()
 
@@ -106,11 +117,18 @@ def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """What TensorBoard shows."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     found = accumulator.EventAccumulator(str(folder / "tensorboard")).Reload()
-    return {tag: [(event.step, event.value) for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
+    return {
+        tag: [(event.step, event.value) for event in found.Scalars(tag)]
+        for tag in found.Tags()["scalars"]
+    }
 
 
-def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(plain: Path, tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard", reason="needs the loggers extra: pip install 'arcade-torch[loggers]'")
+def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(
+    plain: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip(
+        "tensorboard", reason="needs the loggers extra: pip install 'arcade-torch[loggers]'"
+    )
 
     def stop() -> None:
         raise KeyboardInterrupt
@@ -122,7 +140,9 @@ def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(plain: Path
     assert_same_run(plain, folder)
     shown, rows = scalars(folder), read_csv(folder / "metrics.csv")
     assert [step for step, _ in shown["train/loss"]] == [64, 128, 192, 256]
-    assert [value for _, value in shown["train/loss"]] == pytest.approx([float(row["loss"]) for row in rows], rel=1e-6)
+    assert [value for _, value in shown["train/loss"]] == pytest.approx(
+        [float(row["loss"]) for row in rows], rel=1e-6
+    )
     assert [step for step, _ in shown["eval/mean"]] == [128, 256]
 
 
@@ -130,7 +150,9 @@ def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(plain: Path
 def test_weights_and_biases_keeps_one_offline_run_over_both_parts(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("wandb", reason="needs the loggers extra: pip install 'arcade-torch[loggers]'")
+    pytest.importorskip(
+        "wandb", reason="needs the loggers extra: pip install 'arcade-torch[loggers]'"
+    )
     monkeypatch.delenv("WANDB_MODE", raising=False)
     config, folder = dataclasses.replace(CONFIG, logger="wandb"), tmp_path / "run"
 

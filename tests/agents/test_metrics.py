@@ -16,7 +16,10 @@ from arcade_torch.agents.metrics import EpisodeStats, ewm, paper_score
 
 def test_the_ewm_is_the_explicit_weighted_sum():
     x, alpha = np.random.default_rng(0).normal(size=30), 2 / 11
-    weights = [[(1 - alpha) ** t] + [alpha * (1 - alpha) ** (t - k) for k in range(1, t + 1)] for t in range(30)]
+    weights = [
+        [(1 - alpha) ** t] + [alpha * (1 - alpha) ** (t - k) for k in range(1, t + 1)]
+        for t in range(30)
+    ]
     expected = [np.dot(w, x[: len(w)]) for w in weights]
     np.testing.assert_allclose(ewm(x, span=10), expected)
 
@@ -33,7 +36,9 @@ def test_the_score_is_the_best_smoothed_point_not_the_last():
 
 
 def test_the_score_of_a_step_matches_the_geometric_series():
-    """Half the axis at 0, half at 1: 500 points of alpha = 2/101 reach 1 - (1 - alpha)^500 of the step."""
+    """Half the axis at 0, half at 1: 500 points of alpha = 2/101 reach 1 - (1 - alpha)^500 of the
+    step.
+    """
     grid = np.linspace(0, 1000, 1000)
     returns = (np.arange(1000) >= 500).astype(float)
     assert paper_score(grid, returns) == pytest.approx(1 - (1 - 2 / 101) ** 500, abs=1e-12)
@@ -47,7 +52,13 @@ def test_beyond_the_history_the_curve_is_constant():
 
 @pytest.mark.parametrize(
     "history",
-    [([], []), ([1, 2], [0.0]), ([2, 1], [0.0, 0.0]), ([1, np.nan, 3], [0.0] * 3), ([1, np.inf], [0.0, 0.0])],
+    [
+        ([], []),
+        ([1, 2], [0.0]),
+        ([2, 1], [0.0, 0.0]),
+        ([1, np.nan, 3], [0.0] * 3),
+        ([1, np.inf], [0.0, 0.0]),
+    ],
 )
 def test_a_history_that_is_none_is_refused(history):
     with pytest.raises(ValueError):
@@ -55,7 +66,12 @@ def test_a_history_that_is_none_is_refused(history):
 
 
 @settings(deadline=None, max_examples=25)
-@given(seed=st.integers(0, 10**6), envs=st.integers(1, 4), steps=st.integers(1, 12), cut=st.integers(0, 12))
+@given(
+    seed=st.integers(0, 10**6),
+    envs=st.integers(1, 4),
+    steps=st.integers(1, 12),
+    cut=st.integers(0, 12),
+)
 def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
     g = torch.Generator().manual_seed(seed)
     reward, done = torch.randn(envs, steps, generator=g), torch.rand(envs, steps, generator=g) < 0.3
@@ -68,12 +84,19 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
                 expected.append(newest)
                 start = t + 1
             last[i, t] = newest
-    so_far, running = torch.zeros(envs, steps, dtype=torch.float64), torch.zeros(envs, dtype=torch.float64)
+    so_far, running = (
+        torch.zeros(envs, steps, dtype=torch.float64),
+        torch.zeros(envs, dtype=torch.float64),
+    )
     for t in range(steps):
         running = running + reward[:, t]
         so_far[:, t] = running
         running = torch.where(done[:, t], 0.0, running)
-    stats, seen, means = EpisodeStats(np.full(envs, np.nan)), [], []  # means of the windows in which an episode ended
+    stats, seen, means = (
+        EpisodeStats(np.full(envs, np.nan)),
+        [],
+        [],
+    )  # means of the windows in which an episode ended
     for part in (slice(0, min(cut, steps)), slice(min(cut, steps), steps)):
         if reward[:, part].shape[1]:
             mean = stats.update(so_far[:, part], done[:, part])
@@ -92,16 +115,22 @@ def test_episode_returns_are_followed_across_windows(seed, envs, steps, cut):
 
 
 def test_an_environment_that_has_not_ended_yet_is_no_success():
-    """Zeros in the place of first returns are what the published score of Tetris without memory is made of."""
+    """Zeros in the place of first returns are what the published score of Tetris without memory is
+    made of.
+    """
     stats, lost = EpisodeStats(np.full(2, np.nan)), torch.full((2, 4), -1.0)
     ends = torch.tensor([[False, True, False, True], [False, False, False, False]])
     assert stats.update(lost, ends) is None and stats.finished.tolist() == [-1.0, -1.0]
-    assert stats.update(lost, ends.flip(0)) is None  # the second has nothing at the beginning of this window
+    assert (
+        stats.update(lost, ends.flip(0)) is None
+    )  # the second has nothing at the beginning of this window
     assert stats.update(lost, ends & False) == -1.0
 
 
 def test_the_interval_is_that_of_the_normal_mean():
-    assert EvalResult(np.array([1.0, 3.0]), np.ones(2)).ci == pytest.approx(12.706, abs=1e-3)  # Student's, not 1.96
+    assert EvalResult(np.array([1.0, 3.0]), np.ones(2)).ci == pytest.approx(
+        12.706, abs=1e-3
+    )  # Student's, not 1.96
     one = EvalResult(np.array([1.0]), np.ones(1))  # before: +- 0.000 (95 %)
     assert math.isnan(one.ci) and one.half_width is None
     assert one.text == "return 1.000 of one episode, which gives no interval"
@@ -151,10 +180,15 @@ def test_ppo_has_plain_adam_with_a_larger_epsilon():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_fused_radam_is_torchs_radam(dtype):
     torch.manual_seed(0)
-    weights = [torch.randn(7, 5, 3, 3, dtype=dtype).to(memory_format=torch.channels_last), torch.randn(9, dtype=dtype)]
+    weights = [
+        torch.randn(7, 5, 3, 3, dtype=dtype).to(memory_format=torch.channels_last),
+        torch.randn(9, dtype=dtype),
+    ]
     ours, theirs = ([nn.Parameter(x.clone()) for x in weights] for _ in range(2))
     fused, plain = make_optimizer(ours, 1e-2), torch.optim.RAdam(theirs, lr=1e-2)
-    tolerance = {"rtol": 1e-5, "atol": 1e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-13}
+    tolerance = (
+        {"rtol": 1e-5, "atol": 1e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-13}
+    )
     for step in range(40):  # the first five know no variance yet
         set_learning_rate(fused, 1e-2 / (1 + step))
         set_learning_rate(plain, 1e-2 / (1 + step))

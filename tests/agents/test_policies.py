@@ -1,4 +1,6 @@
-"""One policy, three ways to run it: ``env.rollout``, TorchRL's ``Collector``, ``ArcadeCollector``."""
+"""One policy, three ways to run it: ``env.rollout``, TorchRL's ``Collector``,
+``ArcadeCollector``.
+"""
 
 from pathlib import Path
 
@@ -41,7 +43,9 @@ def ways(policy: nn.Module) -> list[TensorDictBase]:
         lambda: next(theirs),
         lambda: next(ours),
     ):
-        torch.manual_seed(7)  # after the collectors were made: TorchRL's runs a policy once to see what it writes
+        torch.manual_seed(
+            7
+        )  # after the collectors were made: TorchRL's runs a policy once to see what it writes
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             found.append(run())
     return found
@@ -59,9 +63,13 @@ def assert_same(found: list[TensorDictBase], *keys: str) -> None:
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
 def test_a_made_policy_acts_alike_everywhere(algorithm: str) -> None:
     if algorithm == "ppo":
-        assert_same(ways(make_policy(make_actor_critic("small", **OPTIONS))), "action_log_prob", "logits")
+        assert_same(
+            ways(make_policy(make_actor_critic("small", **OPTIONS))), "action_log_prob", "logits"
+        )
     else:
-        assert_same(ways(make_policy(make_network("small", **OPTIONS), epsilon=0.3)), "action_value")
+        assert_same(
+            ways(make_policy(make_network("small", **OPTIONS), epsilon=0.3)), "action_value"
+        )
 
 
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo"])

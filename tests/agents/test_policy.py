@@ -11,7 +11,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.utils import get_primers_from_module
 
 import arcade_torch
-from arcade_torch.agents import Agent, build_network, evaluate, load, make_actor, make_policy, preset
+from arcade_torch.agents import (
+    Agent,
+    build_network,
+    evaluate,
+    load,
+    make_actor,
+    make_policy,
+    preset,
+)
 from arcade_torch.agents.runs.checkpoint import save_checkpoint
 from arcade_torch.models import make_network
 from arcade_torch.tools.analysis.windows import resolve_agent
@@ -22,13 +30,17 @@ MANY = 20_000
 
 def q_policy(values, **options):
     """Always the same Q-values."""
-    network = TensorDictModule(lambda x: torch.tensor(values).expand(len(x), -1), ["pixels"], ["action_value"])
+    network = TensorDictModule(
+        lambda x: torch.tensor(values).expand(len(x), -1), ["pixels"], ["action_value"]
+    )
     return make_policy(network, **options)  # type: ignore[arg-type]
 
 
 def sampler(logits, **options):
     """Always the same logits."""
-    network = TensorDictModule(lambda x: torch.tensor(logits).expand(len(x), -1), ["pixels"], ["logits"])
+    network = TensorDictModule(
+        lambda x: torch.tensor(logits).expand(len(x), -1), ["pixels"], ["logits"]
+    )
     return make_actor(network, **options)
 
 
@@ -71,12 +83,17 @@ def test_actions_are_drawn_with_the_probabilities_of_the_softmax_and_say_so():
 def test_nan_logits_still_give_an_action():
     with set_exploration_type(ExplorationType.RANDOM):
         out = act(sampler([float("nan")] * 5), 10)  # the learner then names the update
-    assert ((out["action"] >= 0) & (out["action"] < 5)).all() and out["action_log_prob"].isnan().all()
+    assert ((out["action"] >= 0) & (out["action"] < 5)).all() and out[
+        "action_log_prob"
+    ].isnan().all()
 
 
 @pytest.mark.parametrize(
     "policy",
-    [q_policy([0.0, 2.0, 1.0, 2.0, 2.0], explore=False), sampler([0.0, 3.0, 1.0, 3.0, 2.0], deterministic=True)],
+    [
+        q_policy([0.0, 2.0, 1.0, 2.0, 2.0], explore=False),
+        sampler([0.0, 3.0, 1.0, 3.0, 2.0], deterministic=True),
+    ],
 )
 def test_greedy_takes_the_best_and_of_equal_ones_the_lowest_and_draws_nothing(policy):
     before = torch.get_rng_state()
@@ -125,11 +142,15 @@ def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
             torch.testing.assert_close(value, written.reshape(value.shape))
     frames = torch.randint(256, (1, 3, 32, 32, 3), dtype=torch.uint8)
     last, flags = torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.bool)
-    out, _ = agent.network.remember(agent.network.encode(frames), last, flags, agent.initial_state(1))
+    out, _ = agent.network.remember(
+        agent.network.encode(frames), last, flags, agent.initial_state(1)
+    )
     assert agent.offers == (("logits", "probs", "value") if algorithm == "ppo" else ("q", "value"))
     assert agent.outputs(out, "value").shape == (1, 3, 1)
     if algorithm == "ppo":
-        torch.testing.assert_close(agent.outputs(out, "probs"), agent.outputs(out, "logits").softmax(-1))
+        torch.testing.assert_close(
+            agent.outputs(out, "probs"), agent.outputs(out, "logits").softmax(-1)
+        )
         assert torch.equal(agent.outputs(out, "value"), out[..., -1:])
     else:
         assert torch.equal(agent.outputs(out, "q"), out)
@@ -139,7 +160,9 @@ def test_an_agent_is_a_policy_and_says_what_its_outputs_are(algorithm):
 
 
 @pytest.mark.parametrize(("device", "graphs"), [("cuda", False), ("cuda", True), ("cuda:3", False)])
-def test_an_agent_of_a_gpu_is_loaded_and_plays_where_there_is_none(tmp_path, monkeypatch, device, graphs):
+def test_an_agent_of_a_gpu_is_loaded_and_plays_where_there_is_none(
+    tmp_path, monkeypatch, device, graphs
+):
     """Of one with a high index also where there are others."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: device == "cuda:3")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: int(device == "cuda:3"))
@@ -161,7 +184,12 @@ def test_a_network_is_of_its_configs_seed_and_size_whatever_was_drawn_before(alg
         before = torch.get_rng_state()
         network = build_network(preset("smoke", algorithm=algorithm, seed=seed, obs_size=256))
         assert torch.equal(torch.get_rng_state(), before)
-        assert network.compress(torch.zeros(1, 256, 256, 3, dtype=torch.uint8)).shape == (1, 32, 32, 3)
+        assert network.compress(torch.zeros(1, 256, 256, 3, dtype=torch.uint8)).shape == (
+            1,
+            32,
+            32,
+            3,
+        )
         weights.append(torch.cat([p.flatten() for p in network.parameters()]))
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
 
@@ -169,11 +197,17 @@ def test_a_network_is_of_its_configs_seed_and_size_whatever_was_drawn_before(alg
 @pytest.mark.parametrize("memory", ["gru", "feedforward"])
 def test_a_policy_has_as_many_actions_as_its_network_has_outputs(memory):
     network = make_network("small", memory, num_outputs=3, num_actions=3)
-    roots = {"pixels": torch.zeros(200, 32, 32, 3, dtype=torch.uint8), "is_init": torch.ones(200, 1, dtype=torch.bool)}
+    roots = {
+        "pixels": torch.zeros(200, 32, 32, 3, dtype=torch.uint8),
+        "is_init": torch.ones(200, 1, dtype=torch.bool),
+    }
     step = TensorDict(roots | {"last_action": torch.zeros(200, dtype=torch.int64)}, [200])
     with set_exploration_type(ExplorationType.RANDOM):
         assert set(make_policy(network, epsilon=1.0)(step.clone())["action"].tolist()) == {0, 1, 2}
-        assert set(make_policy(network, epsilon=1.0, num_actions=2)(step)["action"].tolist()) == {0, 1}
+        assert set(make_policy(network, epsilon=1.0, num_actions=2)(step)["action"].tolist()) == {
+            0,
+            1,
+        }
 
 
 @pytest.mark.parametrize("name", ["use_last_action", "zero_action_on_reset", "predicts"])

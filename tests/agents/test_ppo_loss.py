@@ -35,11 +35,15 @@ ESTIMATES = ("advantage", "value_target", "state_value")
 
 
 def acted(s, form="sequences", shift=0.0, **options):
-    """A network, the batch that it could have acted (its log-probabilities moved by ``shift``), and its loss."""
+    """A network, the batch that it could have acted (its log-probabilities moved by ``shift``), and
+    its loss.
+    """
     network = toy_actor_critic(3)
     noise = torch.randn(s.action.shape, generator=torch.Generator().manual_seed(9))
     batch = getattr(s, form)()
-    batch["action_log_prob"] = chosen(play(network.actor, s)[0].log_softmax(-1), s.action) + shift * noise
+    batch["action_log_prob"] = (
+        chosen(play(network.actor, s)[0].log_softmax(-1), s.action) + shift * noise
+    )
     loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, **options)
     loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
     return network, batch, loss
@@ -65,7 +69,10 @@ def test_every_part_equals_the_one_written_out(form, seams, time_limit):
         network.actor.head.bias += torch.linspace(-1, 1, 5)
     out = loss(batch)
 
-    logits, (value_now, after) = play(network.actor, s)[0], (x.squeeze(-1) for x in play(network.critic, s))
+    logits, (value_now, after) = (
+        play(network.actor, s)[0],
+        (x.squeeze(-1) for x in play(network.critic, s)),
+    )
     value = value_now - 0.3
     terminated = s.terminated | s.truncated if time_limit == "terminal" else s.terminated
     advantage = summed_errors(s.reward, value, after - 0.3, terminated, s.cut, GAMMA, LAM)
@@ -84,7 +91,9 @@ def test_every_part_equals_the_one_written_out(form, seams, time_limit):
             old, new = float(value[b, t]), float(value_now[b, t])
             held, g = old + min(max(new - old, -CLIP), CLIP), float(advantage[b, t] + value[b, t])
             critic += 0.5 * max((new - g) ** 2, (held - g) ** 2) / 21
-    found = torch.stack([out["loss_objective"], out["loss_critic"], out["loss_entropy"], out["entropy"]]).detach()
+    found = torch.stack(
+        [out["loss_objective"], out["loss_critic"], out["loss_entropy"], out["entropy"]]
+    ).detach()
     expected = torch.tensor([policy, 0.5 * critic, -0.01 * entropy, entropy])
     torch.testing.assert_close(found, expected, atol=2e-5, rtol=2e-5)
     assert 0 < out["clip_fraction"] < 1 and out["kl_approx"] > 0
@@ -96,13 +105,17 @@ def test_before_the_first_step_the_ratio_is_one_and_values_are_those_of_the_roll
     out = loss(loss.value_estimator(batch))
     assert out["clip_fraction"] == 0 and abs(float(out["kl_approx"])) < 1e-6
     assert abs(float(out["loss_objective"].detach())) < 1e-5  # normalised advantages have mean 0
-    torch.testing.assert_close(batch["state_value"], play(network.critic, s)[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        batch["state_value"], play(network.critic, s)[0], atol=1e-5, rtol=1e-5
+    )
 
 
 def test_advantages_do_not_depend_on_how_many_rows_are_read_at_once_and_rows_keep_theirs():
     s = with_two_states(stream(5, 8, seed=4, ends=0.5))
     network, batch, loss = acted(s)
-    whole, parts = (SequenceGAE(network.critic, GAMMA, LAM, chunks=n)(batch.clone()) for n in (1, 3))
+    whole, parts = (
+        SequenceGAE(network.critic, GAMMA, LAM, chunks=n)(batch.clone()) for n in (1, 3)
+    )
     for key in ESTIMATES:
         torch.testing.assert_close(whole[key], parts[key])
     rows = torch.tensor([2, 0])
@@ -128,8 +141,13 @@ def test_without_estimates_the_loss_makes_them_and_leaves_the_batch_alone():
 
 def test_a_misspelt_time_limit_is_refused_when_estimator_or_loss_is_made():
     network = toy_actor_critic()
-    for make in (partial(SequenceGAE, network.critic), partial(PPOLoss, make_actor(network.actor), network.critic)):
-        with pytest.raises(ValueError, match=r"^time_limit must be 'bootstrap' or 'terminal'; got 'Terminal'$"):
+    for make in (
+        partial(SequenceGAE, network.critic),
+        partial(PPOLoss, make_actor(network.actor), network.critic),
+    ):
+        with pytest.raises(
+            ValueError, match=r"^time_limit must be 'bootstrap' or 'terminal'; got 'Terminal'$"
+        ):
             make(time_limit="Terminal")
 
 
@@ -156,7 +174,9 @@ def test_a_gradient_reaches_both_towers_and_clipped_ratios_give_none_to_the_acto
     total(loss(batch)).backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
     network.zero_grad()
-    batch["action_log_prob"] -= torch.sign(normalise(batch["advantage"])).squeeze(-1)  # beyond the clip, the good way
+    batch["action_log_prob"] -= torch.sign(normalise(batch["advantage"])).squeeze(
+        -1
+    )  # beyond the clip, the good way
     total(loss(batch)).backward()
     assert all(p.grad is None or not p.grad.any() for p in network.actor.parameters())
 
@@ -166,7 +186,9 @@ def test_objective_and_entropy_are_those_of_torchrls_own_loss(form):
     network, batch, ours = acted(with_two_states(stream(3, 6, seed=7)), form, shift=0.4)
     batch = ours.value_estimator(batch)
     found = ours(batch)
-    theirs = ClipPPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, normalize_advantage=False)
+    theirs = ClipPPOLoss(
+        make_actor(network.actor), network.critic, clip_epsilon=CLIP, normalize_advantage=False
+    )
     from torchrl.modules import set_recurrent_mode
 
     from arcade_torch.agents.layout import as_steps
@@ -217,11 +239,15 @@ def test_one_network_for_both_learns_as_two_with_its_weights(form):
 
 
 def test_the_entropy_bonus_fades_over_the_run():
-    config = PPOConfig(num_envs=3, num_steps=6, epochs=2, minibatches=3, entropy_coeff=0.4, entropy_end=0.5)
+    config = PPOConfig(
+        num_envs=3, num_steps=6, epochs=2, minibatches=3, entropy_coeff=0.4, entropy_end=0.5
+    )
     network = toy_actor_critic(3)
     training = Training(total_frames=36, generator=torch.Generator(), device=torch.device("cpu"))
     learner, seen = PPO(network, config, training), []
-    learner.loss.register_forward_pre_hook(lambda loss, _: seen.append(round(float(loss.entropy_coeff), 4)))
+    learner.loss.register_forward_pre_hook(
+        lambda loss, _: seen.append(round(float(loss.entropy_coeff), 4))
+    )
     batch = with_two_states(stream(3, 6, seed=11)).sequences()
     batch["action_log_prob"] = torch.full((3, 6), -1.6)
     learner.update(batch, 0)
@@ -246,7 +272,9 @@ def test_prediction_is_one_more_part_of_the_loss(form):
     torch.testing.assert_close(out["loss_prediction"], 0.5 * error.mean())
     out["loss_prediction"].backward()
     parts = (actor.encoder, actor.block, actor.predictor, actor.head, network.critic)
-    assert [any(p.grad is not None and p.grad.any() for p in m.parameters()) for m in parts] == [True] * 3 + [False] * 2
+    assert [any(p.grad is not None and p.grad.any() for p in m.parameters()) for m in parts] == [
+        True
+    ] * 3 + [False] * 2
 
 
 def test_it_is_a_torchrl_loss_with_its_keys():
@@ -254,7 +282,11 @@ def test_it_is_a_torchrl_loss_with_its_keys():
     batch = loss.value_estimator(batch)
     out = loss(batch)
     assert isinstance(loss, LossModule) and set(out.keys()) == set(loss.out_keys)
-    assert sorted(key for key, v in out.items() if v.requires_grad) == ["loss_critic", "loss_entropy", "loss_objective"]
+    assert sorted(key for key, v in out.items() if v.requires_grad) == [
+        "loss_critic",
+        "loss_entropy",
+        "loss_objective",
+    ]
     assert {id(p) for p in loss.parameters()} == {id(p) for p in network.parameters()}
     loss.set_keys(sample_log_prob="before", advantage="edge", reward="pay")
     batch.rename_key_("action_log_prob", "before").rename_key_(("next", "reward"), ("next", "pay"))
@@ -279,7 +311,9 @@ def test_a_norm_of_torchrl_divides_the_advantages_in_the_place_of_each_minibatch
     s = with_two_states(stream(3, 7, seed=12))
     network, batch, plain = acted(s, form, shift=0.4)
     norm = PopArtValueNorm(beta=0.5, epsilon=1e-8)
-    loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm)
+    loss = PPOLoss(
+        make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm
+    )
     loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
     batch = loss.value_estimator(batch)
     norm.update(batch["advantage"])
@@ -287,14 +321,18 @@ def test_a_norm_of_torchrl_divides_the_advantages_in_the_place_of_each_minibatch
     assert norm.debiasing_term == 0.5  # one update: a loss of estimated advantages gives none
     shifted = batch.copy().set("advantage", batch["advantage"] - batch["advantage"].mean())
     torch.testing.assert_close(parts_of(loss, shifted)["loss_objective"], wanted["loss_objective"])
-    assert not torch.allclose(found["loss_objective"], wanted["loss_objective"])  # it is not centred
+    assert not torch.allclose(
+        found["loss_objective"], wanted["loss_objective"]
+    )  # it is not centred
     assert torch.equal(found["loss_critic"], wanted["loss_critic"])
 
 
 def test_a_norm_learns_from_value_targets_where_the_loss_estimates_by_itself_in_training():
     network, batch, plain = acted(with_two_states(stream(3, 7, seed=12)))
     norm = PopArtValueNorm(beta=0.5, epsilon=1e-8)
-    loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm)
+    loss = PPOLoss(
+        make_actor(network.actor), network.critic, clip_epsilon=CLIP, advantage_norm=norm
+    )
     loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
     loss(batch)
     torch.testing.assert_close(
@@ -305,7 +343,9 @@ def test_a_norm_learns_from_value_targets_where_the_loss_estimates_by_itself_in_
 
 
 def test_the_learner_follows_the_deviation_of_its_windows():
-    config = PPOConfig(num_envs=3, num_steps=6, epochs=2, minibatches=3, learning_rate=1e-9, advantage_decay=0.9)
+    config = PPOConfig(
+        num_envs=3, num_steps=6, epochs=2, minibatches=3, learning_rate=1e-9, advantage_decay=0.9
+    )
     training = Training(total_frames=36, generator=torch.Generator(), device=torch.device("cpu"))
     learner, seen = PPO(toy_actor_critic(3), config, training), []
     window = with_two_states(stream(3, 6, seed=11)).sequences()
@@ -322,12 +362,22 @@ def test_the_learner_follows_the_deviation_of_its_windows():
     squares = 0.9 * 1.0 + 0.01**2  # without bias: weights .9 and 1 of 1.9
     deviation = advantage.std(correction=0).item()
     assert seen == pytest.approx([deviation, deviation * math.sqrt(squares / 1.9)], rel=1e-4)
-    assert PPO(toy_actor_critic(3), replace(config, advantage_decay=0.0), training).loss.advantage_norm is None
+    assert (
+        PPO(toy_actor_critic(3), replace(config, advantage_decay=0.0), training).loss.advantage_norm
+        is None
+    )
 
 
 def test_the_defaults_are_the_papers():
     c = PPOConfig()
-    assert (c.num_envs, c.num_steps, c.epochs, c.minibatches, c.gamma, c.lam) == (16, 128, 4, 16, 0.99, 0.95)
+    assert (c.num_envs, c.num_steps, c.epochs, c.minibatches, c.gamma, c.lam) == (
+        16,
+        128,
+        4,
+        16,
+        0.99,
+        0.95,
+    )
     assert (c.clip, c.entropy_coeff, c.critic_coeff, c.max_grad_norm) == (0.2, 0.01, 0.5, 0.5)
     assert (c.entropy_end, c.advantage_decay) == (1.0, 0.0)
     assert learning_rate_at(c, 0, 10**7) == 1e-4 and learning_rate_at(c, 10**7, 10**7) == 1e-10
@@ -340,17 +390,28 @@ def test_the_objective_is_a_function_of_tensors_with_the_clips_of_the_paper():
     ratio = torch.tensor([1.5, 1.5, 0.5, 1.1])
     advantage = torch.tensor([1.0, -1.0, 1.0, 2.0])
     value = torch.tensor([1.0, 0.1, 0.0, -1.0])
-    terms = ppo_objective(ratio.log(), old, advantage, value, torch.zeros(4), torch.ones(4), torch.tensor(0.2))
+    terms = ppo_objective(
+        ratio.log(), old, advantage, value, torch.zeros(4), torch.ones(4), torch.tensor(0.2)
+    )
     torch.testing.assert_close(terms["policy_loss"], -torch.tensor([1.2, -1.5, 0.5, 2.2]))
     torch.testing.assert_close(terms["value_loss"], 0.5 * torch.tensor([0.64, 0.81, 1.0, 4.0]))
-    assert terms["clipped"].tolist() == [1, 1, 1, 0] and terms["value_clipped"].tolist() == [1, 0, 0, 1]
+    assert terms["clipped"].tolist() == [1, 1, 1, 0] and terms["value_clipped"].tolist() == [
+        1,
+        0,
+        0,
+        1,
+    ]
     torch.testing.assert_close(terms["kl"], ratio - 1 - ratio.log())
-    unclipped = ppo_objective(ratio.log(), old, advantage, value, None, torch.ones(4), torch.tensor(0.2))
+    unclipped = ppo_objective(
+        ratio.log(), old, advantage, value, None, torch.ones(4), torch.tensor(0.2)
+    )
     torch.testing.assert_close(unclipped["value_loss"], 0.5 * (value - 1).square())
 
 
 def test_a_gradient_step_of_ppo_never_waits_for_the_device():
-    """TorchRL's ``ClipPPOLoss`` tests its clip, a buffer, with ``if``: a wait on a GPU in every call."""
+    """TorchRL's ``ClipPPOLoss`` tests its clip, a buffer, with ``if``: a wait on a GPU in every
+    call.
+    """
     _, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
     batch = loss.value_estimator(batch)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profiler:

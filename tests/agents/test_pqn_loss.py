@@ -9,7 +9,16 @@ from torchrl.modules import LSTMModule, QValueActor
 from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from arcade_torch.agents import DQNLoss, PQNLoss, q_lambda_return
-from tests.agents.fakes import GAMMA, LAM, chosen, lambda_return, look_into, play, stream, toy_network
+from tests.agents.fakes import (
+    GAMMA,
+    LAM,
+    chosen,
+    lambda_return,
+    look_into,
+    play,
+    stream,
+    toy_network,
+)
 
 
 def make_loss(network, **options):
@@ -34,7 +43,9 @@ def expected(network, s, steps=None, terminal=False):
     seams=st.sampled_from([0.0, 0.3]),
 )
 def test_targets_equal_those_of_a_step_by_step_play(seed, rows, steps, ends, seams):
-    """At a seam (a start without an end before it) version 0.1 cut the window and not the return: value leaked."""
+    """At a seam (a start without an end before it) version 0.1 cut the window and not the return:
+    value leaked.
+    """
     network, s = toy_network(seed), stream(rows, steps, seed, ends, seams)
     wanted_q, wanted = expected(network, s)
     loss = make_loss(network)
@@ -66,16 +77,22 @@ def test_terminal_time_limits_need_no_final_frame_but_the_windows_last(final_fra
     steps = 9 if bootstrap == "last" else 10
     _, wanted = expected(network, s, steps, terminal=True)
     loss = make_loss(network, time_limit="terminal", bootstrap=bootstrap)
-    torch.testing.assert_close(look_into(loss, s.sequences(final_frames))[1], wanted, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        look_into(loss, s.sequences(final_frames))[1], wanted, atol=1e-5, rtol=1e-5
+    )
 
 
 def test_the_published_recursion_is_the_last_bootstrap_with_terminal_time_limits():
-    """Spec of the published learner: G[L-1] = r + gamma (1 - d) m[L], then backwards with max Q of the next root."""
+    """Spec of the published learner: G[L-1] = r + gamma (1 - d) m[L], then backwards with max Q of
+    the next root.
+    """
     network, s = toy_network(1), stream(3, 12, seed=4)
     best, going = play(network, s)[0].amax(-1), GAMMA * (~(s.terminated | s.truncated)).float()
     returns = [s.reward[:, -2] + going[:, -2] * best[:, -1]]
     for t in range(s.action.shape[1] - 3, -1, -1):
-        returns.append(s.reward[:, t] + going[:, t] * ((1 - LAM) * best[:, t + 1] + LAM * returns[-1]))
+        returns.append(
+            s.reward[:, t] + going[:, t] * ((1 - LAM) * best[:, t + 1] + LAM * returns[-1])
+        )
     loss = make_loss(network, time_limit="terminal", bootstrap="last")
     target = look_into(loss, s.sequences("none"))[1]
     torch.testing.assert_close(target, torch.stack(returns[::-1], 1), atol=1e-5, rtol=1e-5)
@@ -157,8 +174,14 @@ def test_it_is_a_torchrl_loss():
     one_hot = s.stock().set("action", nn.functional.one_hot(s.action, 5))
     torch.testing.assert_close(loss(one_hot)["loss"], out["loss"])
     batch = s.stock()
-    names = {"_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys if key != "is_init"}
-    torch.testing.assert_close(loss(is_init=batch["is_init"], **names)[0], out["loss"])  # plain tensors
+    names = {
+        "_".join(key) if isinstance(key, tuple) else key: batch[key]
+        for key in loss.in_keys
+        if key != "is_init"
+    }
+    torch.testing.assert_close(
+        loss(is_init=batch["is_init"], **names)[0], out["loss"]
+    )  # plain tensors
     total, each = (make_loss(network, reduction=how)(s.stock())["loss"] for how in ("sum", "none"))
     assert each.shape == (2, 5)
     torch.testing.assert_close(total, each.sum())
@@ -167,10 +190,14 @@ def test_it_is_a_torchrl_loss():
     weighted = make_loss(network)(s.stock().set("priority_weight", weight))["loss"]
     torch.testing.assert_close(weighted, (weight * each).sum() / weight.sum())
     loss.set_keys(reward="pay")
-    torch.testing.assert_close(loss(s.stock().rename_key_(("next", "reward"), ("next", "pay")))["loss"], out["loss"])
+    torch.testing.assert_close(
+        loss(s.stock().rename_key_(("next", "reward"), ("next", "pay")))["loss"], out["loss"]
+    )
 
 
-@pytest.mark.parametrize(("kind", "lam"), [(ValueEstimators.TD0, 0.0), (ValueEstimators.TDLambda, LAM)])
+@pytest.mark.parametrize(
+    ("kind", "lam"), [(ValueEstimators.TD0, 0.0), (ValueEstimators.TDLambda, LAM)]
+)
 def test_torchrls_estimators_fit(kind, lam):
     network, s = toy_network(), stream(3, 8, seed=14)
     loss = PQNLoss(network)
@@ -182,11 +209,15 @@ def test_torchrls_estimators_fit(kind, lam):
 
 
 def test_a_stock_network_of_torchrl_is_trained_too():
-    """A ``QValueActor`` behind an ``LSTMModule``: their state keys have other names, and there are no frames."""
+    """A ``QValueActor`` behind an ``LSTMModule``: their state keys have other names, and there are
+    no frames.
+    """
     from tensordict.nn import TensorDictSequential
 
     lstm = LSTMModule(input_size=4, hidden_size=6, in_key="observation", out_key="embed")
-    network = TensorDictSequential(lstm, QValueActor(nn.Linear(6, 5), in_keys=["embed"], action_space="categorical"))
+    network = TensorDictSequential(
+        lstm, QValueActor(nn.Linear(6, 5), in_keys=["embed"], action_space="categorical")
+    )
     s = stream(3, 7, seed=15)
     batch = s.stock().exclude("pixels", "memory", ("next", "pixels"))
     batch["observation"], batch["next", "observation"] = torch.randn(3, 7, 4), torch.randn(3, 7, 4)

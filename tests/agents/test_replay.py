@@ -19,7 +19,9 @@ def windows(count):
         spare = STEPS - batch["final_mask"].shape[1]
         for key, fill in (("final_pixels", 255), ("final_index", STEPS - 1), ("final_mask", False)):
             value = batch[key]
-            batch[key] = torch.cat((value, torch.full_like(value[:, :1], fill).repeat_interleave(spare, 1)), 1)
+            batch[key] = torch.cat(
+                (value, torch.full_like(value[:, :1], fill).repeat_interleave(spare, 1)), 1
+            )
         batches.append(batch)
     return batches
 
@@ -75,7 +77,9 @@ def test_the_oldest_leaves_when_the_capacity_is_reached():
     batches = windows(5)
     replay = filled(batches, capacity=7)  # two windows of three
     assert len(replay) == 6 and (everything(replay) == torch.cat(batches[3:])).all()
-    assert (everything(filled(batches, capacity=1)) == batches[4]).all()  # the newest window stays whole
+    assert (
+        everything(filled(batches, capacity=1)) == batches[4]
+    ).all()  # the newest window stays whole
     with pytest.raises(ValueError, match=r"count must be from 1 to the 6 sequences at hand; got 7"):
         replay.sample(7, generator())
     with pytest.raises(ValueError, match="capacity"):
@@ -95,7 +99,9 @@ def test_it_goes_on_from_a_saved_moment(tmp_path):
         again.add(batch)
     mine, theirs = again.sample(5, generator(1)), replay.sample(5, generator(1))
     assert (mine == theirs).all()
-    SequenceReplay(9, tmp_path).load_state_dict(state)  # until the next checkpoint one may have to begin here again
+    SequenceReplay(9, tmp_path).load_state_dict(
+        state
+    )  # until the next checkpoint one may have to begin here again
     assert again.state_dict() == replay.state_dict()
 
 
@@ -104,7 +110,9 @@ def test_files_stay_as_long_as_a_kept_checkpoint_names_them(tmp_path):
     for batch in windows(6):
         replay.add(batch)
         states.append(replay.state_dict())
-        for state in states[-3:]:  # of the newest, which may not be written yet, and the two before it
+        for state in states[
+            -3:
+        ]:  # of the newest, which may not be written yet, and the two before it
             SequenceReplay(ROWS, tmp_path).load_state_dict(state)
         assert len(list(tmp_path.iterdir())) <= 3
 
@@ -127,6 +135,9 @@ def test_frames_of_another_size_than_those_at_hand_are_refused_in_one_line():
     first, second = windows(2)
     replay = filled([first])
     second["pixels"] = second["pixels"][:, :, :-1]
-    with pytest.raises(CheckpointError, match=r"replay holds frames \(2, 2, 3\), the network now stores \(1, 2, 3\)"):
+    with pytest.raises(
+        CheckpointError,
+        match=r"replay holds frames \(2, 2, 3\), the network now stores \(1, 2, 3\)",
+    ):
         replay.add(second)
     assert len(replay) == ROWS

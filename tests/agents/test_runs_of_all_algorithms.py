@@ -7,14 +7,28 @@ import random
 import pytest
 import torch
 
-from arcade_torch.agents import CheckpointError, NonFiniteError, evaluate, load, preset, train, training
+from arcade_torch.agents import (
+    CheckpointError,
+    NonFiniteError,
+    evaluate,
+    load,
+    preset,
+    train,
+    training,
+)
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import read_csv
 from tests.agents.test_training import assert_same_run, kill_and_resume, stop_after, weights
 
 ALGORITHMS = ("ppo", "dqn")  # PQN: test_training
-CHANGES = {"env": "CartPoleEasy-v0", "memory": "gru", "total_frames": 256, "checkpoint_every": 128, "eval_episodes": 4}
+CHANGES = {
+    "env": "CartPoleEasy-v0",
+    "memory": "gru",
+    "total_frames": 256,
+    "checkpoint_every": 128,
+    "eval_episodes": 4,
+}
 TARGET = {"dqn": {"target_every": 2}}
 
 
@@ -35,7 +49,9 @@ def crash():
 
 
 @pytest.mark.parametrize("updates", [1, 3])
-def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(whole, tmp_path, updates):
+def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(
+    whole, tmp_path, updates
+):
     what, folder, _ = whole
     with pytest.raises(ZeroDivisionError):
         train(what, tmp_path / "run", progress=stop_after(updates, crash))
@@ -45,7 +61,9 @@ def test_an_abrupt_stop_before_and_after_a_checkpoint_costs_nothing_but_time(who
 
 def test_a_killed_run_goes_on_to_the_bit_in_another_process(whole, tmp_path):
     what, folder, _ = whole
-    kill_and_resume(tmp_path / "run", random.Random(5), what)  # three updates, the checkpoint is of two
+    kill_and_resume(
+        tmp_path / "run", random.Random(5), what
+    )  # three updates, the checkpoint is of two
     assert_same_run(tmp_path / "run", folder)
 
 
@@ -56,12 +74,16 @@ def test_a_replay_with_a_target_network_goes_on_to_the_bit(tmp_path):
         train(what, tmp_path / "parts", progress=stop_after(3, crash))
     train(what, tmp_path / "parts", resume=True)
     assert_same_run(tmp_path / "parts", tmp_path / "whole")
-    names = [sorted(p.name for p in (tmp_path / run / "replay").iterdir()) for run in ("parts", "whole")]
+    names = [
+        sorted(p.name for p in (tmp_path / run / "replay").iterdir()) for run in ("parts", "whole")
+    ]
     assert names[0] == names[1] and all(name.startswith("window-") for name in names[0])
 
 
 @pytest.mark.parametrize("whole", ["dqn"], indirect=True)
-def test_a_damaged_file_of_the_replay_costs_only_the_way_since_the_checkpoint_before(whole, tmp_path):
+def test_a_damaged_file_of_the_replay_costs_only_the_way_since_the_checkpoint_before(
+    whole, tmp_path
+):
     what, folder, _ = whole
     what = dataclasses.replace(what, checkpoint_every=64)
     with pytest.raises(ZeroDivisionError):
@@ -97,10 +119,15 @@ def test_a_nan_stops_the_run_and_the_last_good_checkpoint_stays(algorithm, tmp_p
     def poison():
         next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
 
-    words = r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of .*last good checkpoint is .*128"
+    words = (
+        r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of .*last good "
+        r"checkpoint is .*128"
+    )
     with pytest.raises(NonFiniteError, match=words):
         train(config(algorithm), tmp_path / "run", progress=stop_after(3, poison))
-    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == ["frames-000000000128"]
+    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == [
+        "frames-000000000128"
+    ]
     assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
     monkeypatch.undo()
     assert train(config(algorithm), tmp_path / "run", resume=True).status == "finished"
@@ -117,15 +144,23 @@ def test_an_agent_is_loaded_and_plays_as_in_the_last_evaluation(whole):
     obs = make_eval_env(what, 4).reset()
     action, extras, _ = agent.act(obs, state)
     best = extras["logits" if what.algorithm == "ppo" else "q_value"].argmax(-1)
-    assert torch.equal(action, best) and torch.equal(agent.act(obs, state)[0], action)  # greedy: no draw
+    assert torch.equal(action, best) and torch.equal(
+        agent.act(obs, state)[0], action
+    )  # greedy: no draw
 
 
 def test_metrics_have_the_columns_of_their_algorithm(whole):
     what, folder, _ = whole
     rows = read_csv(folder / "metrics.csv")
     filled = {name for name, value in rows[-1].items() if value}
-    of_ppo, of_q = {"policy_loss", "value_loss", "entropy", "kl", "clip_fraction"}, {"epsilon", "replay_frames"}
-    assert (of_ppo <= filled, bool(of_q & filled)) == (what.algorithm == "ppo", what.algorithm != "ppo")
+    of_ppo, of_q = (
+        {"policy_loss", "value_loss", "entropy", "kl", "clip_fraction"},
+        {"epsilon", "replay_frames"},
+    )
+    assert (of_ppo <= filled, bool(of_q & filled)) == (
+        what.algorithm == "ppo",
+        what.algorithm != "ppo",
+    )
     assert {"loss", "q_mean", "td_error", "grad_norm", "lr", "episodes"} <= filled
     if what.algorithm == "dqn":
         assert not rows[0]["loss"] and rows[0]["replay_frames"]
@@ -136,13 +171,16 @@ def test_config_json_repeats_the_run(whole):
     saved = TrainConfig.from_dict(json.loads((folder / "config.json").read_text())["config"])
     assert saved == what
     changed = dataclasses.replace(what, pqn=dataclasses.replace(what.pqn, gamma=0.5))
-    assert train(changed, folder, resume=True).status == "finished"  # PQN's numbers are not this run's
+    assert (
+        train(changed, folder, resume=True).status == "finished"
+    )  # PQN's numbers are not this run's
 
 
 def test_a_mixed_run_is_evaluated_on_both_twins(tmp_path):
     what = config("ppo", observability="mixed")
     result = train(what, tmp_path / "run")
     full, partial = (
-        evaluate(load(tmp_path / "run"), twin, episodes=4).returns.tolist() for twin in ("full", "partial")
+        evaluate(load(tmp_path / "run"), twin, episodes=4).returns.tolist()
+        for twin in ("full", "partial")
     )
     assert result.evaluation.returns.tolist() == full[:2] + partial[2:]

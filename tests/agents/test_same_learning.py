@@ -1,7 +1,9 @@
-"""The losses compute what those of version 0.1 computed (commit 44399dd): ``tests/agents/data`` holds its numbers.
+"""The losses compute what those of version 0.1 computed (commit 44399dd): ``tests/agents/data``
+holds its numbers.
 
-Values and gradients agree to 1e-5 of their largest entry, from sequences of the collector and from a stock batch alike.
-Both sides compute in float64: in float32, rounding alone moves PPO's small sums by up to 1e-4 of themselves.
+Values and gradients agree to 1e-5 of their largest entry, from sequences of the collector and from
+a stock batch alike. Both sides compute in float64: in float32, rounding alone moves PPO's small
+sums by up to 1e-4 of themselves.
 """
 
 from functools import cache
@@ -20,14 +22,18 @@ from arcade_torch.models import make_actor_critic, make_network
 from tests.agents.data.tiny import NETWORK
 
 DATA = Path(__file__).parent / "data"
-GAMES, ALGORITHMS, MEMORIES = ("MineSweeperEasy", "NavigatorEasy"), ("pqn", "ppo", "dqn"), ("lru", "gru", "mlp")
+GAMES, ALGORITHMS, MEMORIES = (
+    ("MineSweeperEasy", "NavigatorEasy"),
+    ("pqn", "ppo", "dqn"),
+    ("lru", "gru", "mlp"),
+)
 TOLERANCE = 1e-5
 OVERLAP = 4  # of the stored window; its last steps are the window without overlap
 MENDED = {"burn_in"}  # here the old loss was wrong: see test_burn_in_takes_no_gradient
 RENAMED: dict[str, str] = {}  # prefix of a weight's old name -> the new one
 
 
-# -- the stored experience, in both forms a loss takes ----------------------------------------------------------------
+# -- the stored experience, in both forms a loss takes ---------------------------------------------
 
 
 @cache
@@ -37,7 +43,11 @@ def stored(name):
 
 def part(name, prefix):
     """The stored tensors below a prefix, by the rest of their names."""
-    return {key.removeprefix(prefix): value for key, value in stored(name).items() if key.startswith(prefix)}
+    return {
+        key.removeprefix(prefix): value
+        for key, value in stored(name).items()
+        if key.startswith(prefix)
+    }
 
 
 def experience(game, name, overlap):
@@ -49,7 +59,9 @@ def experience(game, name, overlap):
 
 def recurrent_state(name, overlap):
     """The state before step 0 by key, ``("memory", ...)``; none for a memory without state."""
-    return {("memory", *key.split("/")): value for key, value in part(name, f"state/{overlap}/").items()}
+    return {
+        ("memory", *key.split("/")): value for key, value in part(name, f"state/{overlap}/").items()
+    }
 
 
 def entries_of(dense, batch_size):
@@ -65,14 +77,19 @@ def entries_of(dense, batch_size):
 
 
 def sequences(game, name, overlap):
-    """As ``ArcadeCollector.collect()`` gives them, with one place more than needed: unused places hold white frames."""
+    """As ``ArcadeCollector.collect()`` gives them, with one place more than needed: unused places
+    hold white frames.
+    """
     dense = experience(game, name, overlap)
     mask = dense["next_mask"]
     rows, length = mask.shape
     places = int(mask.sum(1).max()) + 1
     batch = entries_of(dense, [rows])
     pixels = torch.full((rows, places, *dense["pixels"].shape[2:]), 255, dtype=torch.uint8)
-    index, used = torch.full((rows, places), length - 1), torch.zeros(rows, places, dtype=torch.bool)
+    index, used = (
+        torch.full((rows, places), length - 1),
+        torch.zeros(rows, places, dtype=torch.bool),
+    )
     for row in range(rows):
         steps = mask[row].nonzero().flatten()
         pixels[row, : len(steps)] = dense["next_pixels"][row, steps]
@@ -88,8 +105,8 @@ def sequences(game, name, overlap):
 
 
 def stock(game, name, overlap):
-    """As TorchRL's collector gives it: dense next frames (white where an episode terminated, nothing may look there)
-    and the state of every step, of which only the first is to be read.
+    """As TorchRL's collector gives it: dense next frames (white where an episode terminated,
+    nothing may look there) and the state of every step, of which only the first is to be read.
     """
     dense = experience(game, name, overlap)
     rows, length = dense["next_mask"].shape
@@ -113,16 +130,20 @@ def in_float64(value):
 FORMS = {"sequences": sequences, "stock": stock}
 
 
-# -- networks and cases -----------------------------------------------------------------------------------------------
+# -- networks and cases ----------------------------------------------------------------------------
 
 
 def network_of(name, weights="weights"):
-    """The recorded network; ``"other"``: DQN's target network, PPO's network after some gradient steps."""
+    """The recorded network; ``"other"``: DQN's target network, PPO's network after some gradient
+    steps.
+    """
     algorithm, memory = name.split("-")[1:]
     network = (make_actor_critic if algorithm == "ppo" else make_network)(memory=memory, **NETWORK)
     tensors = part(name, "weights/") | (part(name, "other/") if weights == "other" else {})
     shapes = {key: value.shape for key, value in network.state_dict().items()}
-    network.load_state_dict({new_name(key): value.reshape(shapes[new_name(key)]) for key, value in tensors.items()})
+    network.load_state_dict(
+        {new_name(key): value.reshape(shapes[new_name(key)]) for key, value in tensors.items()}
+    )
     return network.double()
 
 
@@ -144,13 +165,15 @@ def cases(algorithm):
 
 
 def options_of(case):
-    """Options of a case as written in its name: overlap, time_limit, bootstrap, lam, burn_in, target_network, later."""
+    """Options of a case as written in its name: overlap, time_limit, bootstrap, lam, burn_in,
+    target_network, later.
+    """
     options = dict(item.split("=") for item in case.split(","))
     whole = {"overlap": int, "lam": float, "burn_in": int, "target_network": bool, "later": bool}
     return {key: whole.get(key, str)(value) for key, value in options.items()}
 
 
-# -- to be filled in: how the losses are made -------------------------------------------------------------------------
+# -- to be filled in: how the losses are made ------------------------------------------------------
 
 
 def new_loss(algorithm, network, batch, *, target_network=None, before=None, **options):
@@ -161,19 +184,25 @@ def new_loss(algorithm, network, batch, *, target_network=None, before=None, **o
         network: what is trained; after the call its parameters have the gradients.
         batch: sequences [N] or a stock batch [N, L].
         target_network: DQN's, with other weights; None for none.
-        before: PPO only: the network that gives advantages and value targets, if it is not ``network``.
-        **options: ``time_limit`` ("bootstrap" unless given), ``bootstrap`` (PQN; "next"), ``lam`` (DQN; 0.0),
-            ``burn_in`` (DQN; 0). Everything else is the default of 0.1: gamma 0.99, lam 0.95 (PQN, PPO), clip 0.2,
-            critic 0.5, entropy 0.01; advantages are normalised over the minibatch by the population deviation + 1e-8.
+        before: PPO only: the network that gives advantages and value targets, if it is not
+            ``network``.
+        **options: ``time_limit`` ("bootstrap" unless given), ``bootstrap`` (PQN; "next"), ``lam``
+            (DQN; 0.0), ``burn_in`` (DQN; 0). Everything else is the default of 0.1: gamma 0.99, lam
+            0.95 (PQN, PPO), clip 0.2, critic 0.5, entropy 0.01; advantages are normalised over the
+            minibatch by the population deviation + 1e-8.
 
     Returns:
-        By name. PQN and DQN: ``loss``, ``target`` and ``next_value`` [N, S]. PPO: ``loss`` (the weighted sum),
-        ``policy``, ``value``, ``entropy`` (without their weights, ``entropy`` positive), ``kl``, ``clip_fraction``;
-        ``advantage``, ``value_target``, ``state_value`` [N, L].
+        By name. PQN and DQN: ``loss``, ``target`` and ``next_value`` [N, S]. PPO: ``loss`` (the
+        weighted sum), ``policy``, ``value``, ``entropy`` (without their weights, ``entropy``
+        positive), ``kl``, ``clip_fraction``; ``advantage``, ``value_target``, ``state_value`` [N,
+        L].
     """
     if algorithm == "ppo":
         return new_ppo_loss(network, batch, before or network, **options)
-    time_limit, lam = options.get("time_limit", "bootstrap"), options.get("lam", 0.95 if algorithm == "pqn" else 0.0)
+    time_limit, lam = (
+        options.get("time_limit", "bootstrap"),
+        options.get("lam", 0.95 if algorithm == "pqn" else 0.0),
+    )
     if algorithm == "pqn":
         loss = PQNLoss(network, time_limit=time_limit, bootstrap=options.get("bootstrap", "next"))
     else:
@@ -181,7 +210,9 @@ def new_loss(algorithm, network, batch, *, target_network=None, before=None, **o
         loss = DQNLoss(network, time_limit=time_limit, delay_value=has_target, burn_in=burn_in)
         if has_target:
             SoftUpdate(loss, eps=0.5)
-            loss.target_value_network_params.data.update_(TensorDict.from_module(target_network).data)
+            loss.target_value_network_params.data.update_(
+                TensorDict.from_module(target_network).data
+            )
     loss.make_value_estimator(gamma=0.99, lmbda=lam)
     out = loss(batch)
     out["loss"].backward()
@@ -216,12 +247,14 @@ def new_ppo_loss(network, batch, before, *, time_limit="bootstrap"):
     }
 
 
-# -- the comparison ---------------------------------------------------------------------------------------------------
+# -- the comparison --------------------------------------------------------------------------------
 
 
 def assert_close(found, wanted, what):
     scale = wanted.abs().max().item()
-    assert found.shape == wanted.shape, f"{what}: shape {tuple(found.shape)}, recorded {tuple(wanted.shape)}"
+    assert found.shape == wanted.shape, (
+        f"{what}: shape {tuple(found.shape)}, recorded {tuple(wanted.shape)}"
+    )
     error = (found.detach() - wanted).abs().max().item()
     assert error <= TOLERANCE * scale, f"{what}: off by {error:.2e}, largest entry {scale:.2e}"
 
@@ -260,7 +293,11 @@ def compare(name, case, form):
         if key == "next_value":
             found, wanted = counted(name, case, found), counted(name, case, wanted)
         assert_close(found, wanted, key)
-    gradients = {new_name(key.removeprefix("grad/")): value for key, value in recorded.items() if key not in outputs}
+    gradients = {
+        new_name(key.removeprefix("grad/")): value
+        for key, value in recorded.items()
+        if key not in outputs
+    }
     parameters = dict(network.named_parameters())
     assert gradients.keys() == parameters.keys()
     for key, wanted in gradients.items():
@@ -294,21 +331,30 @@ def test_dqn(name, case, form):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", [f"{game}-dqn-{memory}" for game in GAMES for memory in MEMORIES])
 def test_burn_in_takes_no_gradient(name, form):
-    """Version 0.1 let gradients through the burn-in: the values are the same, the gradients of a memory are not."""
+    """Version 0.1 let gradients through the burn-in: the values are the same, the gradients of a
+    memory are not.
+    """
     case = "overlap=4,burn_in=2"
     network, out = compute(name, case, form)
     for key in ("loss", "target"):
         wanted = stored(name)[f"{case}/{key}"]
-        assert_close(out[key], wanted[:, 2:] if key == "target" else wanted, key)  # no targets in the burn-in any more
+        assert_close(
+            out[key], wanted[:, 2:] if key == "target" else wanted, key
+        )  # no targets in the burn-in any more
     parameters = dict(network.named_parameters())
     differs = [
-        not torch.allclose(parameters[new_name(key)].grad.reshape(wanted.shape), wanted.double(), rtol=1e-3, atol=1e-6)
+        not torch.allclose(
+            parameters[new_name(key)].grad.reshape(wanted.shape),
+            wanted.double(),
+            rtol=1e-3,
+            atol=1e-6,
+        )
         for key, wanted in part(name, f"{case}/grad/").items()
     ]
     assert any(differs) == (not name.endswith("mlp"))
 
 
-# -- the data itself --------------------------------------------------------------------------------------------------
+# -- the data itself -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("game", GAMES)

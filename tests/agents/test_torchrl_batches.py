@@ -1,4 +1,6 @@
-"""Batches as TorchRL's own tools make them: padded, sliced, flat, nested, weighted; what cannot be read is refused."""
+"""Batches as TorchRL's own tools make them: padded, sliced, flat, nested, weighted; what cannot be
+read is refused.
+"""
 
 import pytest
 import torch
@@ -30,11 +32,14 @@ def make_loss(network, kind=DQNLoss, **options):
 
 
 def numbered(s, zeros=False):
-    """A stock batch with the counts of an env: steps since the episode began, and a number for each trajectory; its
-    states are finite, at true starts zero.
+    """A stock batch with the counts of an env: steps since the episode began, and a number for each
+    trajectory; its states are finite, at true starts zero.
     """
     batch, (rows, steps) = s.stock(), s.action.shape
-    count, number = torch.zeros(rows, steps, dtype=torch.int64), torch.zeros(rows, steps, dtype=torch.int64)
+    count, number = (
+        torch.zeros(rows, steps, dtype=torch.int64),
+        torch.zeros(rows, steps, dtype=torch.int64),
+    )
     for b in range(rows):
         at = 0 if s.is_init[b, 0] else 3
         for t in range(steps):
@@ -55,12 +60,14 @@ def numbered(s, zeros=False):
 def slices(batch, length=4, count=6):
     """What a replay of single steps draws, flat; where it cut an episode it has set ``is_init``."""
     sampler = SliceSampler(slice_len=length, traj_key=("collector", "traj_ids"))
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(500), sampler=sampler, batch_size=length * count)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(500), sampler=sampler, batch_size=length * count
+    )
     buffer.extend(batch.reshape(-1))
     return buffer.sample()
 
 
-# -- trajectories padded with zeros -----------------------------------------------------------------------------------
+# -- trajectories padded with zeros ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", ["mask", ("collector", "mask")])
@@ -72,12 +79,17 @@ def test_the_last_step_of_a_padded_trajectory_reads_its_own_next_frame(key, seam
     wanted = lambda_return(s.reward, after.amax(-1), s.terminated, s.cut, GAMMA, LAM)
     prefix = "collector" if key == ("collector", "mask") else None
     split = split_trajectories(
-        batch if prefix else batch.exclude("collector").set("traj_ids", batch["collector", "traj_ids"]), prefix=prefix
+        batch
+        if prefix
+        else batch.exclude("collector").set("traj_ids", batch["collector", "traj_ids"]),
+        prefix=prefix,
     )
     mask = split[key].view(split.shape)
     assert not mask.all() and mask.sum() == s.action.numel()
     loss = make_loss(network)
-    torch.testing.assert_close(look_into(loss, split)[1][mask], wanted.flatten(), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        look_into(loss, split)[1][mask], wanted.flatten(), atol=1e-5, rtol=1e-5
+    )
     if prefix:  # by default TorchRL's losses look for no other mask
         error = chosen(q, s.action) - wanted
         means = {"loss": 0.5 * error.square(), "q_mean": chosen(q, s.action), "target_mean": wanted}
@@ -104,7 +116,7 @@ def test_an_entry_called_mask_that_is_none_of_steps_changes_nothing():
     assert torch.equal(loss(s.stock().set("mask", allowed))["loss"], loss(s.stock())["loss"])
 
 
-# -- what cannot be read ----------------------------------------------------------------------------------------------
+# -- what cannot be read ---------------------------------------------------------------------------
 
 
 def readers(**options):
@@ -117,7 +129,9 @@ def readers(**options):
 def test_steps_joined_to_n_steps_are_refused():
     batch = MultiStep(GAMMA, 3)(stream(3, 8, seed=1).stock())
     for read in readers():
-        with pytest.raises(ValueError, match=r"^the batch must be .*lmbda.*; got 'steps_to_next_obs'$"):
+        with pytest.raises(
+            ValueError, match=r"^the batch must be .*lmbda.*; got 'steps_to_next_obs'$"
+        ):
             read(batch.clone())
 
 
@@ -152,7 +166,9 @@ def test_no_true_start_is_taken_for_the_cut_of_a_sampler():
     for read in readers(store="sequence"):
         read(numbered(s))  # episodes begin with zeros
         stale = numbered(s)
-        stale["memory", "h"] = torch.rand_like(stale["memory", "h"]) + 0.1  # or with what the one before left
+        stale["memory", "h"] = (
+            torch.rand_like(stale["memory", "h"]) + 0.1
+        )  # or with what the one before left
         read(stale)
         read(s.sequences().set("step_count", torch.ones(4, 12, 1)).set("memory", stale["memory"]))
         nothing = slices(numbered(s, zeros=True), 2)  # no state is lost
@@ -181,18 +197,26 @@ def test_a_burn_in_of_a_flat_batch_of_slices_is_refused():
     torch.testing.assert_close(loss(one[0].clone())["loss"], loss(one)["loss"])
 
 
-# -- shapes, weights, priorities --------------------------------------------------------------------------------------
+# -- shapes, weights, priorities -------------------------------------------------------------------
 
 
 def weighing(batch, loss, weight, shape):
     """Each reduction of a loss with weights, against the plain errors."""
     each = loss(batch.clone())["loss"].detach()
-    full = weight.reshape(len(weight), *[1] * (each.ndim - weight.ndim), *weight.shape[1:]).expand_as(each)
+    full = weight.reshape(
+        len(weight), *[1] * (each.ndim - weight.ndim), *weight.shape[1:]
+    ).expand_as(each)
     assert each.shape == shape
-    wanted = {"none": each * full, "sum": (each * full).sum(), "mean": (each * full).sum() / full.sum()}
+    wanted = {
+        "none": each * full,
+        "sum": (each * full).sum(),
+        "mean": (each * full).sum() / full.sum(),
+    }
     for how, value in wanted.items():
         loss.reduction = how
-        torch.testing.assert_close(loss(batch.clone().set("priority_weight", weight))["loss"].detach(), value)
+        torch.testing.assert_close(
+            loss(batch.clone().set("priority_weight", weight))["loss"].detach(), value
+        )
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])
@@ -210,7 +234,9 @@ def test_weights_fit_every_layout(burn_in):
     for shape in ((4, 7), (2, 2, 7)):
         each = loss()(stock.clone().reshape(shape))["loss"]
         assert each.shape == (*shape[:-1], left)
-        found = loss()(stock.clone().reshape(shape).set("priority_weight", weight.view(shape)))["loss"]
+        found = loss()(stock.clone().reshape(shape).set("priority_weight", weight.view(shape)))[
+            "loss"
+        ]
         torch.testing.assert_close(found, each * weight.view(shape)[..., burn_in:])
     each = loss()(stock[1].clone())["loss"]
     assert each.shape == (left,)
@@ -225,10 +251,14 @@ def test_batches_of_nested_envs_are_read_row_by_row():
     nested = s.stock().reshape(2, 3, 7)
     for read in readers():
         out, wanted = read(nested.clone()), read(s.stock())
-        for key in ("loss", "q_mean") if "loss" in out else ("advantage", "value_target", "state_value"):
+        for key in (
+            ("loss", "q_mean") if "loss" in out else ("advantage", "value_target", "state_value")
+        ):
             found = out[key] if key in ("loss", "q_mean") else out[key].view(6, 7, 1)
             assert torch.equal(found, wanted[key])
-    assert SequenceGAE(toy_network(out_key="state_value", outputs=1))(nested)["advantage"].shape == (2, 3, 7, 1)
+    assert SequenceGAE(toy_network(out_key="state_value", outputs=1))(nested)[
+        "advantage"
+    ].shape == (2, 3, 7, 1)
 
 
 @pytest.mark.parametrize(("burn_in", "bootstrap"), [(0, "next"), (2, "next"), (0, "last")])
@@ -238,11 +268,18 @@ def test_priorities_are_written_where_torchrl_looks_for_them(burn_in, bootstrap)
     loss, steps = make_loss(network, **kind), slice(burn_in, 6 if bootstrap == "last" else 7)
     q, target, _ = look_into(loss, s.stock())
     wanted = (chosen(q, s.action[:, burn_in:])[:, : target.shape[1]] - target).abs()
-    for form in (s.stock(), s.sequences(), s.stock().reshape(2, 2, 7), *[s.stock()[0]] * (not burn_in)):
+    for form in (
+        s.stock(),
+        s.sequences(),
+        s.stock().reshape(2, 2, 7),
+        *[s.stock()[0]] * (not burn_in),
+    ):
         loss(form)
         found, rows = form["td_error"], 1 if form.batch_size == (7,) else 4
         shape = (4, 7) if form.batch_size == (4,) else form.shape
-        assert found.shape == (*shape, 1) and not found.requires_grad  # TorchRL's, so that it can go on with it
+        assert (
+            found.shape == (*shape, 1) and not found.requires_grad
+        )  # TorchRL's, so that it can go on with it
         found = found.reshape(rows, 7)
         torch.testing.assert_close(found[:, steps], wanted[:rows])
         outside = torch.cat((found[:, : steps.start], found[:, steps.stop :]), 1)
@@ -254,4 +291,6 @@ def test_priorities_are_written_where_torchrl_looks_for_them(burn_in, bootstrap)
     loss(s.stock().lock_())
     assert set(data.keys()) == before
     loss.set_keys(priority="surprise")
-    torch.testing.assert_close(loss(batch := s.stock())["td_error"], batch["surprise"][:, steps].mean())
+    torch.testing.assert_close(
+        loss(batch := s.stock())["td_error"], batch["surprise"][:, steps].mean()
+    )

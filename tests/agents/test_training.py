@@ -33,9 +33,13 @@ from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_checkpoin
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS
 
-CONFIG = preset("smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=256, checkpoint_every=128)
+CONFIG = preset(
+    "smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=256, checkpoint_every=128
+)
 WITH_OVERLAP = dataclasses.replace(
-    CONFIG, memory="lru", pqn=dataclasses.replace(CONFIG.pqn, overlap=3, bootstrap="last", minibatches=8)
+    CONFIG,
+    memory="lru",
+    pqn=dataclasses.replace(CONFIG.pqn, overlap=3, bootstrap="last", minibatches=8),
 )
 
 
@@ -56,11 +60,15 @@ def assert_same_run(one: Path, other: Path):
     assert mine.keys() == theirs.keys()
     assert all(torch.equal(mine[name], theirs[name]) for name in mine)
     timeless = [c for c in METRIC_COLUMNS if c not in ("seconds", "fps")]
-    rows = [[[row[c] for c in timeless] for row in read_csv(f / "metrics.csv")] for f in (one, other)]
+    rows = [
+        [[row[c] for c in timeless] for row in read_csv(f / "metrics.csv")] for f in (one, other)
+    ]
     assert rows[0] == rows[1]
     assert (one / "eval.csv").read_text() == (other / "eval.csv").read_text()
     finals = [json.loads((f / "eval.json").read_text()) for f in (one, other)]
-    assert all(finals[0][k] == finals[1][k] for k in ("returns", "lengths", "mean", "train_max_ewm"))
+    assert all(
+        finals[0][k] == finals[1][k] for k in ("returns", "lengths", "mean", "train_max_ewm")
+    )
 
 
 def stop_after(updates, action):
@@ -74,7 +82,9 @@ def stop_after(updates, action):
 
 
 def assert_goes_on_to_the_bit(config: TrainConfig, folder: Path) -> Path:
-    """Train once through and once interrupted after two updates; returns the folder of the second."""
+    """Train once through and once interrupted after two updates; returns the folder of the
+    second.
+    """
 
     def stop() -> None:
         raise KeyboardInterrupt
@@ -91,7 +101,9 @@ def test_a_run_leaves_its_files(whole):
     folder, result = whole
     assert (result.status, result.frames) == ("finished", 640)
     rows = read_csv(folder / "metrics.csv")
-    assert tuple(rows[0]) == METRIC_COLUMNS and tuple(read_csv(folder / "eval.csv")[0]) == EVAL_COLUMNS
+    assert (
+        tuple(rows[0]) == METRIC_COLUMNS and tuple(read_csv(folder / "eval.csv")[0]) == EVAL_COLUMNS
+    )
     assert [int(r["frames"]) for r in rows] == list(range(64, 641, 64))
     assert [int(r["grad_steps"]) for r in rows] == [8 * i for i in range(1, 11)]
     assert [int(r["frames"]) for r in read_csv(folder / "eval.csv")] == [256, 512, 640]
@@ -100,10 +112,16 @@ def test_a_run_leaves_its_files(whole):
     final = json.loads((folder / "eval.json").read_text())
     assert final["status"] == "finished" and len(final["returns"]) == len(final["lengths"]) == 4
     assert result.evaluation.mean == pytest.approx(sum(final["returns"]) / 4)
-    points = [(int(r["frames"]), float(r["train_return_last"])) for r in rows if r["train_return_last"]]
+    points = [
+        (int(r["frames"]), float(r["train_return_last"])) for r in rows if r["train_return_last"]
+    ]
     assert result.train_max_ewm == pytest.approx(paper_score(*zip(*points, strict=True)))
     progress = json.loads((folder / "progress.json").read_text())
-    assert (progress["frames"], progress["total_frames"], progress["status"]) == (640, 640, "finished")
+    assert (progress["frames"], progress["total_frames"], progress["status"]) == (
+        640,
+        640,
+        "finished",
+    )
     assert len(list_checkpoints(folder / "checkpoints")) == 2
     saved = json.loads((folder / "config.json").read_text())
     assert type(CONFIG).from_dict(saved["config"]) == CONFIG and saved["versions"]["torch"]
@@ -118,7 +136,9 @@ def test_resuming_a_finished_run_returns_its_result_at_once(whole, monkeypatch):
 
 
 @pytest.mark.parametrize("left", ["{", None])
-def test_a_finished_run_whose_result_is_lost_is_evaluated_again_and_logged_once(whole, tmp_path, left):
+def test_a_finished_run_whose_result_is_lost_is_evaluated_again_and_logged_once(
+    whole, tmp_path, left
+):
     run = shutil.copytree(whole[0], tmp_path / "run")
     (run / "eval.json").write_text(left) if left else (run / "eval.json").unlink()
     assert train(CONFIG, run, resume=True).status == "finished"
@@ -131,7 +151,8 @@ def test_a_folder_that_is_taken_is_refused_and_left_alone(whole, tmp_path):
     with pytest.raises(RunFolderError, match="resume=True"):
         train(CONFIG, folder)
     with pytest.raises(
-        RunFolderError, match=r"another run; differing fields: pqn\.lam \(0\.8 != 0\.5\), seed \(0 != 3\)"
+        RunFolderError,
+        match=r"another run; differing fields: pqn\.lam \(0\.8 != 0\.5\), seed \(0 != 3\)",
     ):
         pqn = dataclasses.replace(CONFIG.pqn, lam=0.5)
         train(dataclasses.replace(CONFIG, seed=3, pqn=pqn), folder, resume=True)
@@ -143,7 +164,10 @@ def test_a_folder_that_is_taken_is_refused_and_left_alone(whole, tmp_path):
 
 def test_a_bare_name_is_the_run_of_the_version_it_means(whole, monkeypatch):
     monkeypatch.setattr(training, "Trainer", None)
-    assert train(dataclasses.replace(CONFIG, env="CartPoleEasy"), whole[0], resume=True).status == "finished"
+    assert (
+        train(dataclasses.replace(CONFIG, env="CartPoleEasy"), whole[0], resume=True).status
+        == "finished"
+    )
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
@@ -161,7 +185,9 @@ def test_an_unknown_game_leaves_no_folder_behind(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_run_at_an_update_and_it_goes_on_to_the_bit(whole, tmp_path, number):
     handler = signal.getsignal(number)
-    result = train(CONFIG, tmp_path / "run", progress=stop_after(3, lambda: os.kill(os.getpid(), number)))
+    result = train(
+        CONFIG, tmp_path / "run", progress=stop_after(3, lambda: os.kill(os.getpid(), number))
+    )
     assert (result.status, result.frames, result.evaluation) == ("interrupted", 192, None)
     assert json.loads((tmp_path / "run" / "progress.json").read_text())["status"] == "interrupted"
     assert list_checkpoints(tmp_path / "run" / "checkpoints")[0].name == "frames-000000000192"
@@ -226,10 +252,15 @@ def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
     def poison():
         next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
 
-    words = r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of 8; the last good checkpoint is .*128"
+    words = (
+        r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of 8; the last good "
+        r"checkpoint is .*128"
+    )
     with pytest.raises(NonFiniteError, match=words):
         train(CONFIG, tmp_path / "run", progress=stop_after(3, poison))
-    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == ["frames-000000000128"]
+    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == [
+        "frames-000000000128"
+    ]
     assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
     assert load(tmp_path / "run").frames == 128
     assert "loss is nan" in json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
@@ -245,9 +276,14 @@ def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> 
     assert trainer.learner.optimizer.param_groups[0]["lr"] is rate
 
 
-def test_a_gpu_that_is_not_there_is_refused_in_one_line_and_leaves_no_folder_behind(tmp_path, monkeypatch):
+def test_a_gpu_that_is_not_there_is_refused_in_one_line_and_leaves_no_folder_behind(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match=r"^device is 'cuda', but torch sees no GPU: use 'cpu', or install torch with"):
+    with pytest.raises(
+        ValueError,
+        match=r"^device is 'cuda', but torch sees no GPU: use 'cpu', or install torch with",
+    ):
         train(dataclasses.replace(CONFIG, device="cuda"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -259,7 +295,9 @@ def test_the_generator_that_is_saved_is_that_of_the_device_on_which_actions_are_
     def stop(*_):
         raise Made
 
-    monkeypatch.setattr(training, "pick_devices", lambda device: (torch.device(device), None), raising=False)
+    monkeypatch.setattr(
+        training, "pick_devices", lambda device: (torch.device(device), None), raising=False
+    )
     monkeypatch.setattr(training, "build_network", lambda config: None)
     monkeypatch.setitem(training.LEARNERS, "pqn", stop)
     generators = [torch.Generator(), torch.Generator()]
@@ -279,8 +317,12 @@ train(TrainConfig.from_dict(json.loads(sys.argv[1])), sys.argv[2])
 
 
 def kill_and_resume(folder: Path, rng: random.Random, config: TrainConfig = CONFIG) -> int:
-    """Start a run in another process, kill it at a random moment, go on here; returns how many rows it had left."""
-    process = subprocess.Popen([sys.executable, "-c", KILLED, json.dumps(config.to_dict()), str(folder)])
+    """Start a run in another process, kill it at a random moment, go on here; returns how many rows
+    it had left.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, json.dumps(config.to_dict()), str(folder)]
+    )
     try:
         rows, deadline = rng.randint(1, config.num_updates - 1), time.monotonic() + 120
         log = folder / "metrics.csv"
@@ -324,7 +366,9 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(whole, tmp_pa
     train(dataclasses.replace(CONFIG, seed=1), tmp_path / "other")
     assert any(
         not torch.equal(w, v)
-        for w, v in zip(weights(tmp_path / "other").values(), weights(whole[0]).values(), strict=True)
+        for w, v in zip(
+            weights(tmp_path / "other").values(), weights(whole[0]).values(), strict=True
+        )
     )
 
 
@@ -335,7 +379,11 @@ def test_an_agent_is_loaded_from_a_run_or_a_checkpoint(whole):
     assert agent.frames == result.frames and agent.config == CONFIG
     saved = load_file(newest / "weights.safetensors")
     assert all(torch.equal(v, saved[k]) for k, v in agent.network.state_dict().items())
-    assert load(newest).frames == 640 and load(previous).frames == 512 and load(folder / "checkpoints").frames == 640
+    assert (
+        load(newest).frames == 640
+        and load(previous).frames == 512
+        and load(folder / "checkpoints").frames == 640
+    )
     again = evaluate(agent, episodes=4)
     assert again.returns.tolist() == result.evaluation.returns.tolist()
 
@@ -346,7 +394,9 @@ def test_the_weights_that_act_are_evaluated_saved_and_loaded(tmp_path):
     result = train(config, tmp_path)
     agent, (newest, _) = load(tmp_path), list_checkpoints(tmp_path / "checkpoints")
     trained = load_checkpoint(newest).trainer["network"]
-    assert any(not torch.equal(value, trained[name]) for name, value in agent.network.state_dict().items())
+    assert any(
+        not torch.equal(value, trained[name]) for name, value in agent.network.state_dict().items()
+    )
     assert evaluate(agent, episodes=4).returns.tolist() == result.evaluation.returns.tolist()
 
 
@@ -359,7 +409,11 @@ def test_loading_nothing_says_what_was_found(tmp_path):
 
 def test_bad_evaluation_arguments_are_named(whole):
     agent = load(whole[0])
-    for change, words in (({"episodes": 0}, "episodes"), ({"seed": -1}, "seed"), ({"observability": "half"}, "'full'")):
+    for change, words in (
+        ({"episodes": 0}, "episodes"),
+        ({"seed": -1}, "seed"),
+        ({"observability": "half"}, "'full'"),
+    ):
         with pytest.raises(ValueError, match=words):
             evaluate(agent, **change)
 

@@ -1,4 +1,6 @@
-"""Trainings that are ended from outside (a dropped connection, a full disk, a folder that is gone), and bad weights."""
+"""Trainings that are ended from outside (a dropped connection, a full disk, a folder that is gone),
+and bad weights.
+"""
 
 import errno
 import json
@@ -19,7 +21,9 @@ from arcade_torch.agents.runs import files
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import checksum, read_json, write_json
 
-CONFIG = preset("smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=0, checkpoint_every=128)
+CONFIG = preset(
+    "smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=0, checkpoint_every=128
+)
 
 LONG = """
 import sys
@@ -36,7 +40,10 @@ def test_a_dropped_connection_saves_and_nohup_ignores_it(tmp_path: Path, ignored
     handler = signal.SIG_IGN if ignored else signal.SIG_DFL
     words = [sys.executable, "-c", LONG, str(tmp_path / "run")]
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGHUP, handler)
+        words,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, handler),
     ) as process:
         assert process.stdout is not None and process.stdout.readline() == "update\n"
         process.send_signal(signal.SIGHUP)
@@ -60,7 +67,9 @@ def test_a_run_whose_folder_is_gone_ends_at_its_next_checkpoint(tmp_path: Path, 
         if row["frames"] == 128:
             shutil.rmtree(run) if how == "removed" else run.rename(tmp_path / "elsewhere")
 
-    with pytest.raises(RunFolderError, match=r"run is not there any more, or its config\.json: the run ends here"):
+    with pytest.raises(
+        RunFolderError, match=r"run is not there any more, or its config\.json: the run ends here"
+    ):
         train(CONFIG, run, progress=progress)
     assert seen[-1] < 640 and not run.exists()
 
@@ -78,7 +87,10 @@ def test_a_full_disk_ends_a_run_in_one_line_and_it_goes_on_when_there_is_room(
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", fill)
-        message = r"could not write .*weights\.safetensors: No space left on device; frames-000000000256 is whole"
+        message = (
+            r"could not write .*weights\.safetensors: No space left on device; frames-000000000256 "
+            r"is whole"
+        )
         with pytest.raises(RunFolderError, match=message):
             train(CONFIG, run)
     assert read_json(run / "progress.json")["status"] == "failed"
@@ -97,7 +109,9 @@ def changed(trained: Path, folder: Path, change: object) -> Path:
     shutil.copytree(trained, folder)
     newest = list_checkpoints(folder / "checkpoints")[0]
     tensors = load_file(newest / "weights.safetensors")
-    name = next(name for name, value in tensors.items() if value.is_floating_point() and value.numel() > 1)
+    name = next(
+        name for name, value in tensors.items() if value.is_floating_point() and value.numel() > 1
+    )
     tensors[name] = change(tensors[name])  # type: ignore[operator]
     save_file(tensors, newest / "weights.safetensors")
     meta = read_json(newest / "meta.json")
@@ -115,14 +129,18 @@ def changed(trained: Path, folder: Path, change: object) -> Path:
         (lambda x: x.double(), "is torch.float64, the network has torch.float32"),
     ],
 )
-def test_weights_that_mean_nothing_are_refused(trained: Path, tmp_path: Path, change: object, says: str) -> None:
+def test_weights_that_mean_nothing_are_refused(
+    trained: Path, tmp_path: Path, change: object, says: str
+) -> None:
     """Before: they were evaluated to a mean with an interval, exit code 0."""
     path = changed(trained, tmp_path / "run", change)
     with pytest.raises(CheckpointError, match=says):
         load(path)
 
 
-def test_a_disk_that_is_full_at_the_end_still_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_is_full_at_the_end_still_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(path: Path, data: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 

@@ -1,4 +1,5 @@
-"""Interrupts a collector at random moments, in a process of its own: ``python -m tests.arcade_torch.interrupts -h``.
+"""Interrupts a collector at random moments, in a process of its own: ``python -m
+tests.arcade_torch.interrupts -h``.
 
 Prints how many windows were collected and interrupted. A crash ends the process, a fault raises.
 """
@@ -44,11 +45,15 @@ def follows_on(batch) -> None:
 
 
 def run(game: str, same: bool, interrupts: int, seed: int) -> tuple[int, int]:
-    """Collect until there were so many interrupts; returns how many windows were collected, and interrupted."""
+    """Collect until there were so many interrupts; returns how many windows were collected, and
+    interrupted.
+    """
     global armed
     draw = random.Random(seed)
     env = make(game, num_envs=NUM_ENVS, seed=seed)
-    collector = ArcadeCollector(env, None, frames_per_batch=NUM_ENVS * STEPS, return_same_td=same, seed=seed)
+    collector = ArcadeCollector(
+        env, None, frames_per_batch=NUM_ENVS * STEPS, return_same_td=same, seed=seed
+    )
     collector.collect()
     began = time.perf_counter()
     collector.collect()
@@ -67,7 +72,8 @@ def run(game: str, same: bool, interrupts: int, seed: int) -> tuple[int, int]:
         except KeyboardInterrupt:
             stopped += 1
         if batch is None:
-            # With shared storage the window that was lost has written over the batch before; it can still be read.
+            # With shared storage the window that was lost has written over the batch before; it can
+            # still be read.
             for old, _ in held if same else ():
                 old.apply(lambda value: value.clone())
             held = deque(maxlen=3) if same else held

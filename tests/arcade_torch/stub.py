@@ -55,7 +55,15 @@ class StubGame(Game[State]):
 
     def render(self, state: State, partial: Any) -> Array:
         serial = jnp.where(partial, jnp.uint32(0), state.clock.serial)
-        rows = [state.clock.count, serial, serial >> 8, serial >> 16, state.dice[0], state.dice[1], state.total]
+        rows = [
+            state.clock.count,
+            serial,
+            serial >> 8,
+            serial >> 16,
+            state.dice[0],
+            state.dice[1],
+            state.total,
+        ]
         column = jnp.stack([jnp.asarray(row).astype(jnp.uint8) for row in rows] + [jnp.uint8(7)])
         return jnp.broadcast_to(column[:, None, None], (8, 8, 3))
 
@@ -68,7 +76,8 @@ class Coin(NamedTuple):
 
 
 class CoinGame(Game[Coin]):
-    """Tosses a coin: action 0 keeps it, any other tosses it. Ends at five heads in a row, truncates at seven steps.
+    """Tosses a coin: action 0 keeps it, any other tosses it. Ends at five heads in a row, truncates
+    at seven steps.
 
     The frame shows the count and the coin, the partial one all but the coin.
     """
@@ -85,7 +94,12 @@ class CoinGame(Game[Coin]):
     def step(self, key: Array, state: Coin, action: Array) -> tuple[Coin, Array, Array, Array]:
         heads = jnp.where(action == 0, state.heads, jax.random.bernoulli(key))
         count = state.count + jnp.uint8(1)
-        return Coin(heads, count), heads.astype(jnp.float32) / 7, heads & (count == 5), count >= self.max_steps
+        return (
+            Coin(heads, count),
+            heads.astype(jnp.float32) / 7,
+            heads & (count == 5),
+            count >= self.max_steps,
+        )
 
     def render(self, state: Coin, partial: Any) -> Array:
         coin = jnp.where(partial, 0, 100 + state.heads.astype(jnp.uint8))
@@ -93,8 +107,8 @@ class CoinGame(Game[Coin]):
         return jnp.broadcast_to(column[:, None, None], (8, 8, 3))
 
 
-# Shared by all test modules, so that each is compiled once. In the second all envs end at once, in every fifth step;
-# the third has four envs of one game and two of another where there are six.
+# Shared by all test modules, so that each is compiled once. In the second all envs end at once, in
+# every fifth step; the third has four envs of one game and two of another where there are six.
 GAME = CompiledGame(StubGame())
 LOCKSTEP = CompiledGame(StubGame(risk=0.0, max_steps=5))
 MIXED = CompiledGame(MixedGames([StubGame(), CoinGame()], weights=(2, 1)))

@@ -1,4 +1,6 @@
-"""Laws of the collector: the same data as TorchRL's, every frame once, sequences that replay, resuming to the bit."""
+"""Laws of the collector: the same data as TorchRL's, every frame once, sequences that replay,
+resuming to the bit.
+"""
 
 import itertools
 import re
@@ -27,8 +29,12 @@ def stub_env(game: CompiledGame = GAME, seed: int = 3, **options: Any) -> Arcade
     return ArcadeEnv(game, N, seed=seed, **options)
 
 
-def stub_collector(policy: Any, game: CompiledGame = GAME, seed: int = 3, **options: Any) -> ArcadeCollector:
-    return ArcadeCollector(stub_env(game, seed), policy, options.pop("frames_per_batch", N * T), **options)
+def stub_collector(
+    policy: Any, game: CompiledGame = GAME, seed: int = 3, **options: Any
+) -> ArcadeCollector:
+    return ArcadeCollector(
+        stub_env(game, seed), policy, options.pop("frames_per_batch", N * T), **options
+    )
 
 
 def scripted(td: TensorDictBase) -> TensorDictBase:
@@ -40,7 +46,9 @@ def scripted(td: TensorDictBase) -> TensorDictBase:
 
 
 class Recurrent(nn.Module):
-    """A deterministic policy with a memory: a leaky sum of what it saw, forgotten at the start of an episode."""
+    """A deterministic policy with a memory: a leaky sum of what it saw, forgotten at the start of
+    an episode.
+    """
 
     in_keys = ("pixels", "last_action", "is_init", ("memory", "sum"))
     out_keys = ("action", "total", ("next", "memory", "sum"))
@@ -50,7 +58,9 @@ class Recurrent(nn.Module):
         return TensorDictPrimer(spec, default_value={"memory": {"sum": 0.5}})
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        seen = td["pixels"].flatten(1).float().sum(-1, keepdim=True) / 1000 + td["last_action"].unsqueeze(-1)
+        seen = td["pixels"].flatten(1).float().sum(-1, keepdim=True) / 1000 + td[
+            "last_action"
+        ].unsqueeze(-1)
         total = torch.where(td["is_init"], 0.5, td["memory", "sum"]) / 2 + seen
         td["action"] = (total.squeeze(-1) * 7).long() % 5
         td["total"] = td["next", "memory", "sum"] = total
@@ -67,15 +77,23 @@ def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
 
 def steps(batch: TensorDictBase) -> TensorDictBase:
     """The entries of sequences that have an axis of time, as a batch [N, L]."""
-    keys = [key for key in batch.keys(True, True) if key[0] != "initial_state" and not str(key).startswith("final_")]
+    keys = [
+        key
+        for key in batch.keys(True, True)
+        if key[0] != "initial_state" and not str(key).startswith("final_")
+    ]
     return batch.select(*keys).clone().auto_batch_size_(2)
 
 
-# -- the same data as TorchRL's ---------------------------------------------------------------------------------------
+# -- the same data as TorchRL's --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("game", "steps"), [(GAME, 200), (LOCKSTEP, 24), (MIXED, 24)])  # 1000 and 120 steps an env
-def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(game: CompiledGame, steps: int) -> None:
+@pytest.mark.parametrize(
+    ("game", "steps"), [(GAME, 200), (LOCKSTEP, 24), (MIXED, 24)]
+)  # 1000 and 120 steps an env
+def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(
+    game: CompiledGame, steps: int
+) -> None:
     windows = 5
     options = {"frames_per_batch": N * steps, "total_frames": N * steps * windows}
     stock = torch.cat(list(Collector(stub_env(game), scripted, **options)), 1)
@@ -103,7 +121,9 @@ def test_compact_batches_lack_only_the_next_frames() -> None:
 @pytest.mark.parametrize("overlap", [0, 4])
 @pytest.mark.parametrize("mode", ["all", "truncated", "none"])
 def test_iteration_gives_all_next_frames_or_none(mode: Any, overlap: int) -> None:
-    """Where final frames were not drawn, the first frames of the next episodes stood in their place."""
+    """Where final frames were not drawn, the first frames of the next episodes stood in their
+    place.
+    """
     rollout = stub_env().rollout(3 * T + overlap, scripted, break_when_any_done=False)[:, overlap:]
     batches = stub_collector(scripted, total_frames=3 * N * T, final_frames=mode, overlap=overlap)
     ours = torch.cat(list(batches), 1).exclude("collector")
@@ -119,14 +139,19 @@ def test_sequences_hold_the_data_of_a_rollout(game: CompiledGame, overlap: int) 
     for window in range(10):
         found = steps(collector.collect())
         assert len(list(found.keys(True, True))) == (14 if game is not MIXED else 15)
-        assert_same(found, rollout[:, window * T : (window + 1) * T + overlap].select(*found.keys(True, True)))
+        assert_same(
+            found,
+            rollout[:, window * T : (window + 1) * T + overlap].select(*found.keys(True, True)),
+        )
 
 
-# -- the observations that follow a step ------------------------------------------------------------------------------
+# -- the observations that follow a step -----------------------------------------------------------
 
 
 def dense_next_pixels(batch: TensorDictBase) -> torch.Tensor:
-    """Dense next observations from a batch of sequences with final_pixels, as its description has it."""
+    """Dense next observations from a batch of sequences with final_pixels, as its description has
+    it.
+    """
     dense = torch.cat([batch["pixels"][:, 1:], batch["pixels"][:, :1] * 0], 1)
     for row, place in batch["final_mask"].nonzero().tolist():
         dense[row, batch["final_index"][row, place]] = batch["final_pixels"][row, place]
@@ -144,16 +169,22 @@ def small(pixels: torch.Tensor) -> torch.Tensor:
 def test_next_observations_of_sequences_are_those_of_a_rollout(
     game: CompiledGame, overlap: int, mode: Any, compress: Any
 ) -> None:
-    """Terminations, truncations, several truncations a row (LOCKSTEP: every 5 steps, HASTY: every 3)."""
+    """Terminations, truncations, several truncations a row (LOCKSTEP: every 5 steps, HASTY: every
+    3).
+    """
     rollout = stub_env(game).rollout(8 * T + overlap, scripted_small, break_when_any_done=False)
-    collector = stub_collector(scripted_small, game, overlap=overlap, final_frames=mode, compress=compress)
+    collector = stub_collector(
+        scripted_small, game, overlap=overlap, final_frames=mode, compress=compress
+    )
     limit, length = min(game.game.max_steps for game in game.batched.groups), T + overlap
     places = 1 + -(-(length - 1) // limit) if mode == "truncated" else 1
     used = 0
     for window in range(8):
         batch = collector.collect()
         path = rollout[:, window * T : window * T + length]
-        terminated, truncated, done = (path["next", key].squeeze(-1) for key in ("terminated", "truncated", "done"))
+        terminated, truncated, done = (
+            path["next", key].squeeze(-1) for key in ("terminated", "truncated", "done")
+        )
         index, mask = batch["final_index"], batch["final_mask"]
         assert batch["final_pixels"].shape[:2] == index.shape == mask.shape == (N, places)
         assert index.dtype is torch.int64 and mask.dtype is torch.bool
@@ -201,7 +232,7 @@ def test_a_replay_buffer_of_torchrl_stores_sequences_and_gives_them_back(mode: A
     assert buffer.sample()["pixels"].shape[:2] == (N, T + 2)
 
 
-# -- recurrent state and overlap --------------------------------------------------------------------------------------
+# -- recurrent state and overlap -------------------------------------------------------------------
 
 
 def replay(batch: TensorDictBase) -> torch.Tensor:
@@ -219,7 +250,9 @@ def replay(batch: TensorDictBase) -> torch.Tensor:
 
 @pytest.mark.parametrize("overlap", [0, 3, T, T + 3, 3 * T])
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP])
-def test_sequences_replay_from_their_initial_state_and_begin_with_the_overlap(game: CompiledGame, overlap: int) -> None:
+def test_sequences_replay_from_their_initial_state_and_begin_with_the_overlap(
+    game: CompiledGame, overlap: int
+) -> None:
     collector = stub_collector(Recurrent(), game, overlap=overlap)
     before = None
     for _ in range(6):
@@ -243,13 +276,15 @@ def test_the_overlap_holds_the_same_path_as_windows_without_overlap() -> None:
 
 
 def test_iteration_with_a_overlap_gives_only_the_new_steps() -> None:
-    plain = torch.cat(list(stub_collector(scripted, total_frames=5 * N * T, return_same_td=False)), 1)
+    plain = torch.cat(
+        list(stub_collector(scripted, total_frames=5 * N * T, return_same_td=False)), 1
+    )
     batches = stub_collector(scripted, overlap=3, total_frames=4 * N * T, return_same_td=False)
     ours = torch.cat(list(batches), 1).exclude("collector")
     assert_same(ours, plain[:, 3 : 3 + 4 * T].exclude("collector"))
 
 
-# -- storage ----------------------------------------------------------------------------------------------------------
+# -- storage ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("overlap", [0, 3])
@@ -263,18 +298,24 @@ def test_batches_are_the_callers_own_unless_storage_is_to_be_reused(overlap: int
     for batch in batches:
         again = reusing.collect()
         assert_same(batch.exclude("final_pixels"), again.exclude("final_pixels"))
-        assert torch.equal(batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]])
+        assert torch.equal(
+            batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]]
+        )
         pointers.add(again["pixels"].data_ptr())
     assert len(pointers) == 1
     frames = [batch["pixels"].sum() for batch in stub_collector(scripted, total_frames=3 * N * T)]
-    assert [batch["pixels"].sum() for batch in list(stub_collector(scripted, total_frames=3 * N * T))] == frames
+    assert [
+        batch["pixels"].sum() for batch in list(stub_collector(scripted, total_frames=3 * N * T))
+    ] == frames
 
 
 def test_memory_that_nobody_holds_any_more_is_used_again() -> None:
     collector = stub_collector(scripted)
     pointers = [batch["pixels"].data_ptr() for batch in (collector.collect() for _ in range(6))]
     assert len(set(pointers)) == 2  # the loop holds a batch while the next one is collected
-    held = [collector.collect()["pixels"][0, 0].numpy() for _ in range(4)]  # any view keeps the memory
+    held = [
+        collector.collect()["pixels"][0, 0].numpy() for _ in range(4)
+    ]  # any view keeps the memory
     frames = [frame.copy() for frame in held]
     collector.collect()
     assert all((one == two).all() for one, two in zip(held, frames, strict=True))
@@ -305,7 +346,9 @@ def test_only_what_is_asked_for_is_stored() -> None:
 def test_the_stored_state_at_a_start_is_the_primers() -> None:
     batch = stub_collector(Recurrent(), LOCKSTEP).collect()
     starts = batch["is_init"].squeeze(-1)
-    assert (batch["memory", "sum"][starts] == 0.5).all() and not (batch["memory", "sum"][~starts] == 0.5).any()
+    assert (batch["memory", "sum"][starts] == 0.5).all() and not (
+        batch["memory", "sum"][~starts] == 0.5
+    ).any()
     assert (batch["initial_state", "memory", "sum"] == 0.5).all()
 
 
@@ -318,10 +361,14 @@ class Unaware(Recurrent):
         return super().forward(td.set("is_init", torch.zeros(N, 1, dtype=torch.bool)))
 
 
-def test_a_policy_that_does_not_read_is_init_begins_anew_whether_its_states_are_stored_or_not() -> None:
+def test_a_policy_that_does_not_read_is_init_begins_anew_whether_its_states_are_stored_or_not() -> (
+    None
+):
     aware = stub_collector(Recurrent(), LOCKSTEP).collect()["total"]
     for stored in (True, False):
-        assert torch.equal(stub_collector(Unaware(), LOCKSTEP, store_states=stored).collect()["total"], aware)
+        assert torch.equal(
+            stub_collector(Unaware(), LOCKSTEP, store_states=stored).collect()["total"], aware
+        )
 
 
 def test_a_policy_may_write_all_its_actions_into_one_tensor() -> None:
@@ -350,7 +397,7 @@ def test_what_is_stored_of_a_frame_is_what_the_policy_saw() -> None:
         assert torch.equal(batch[key], small(full[key]))
 
 
-# -- control ----------------------------------------------------------------------------------------------------------
+# -- control ---------------------------------------------------------------------------------------
 
 
 def resumed(collector: ArcadeCollector, other: ArcadeCollector, path: Any) -> None:
@@ -360,7 +407,9 @@ def resumed(collector: ArcadeCollector, other: ArcadeCollector, path: Any) -> No
 
 @pytest.mark.parametrize(("game", "overlap"), [(GAME, 0), (GAME, 3), (GAME, T + 3), (MIXED, 3)])
 @pytest.mark.parametrize("policy", [Recurrent, lambda: None, lambda: scripted])
-def test_a_resumed_collector_goes_on_to_the_bit(policy: Any, game: CompiledGame, overlap: int, tmp_path: Any) -> None:
+def test_a_resumed_collector_goes_on_to_the_bit(
+    policy: Any, game: CompiledGame, overlap: int, tmp_path: Any
+) -> None:
     collector = stub_collector(policy(), game, overlap=overlap, init_random_frames=N * T)
     for _ in range(3):
         collector.collect()
@@ -376,7 +425,9 @@ def test_a_resumed_collector_has_the_final_frames_of_its_overlap_and_leaves_earl
     tmp_path: Any,
 ) -> None:
     options: dict[str, Any] = {"overlap": T + 3, "final_frames": "truncated"}
-    collector, other = (stub_collector(scripted_small, LOCKSTEP, seed, **options) for seed in (3, 77))
+    collector, other = (
+        stub_collector(scripted_small, LOCKSTEP, seed, **options) for seed in (3, 77)
+    )
     collector.collect()
     held = other.collect()
     before = held.clone()
@@ -431,7 +482,9 @@ def test_iteration_ends_after_total_frames() -> None:
 
 def test_random_frames_come_first_and_the_env_took_them() -> None:
     for frames, windows in ((N * T, 1), (N * T + 1, 2)):
-        collector = stub_collector(lambda td: td.set("action", torch.full((N,), 4)), init_random_frames=frames)
+        collector = stub_collector(
+            lambda td: td.set("action", torch.full((N,), 4)), init_random_frames=frames
+        )
         actions = [collector.collect()["action"] for _ in range(windows + 1)]
         assert [action.unique().numel() for action in actions] == [5] * windows + [1]
         assert (actions[-1] == 4).all()
@@ -466,11 +519,15 @@ def test_a_change_of_observability_between_windows_is_seen_at_once() -> None:
     collector.collect()
     collector.env.set_observability("partial")
     batch = collector.collect()
-    assert (batch["pixels"][:, :, 1:4] == 0).all()  # the stub's partial frames hide the serial number
+    assert (
+        batch["pixels"][:, :, 1:4] == 0
+    ).all()  # the stub's partial frames hide the serial number
 
 
 def rollout_of(env: ArcadeEnv) -> None:
-    assert env.rollout(100)["next", "done"][:, -1].any()  # it stops at the first end, before the reset
+    assert env.rollout(100)["next", "done"][
+        :, -1
+    ].any()  # it stops at the first end, before the reset
 
 
 def reset_some(env: ArcadeEnv) -> None:
@@ -491,8 +548,12 @@ def another_collector(env: ArcadeEnv) -> None:
 
 @pytest.mark.parametrize("overlap", [0, 3])
 @pytest.mark.parametrize("interfere", [rollout_of, reset_some, step_raw, load, another_collector])
-def test_what_others_did_to_the_env_leaks_into_no_window(interfere: Callable[[ArcadeEnv], None], overlap: int) -> None:
-    """The overlap is dropped, the policy's state begins anew, episode numbers go on; none goes on after its end."""
+def test_what_others_did_to_the_env_leaks_into_no_window(
+    interfere: Callable[[ArcadeEnv], None], overlap: int
+) -> None:
+    """The overlap is dropped, the policy's state begins anew, episode numbers go on; none goes on
+    after its end.
+    """
     collector = stub_collector(Recurrent(), overlap=overlap)
     before = collector.collect()
     interfere(collector.env)
@@ -505,15 +566,21 @@ def test_what_others_did_to_the_env_leaks_into_no_window(interfere: Callable[[Ar
     expected.env.set_state(state)
     expected.env.reset(TensorDict({"_reset": ended}, [N]))
     assert_same(batch, expected.collect())
-    assert torch.equal(replay(batch), batch["total"]) and not torch.equal(before["pixels"], batch["pixels"])
+    assert torch.equal(replay(batch), batch["total"]) and not torch.equal(
+        before["pixels"], batch["pixels"]
+    )
     inside, done = batch["is_init"][:, 1:], batch["next", "done"][:, :-1]
     assert torch.equal(inside, done)
 
 
 @pytest.mark.parametrize("interfere", [rollout_of, reset_some, step_raw, load])
-def test_a_collector_saved_after_others_moved_the_env_is_resumed_as_it_goes_on(interfere: Any, tmp_path: Any) -> None:
+def test_a_collector_saved_after_others_moved_the_env_is_resumed_as_it_goes_on(
+    interfere: Any, tmp_path: Any
+) -> None:
     """And it goes on as one that was never saved."""
-    collector, unsaved, other = (stub_collector(Recurrent(), seed=seed, overlap=3) for seed in (3, 3, 77))
+    collector, unsaved, other = (
+        stub_collector(Recurrent(), seed=seed, overlap=3) for seed in (3, 3, 77)
+    )
     for one in (collector, unsaved):
         one.collect()
         torch.manual_seed(0)  # of the actions that others take
@@ -544,7 +611,9 @@ def test_two_collectors_that_take_turns_on_one_env_both_go_on_from_where_it_is()
     for one, two in itertools.pairwise(path[1:]):  # the second collector began with a reset
         going_on = ~one["next", "done"][:, -1, 0]
         assert torch.equal(two["pixels"][:, 0][going_on], one["next", "pixels"][:, -1][going_on])
-        assert torch.equal(two["step_count"][:, 0][going_on], one["next", "step_count"][:, -1][going_on])
+        assert torch.equal(
+            two["step_count"][:, 0][going_on], one["next", "step_count"][:, -1][going_on]
+        )
 
 
 def test_hooks_are_called_and_statistics_counted() -> None:
@@ -571,22 +640,34 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"frames_per_batch": 7}, ValueError, "frames_per_batch is 7, expected an int multiple of num_envs (6)"),
+        (
+            {"frames_per_batch": 7},
+            ValueError,
+            "frames_per_batch is 7, expected an int multiple of num_envs (6)",
+        ),
         ({"frames_per_batch": 0}, ValueError, "frames_per_batch is 0, expected an int multiple"),
         ({"frames_per_batch": 48.0}, TypeError, "frames_per_batch is 48.0, expected an int"),
         ({"overlap": -1}, ValueError, "overlap is -1, expected an int of 0 or more"),
         ({"overlap": 2.0}, TypeError, "overlap is 2.0, expected an int"),
-        ({"final_frames": "some"}, ValueError, "final_frames is 'some', allowed: 'all', 'truncated', 'none'"),
+        (
+            {"final_frames": "some"},
+            ValueError,
+            "final_frames is 'some', allowed: 'all', 'truncated', 'none'",
+        ),
         ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
     ],
 )
-def test_wrong_arguments_are_explained(options: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_wrong_arguments_are_explained(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=re.escape(message)):
         stub_collector(options.pop("policy", scripted), **options)
 
 
 def test_wrong_envs_are_explained() -> None:
-    with pytest.raises(TypeError, match=r"env is a TransformedEnv, expected an ArcadeEnv; others go with torchrl"):
+    with pytest.raises(
+        TypeError, match=r"env is a TransformedEnv, expected an ArcadeEnv; others go with torchrl"
+    ):
         ArcadeCollector(TransformedEnv(stub_env()), scripted, N * T)
     with pytest.raises(ValueError, match="make the env with categorical_actions=True"):
         ArcadeCollector(stub_env(categorical_actions=False), scripted, N * T)
@@ -602,5 +683,7 @@ def test_an_overlap_without_the_next_frames_that_batches_show_is_refused(mode: A
 
 def test_a_state_of_other_sizes_is_refused() -> None:
     state = stub_collector(scripted).state_dict()
-    with pytest.raises(ValueError, match=re.escape("(envs, steps, overlap) [6, 8, 0], this one has [6, 8, 2]")):
+    with pytest.raises(
+        ValueError, match=re.escape("(envs, steps, overlap) [6, 8, 0], this one has [6, 8, 2]")
+    ):
         stub_collector(scripted, overlap=2).load_state_dict(state)

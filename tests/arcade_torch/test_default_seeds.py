@@ -1,4 +1,6 @@
-"""Workers that play the very same episodes, because 0 is everybody's seed, are told so once; honest uses are not."""
+"""Workers that play the very same episodes, because 0 is everybody's seed, are told so once; honest
+uses are not.
+"""
 
 import gc
 import warnings
@@ -73,7 +75,9 @@ def test_honest_uses_hear_nothing() -> None:
     assert not warnings_of(play)
 
 
-def test_a_worker_process_is_told(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_worker_process_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(default_seeds.multiprocessing, "parent_process", lambda: object())
     make(seed=0).reset()
     assert not caplog.messages

@@ -67,19 +67,29 @@ def test_a_tensor_on_a_gpu_that_begins_where_jax_cannot_compute_is_refused() -> 
         dlpack.to_jax(torch.zeros(64).as_subclass(CudaStandIn)[1:])
 
 
-@pytest.mark.parametrize("change", ["reset", "observe", "set_seed", "set_observability", "set_state"])
+@pytest.mark.parametrize(
+    "change", ["reset", "observe", "set_seed", "set_observability", "set_state"]
+)
 def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
     monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
-    """A step waits for its actions. The others gave JAX memory of frames that torch had yet to read."""
+    """A step waits for its actions. The others gave JAX memory of frames that torch had yet to
+    read.
+    """
     env = ArcadeEnv(GAME, N)
     env.reset()
-    argument = {"set_seed": [1], "set_observability": ["partial"], "set_state": [env.get_state()]}.get(change, [])
+    argument = {
+        "set_seed": [1],
+        "set_observability": ["partial"],
+        "set_state": [env.get_state()],
+    }.get(change, [])
     events: list[str] = []
     stream = type("Stream", (), {"synchronize": lambda self: events.append("torch")})()
     monkeypatch.setattr(dlpack, "is_host", lambda value: False)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    monkeypatch.setattr(env_module, "to_torch", lambda array, device: torch.from_numpy(np.array(array)))
+    monkeypatch.setattr(
+        env_module, "to_torch", lambda array, device: torch.from_numpy(np.array(array))
+    )
     for name in ("render", "reset_render"):
         original = getattr(env._batched, name)
         call = lambda *args, original=original: (events.append("jax"), original(*args))[1]  # noqa: E731
@@ -91,7 +101,9 @@ def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
 
 
 @pytest.mark.parametrize("path", ["collector", "env"])
-def test_a_step_exports_frames_and_one_array_of_numbers(monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+def test_a_step_exports_frames_and_one_array_of_numbers(
+    monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
     """Each export is a transfer where JAX is on the CPU and torch on a GPU; there were nine."""
     env = ArcadeEnv(GAME, N)
     root = env.reset()
@@ -136,18 +148,22 @@ def output_of(code: str, environment: dict[str, str] | None = None) -> str:
 
     variables = {**os.environ, **(environment or {})}
     command = [sys.executable, "-c", code]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=variables, timeout=300, check=False)
+    result = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env=variables, timeout=300, check=False
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout.strip()
 
 
-# -- waits of the host ------------------------------------------------------------------------------------------------
+# -- waits of the host -----------------------------------------------------------------------------
 
 
 class Waits(TorchDispatchMode):
-    """Counts what makes the host wait for a GPU: values that Python reads, and shapes that depend on values.
+    """Counts what makes the host wait for a GPU: values that Python reads, and shapes that depend
+    on values.
 
-    Also Python numbers that become a tensor (``lift_fresh``), as a list of indices does: the copy is waited for.
+    Also Python numbers that become a tensor (``lift_fresh``), as a list of indices does: the copy
+    is waited for.
     """
 
     READS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "unique", "lift_fresh")
@@ -158,14 +174,18 @@ class Waits(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = func.overloadpacket.__name__
-        if name in self.READS or (name == "index" and any(i is not None and i.dtype is torch.bool for i in args[1])):
+        if name in self.READS or (
+            name == "index" and any(i is not None and i.dtype is torch.bool for i in args[1])
+        ):
             self.counts[name] += 1
         return func(*args, **(kwargs or {}))
 
 
 @contextmanager
 def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Counter[str]]:
-    """Take the paths that a GPU takes, and count waits: reads by torch, copies to the host, reads of JAX arrays."""
+    """Take the paths that a GPU takes, and count waits: reads by torch, copies to the host, reads
+    of JAX arrays.
+    """
     waits, array = Waits(), type(jnp.zeros(1))
 
     def counted(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
@@ -177,14 +197,18 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
 
     def read_by_numpy(original: Callable[..., Any]) -> Callable[..., Any]:
         return lambda x, *rest, **options: (
-            counted("numpy", original) if isinstance(x, array) else original  # numpy does not ask for __array__
+            counted("numpy", original)
+            if isinstance(x, array)
+            else original  # numpy does not ask for __array__
         )(x, *rest, **options)
 
     monkeypatch.setattr(compiled.FrameMemory, "show", lambda self, frames: frames)
     for module in (dlpack, env_module, collector_module):
         monkeypatch.setattr(module, "is_host", lambda value: False)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
-    monkeypatch.setattr(torch, "from_numpy", _disable_current_modes()(torch.from_numpy))  # from pinned memory: no wait
+    monkeypatch.setattr(
+        torch, "from_numpy", _disable_current_modes()(torch.from_numpy)
+    )  # from pinned memory: no wait
     monkeypatch.setattr(env, "_check_actions", False)
     monkeypatch.setattr(torch.Tensor, "cpu", counted("cpu", torch.Tensor.cpu))
     for name in ("array", "asarray"):
@@ -197,7 +221,9 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
 
 @pytest.mark.parametrize("mode", ["truncated", "all"])
 @pytest.mark.parametrize("game", [GAME, MIXED])
-def test_the_host_waits_once_a_window(monkeypatch: pytest.MonkeyPatch, game: Any, mode: Any) -> None:
+def test_the_host_waits_once_a_window(
+    monkeypatch: pytest.MonkeyPatch, game: Any, mode: Any
+) -> None:
     """128 steps, a recurrent policy whose states are stored, ends of both kinds."""
     env = ArcadeEnv(game, N)
     collector = ArcadeCollector(env, Recurrent(), N * 128, final_frames=mode)
@@ -211,7 +237,9 @@ def test_the_host_waits_once_a_window(monkeypatch: pytest.MonkeyPatch, game: Any
     assert batch["next", "truncated"].any() and batch["next", "terminated"].any()
     again = expected.collect()
     if mode == "truncated":
-        assert torch.equal(batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]])
+        assert torch.equal(
+            batch["final_pixels"][batch["final_mask"]], again["final_pixels"][again["final_mask"]]
+        )
     assert_same(batch.exclude("final_pixels"), again.exclude("final_pixels"))
 
 
@@ -222,7 +250,9 @@ def test_the_host_waits_once_a_window_of_a_training_too(
 ) -> None:
     """With our networks, exploration and final frames of truncated episodes."""
     learner = {algorithm: {"time_limit": "bootstrap"}}
-    trainer = Trainer(preset("smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, **learner))
+    trainer = Trainer(
+        preset("smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, **learner)
+    )
     for _ in range(2):
         trainer.collector.collect()
     with as_on_cuda(monkeypatch, trainer.env) as counts:
@@ -244,7 +274,7 @@ def test_the_counter_of_waits_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert counts == {"_local_scalar_dense": 1, "cpu": 1, "numpy": 1, "index": 1, "lift_fresh": 1}
 
 
-# -- one process, many ------------------------------------------------------------------------------------------------
+# -- one process, many -----------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -301,9 +331,13 @@ os._exit(0)
 def test_a_forked_process_is_refused_in_one_line() -> None:
     """No env had been made before the fork, only JAX had started: the first one hung for ever."""
     command = [sys.executable, "-c", FORKED_BY_HAND]
-    result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
+    result = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False
+    )
     lines = result.stdout.splitlines()
-    assert [line.count("forked after JAX had started, where JAX hangs: start workers") for line in lines] == [1, 1]
+    assert [
+        line.count("forked after JAX had started, where JAX hangs: start workers") for line in lines
+    ] == [1, 1]
 
 
 FORKED = """
@@ -319,22 +353,30 @@ if __name__ == "__main__":
 
 
 def test_gymnasiums_async_vector_env_ends_at_once_and_names_spawn(tmp_path: Path) -> None:
-    """It hung for ever: Gymnasium makes one env in the parent, forks, and makes the others in the workers."""
+    """It hung for ever: Gymnasium makes one env in the parent, forks, and makes the others in the
+    workers.
+    """
     for options, clear in (("{'context': 'fork'}", True), ("{'context': 'spawn'}", False)):
         script = tmp_path / "script.py"
         script.write_text(FORKED.replace("KW", options))
         command = [sys.executable, str(script)]
-        result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False)
+        result = subprocess.run(
+            command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False
+        )
         assert ("start workers with 'spawn'" in result.stderr) == clear, result.stderr
         assert ("(2, 128, 128, 3)" in result.stdout) != clear, result.stdout
 
 
 def test_each_thread_may_have_envs_and_collectors_of_its_own() -> None:
-    """What is promised: envs share compiled functions, not state; one env belongs to one thread at a time."""
+    """What is promised: envs share compiled functions, not state; one env belongs to one thread at
+    a time.
+    """
 
     def path(seed: int) -> TensorDictBase:
         env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=seed)
-        collector = ArcadeCollector(env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8)
+        collector = ArcadeCollector(
+            env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8
+        )
         return torch.stack([collector.collect() for _ in range(4)])
 
     alone = [path(seed) for seed in range(4)]
@@ -344,10 +386,16 @@ def test_each_thread_may_have_envs_and_collectors_of_its_own() -> None:
             assert_same(one, two)
 
 
-def test_a_collector_leaves_the_exploration_type_alone_where_it_is_as_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It belongs to the process: threads that set it and put it back in turns leave the wrong one behind."""
+def test_a_collector_leaves_the_exploration_type_alone_where_it_is_as_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It belongs to the process: threads that set it and put it back in turns leave the wrong one
+    behind.
+    """
     env = arcade_torch.make("CartPoleEasy", num_envs=2, seed=0)
-    collector = ArcadeCollector(env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8)
+    collector = ArcadeCollector(
+        env, lambda td: td.set("action", td["step_count"].squeeze(-1) % 5), 2 * 8
+    )
     with set_exploration_type(ExplorationType.RANDOM):
         monkeypatch.setattr("arcade_torch.collector.set_exploration_type", None)
         assert collector.collect()["action"].shape == (2, 8)

@@ -42,13 +42,19 @@ def test_a_frame_stays_shared_when_it_is_permuted_for_a_convolution() -> None:
     ("tensor", "error", "message"),
     [
         (torch.zeros(2, dtype=torch.int64), TypeError, "convert it yourself with .to(torch.int32)"),
-        (torch.zeros(2, dtype=torch.float64), TypeError, "convert it yourself with .to(torch.float32)"),
+        (
+            torch.zeros(2, dtype=torch.float64),
+            TypeError,
+            "convert it yourself with .to(torch.float32)",
+        ),
         (torch.zeros(2, requires_grad=True), ValueError, "pass tensor.detach()"),
         (torch.zeros(4, 4)[:, ::2], ValueError, "have holes: pass .contiguous()"),
         (torch.zeros(64)[1:], ValueError, "JAX would copy it: pass .clone()"),
     ],
 )
-def test_what_jax_would_copy_in_silence_is_refused(tensor: torch.Tensor, error: type[Exception], message: str) -> None:
+def test_what_jax_would_copy_in_silence_is_refused(
+    tensor: torch.Tensor, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=re.escape(message)):
         dlpack.to_jax(tensor)
 
@@ -72,10 +78,14 @@ def test_both_sides_may_forget_the_memory_first() -> None:
     assert (array == 3).all()
 
 
-def test_the_warning_about_copied_frames_names_the_package_and_comes_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_warning_about_copied_frames_names_the_package_and_comes_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     dlpack.warn_frames_are_copied.cache_clear()
-    with pytest.warns(UserWarning, match=r"jax-cuda13-plugin is missing.*pip install 'jax\[cuda13\]'") as caught:
+    with pytest.warns(
+        UserWarning, match=r"jax-cuda13-plugin is missing.*pip install 'jax\[cuda13\]'"
+    ) as caught:
         dlpack.warn_frames_are_copied()
         dlpack.warn_frames_are_copied()
     assert len(caught) == 1

@@ -1,4 +1,6 @@
-"""TorchRL carries a policy's recurrent state only in a primed env: a bare one says so, once, and only then."""
+"""TorchRL carries a policy's recurrent state only in a primed env: a bare one says so, once, and
+only then.
+"""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -22,7 +24,10 @@ from arcade_torch.models import MemoryModule, make_memory
 from tests.arcade_torch.stub import GAME
 
 N, T = 4, 12
-MESSAGE = r"the policy wrote .* for the next step, .* a memory forgets: .*get_primers_from_module.*ArcadeCollector$"
+MESSAGE = (
+    r"the policy wrote .* for the next step, .* a memory forgets: "
+    r".*get_primers_from_module.*ArcadeCollector$"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -37,14 +42,18 @@ def stub_env(**options: Any) -> ArcadeEnv:
 
 
 def policy_of(*memory: TensorDictModule, hidden: str) -> TensorDictSequential:
-    encode = TensorDictModule(lambda pixels: pixels[..., 0, 0].float() / 255, ["pixels"], ["features"])
+    encode = TensorDictModule(
+        lambda pixels: pixels[..., 0, 0].float() / 255, ["pixels"], ["features"]
+    )
     head = TensorDictModule(nn.Linear(8, 5), [hidden], ["action_value"])
     return TensorDictSequential(encode, *memory, head, QValueModule(action_space="categorical"))
 
 
 def ours() -> TensorDictSequential:
     torch.manual_seed(1)
-    return policy_of(MemoryModule(make_memory("gru", 8, 8), "features", "remembered"), hidden="remembered")
+    return policy_of(
+        MemoryModule(make_memory("gru", 8, 8), "features", "remembered"), hidden="remembered"
+    )
 
 
 def torchrls() -> TensorDictSequential:
@@ -55,7 +64,9 @@ def torchrls() -> TensorDictSequential:
 
 def without_memory() -> TensorDictSequential:
     torch.manual_seed(1)
-    return policy_of(MemoryModule(make_memory("mlp", 8, 8), "features", "remembered"), hidden="remembered")
+    return policy_of(
+        MemoryModule(make_memory("mlp", 8, 8), "features", "remembered"), hidden="remembered"
+    )
 
 
 def primed(policy: nn.Module, env: Any) -> TransformedEnv:
@@ -73,7 +84,9 @@ def collected(env: Any, policy: Any, **options: Any) -> TensorDictBase:
 
 @pytest.mark.parametrize("policy", [ours(), torchrls()])
 @pytest.mark.parametrize(
-    "run", [rollout, partial(collected, auto_register_policy_transforms=False)], ids=["rollout", "Collector"]
+    "run",
+    [rollout, partial(collected, auto_register_policy_transforms=False)],
+    ids=["rollout", "Collector"],
 )
 def test_a_bare_env_says_once_that_the_state_is_dropped(policy: nn.Module, run: Any) -> None:
     with pytest.warns(UserWarning, match=MESSAGE) as warned:
@@ -81,7 +94,9 @@ def test_a_bare_env_says_once_that_the_state_is_dropped(policy: nn.Module, run: 
         run(stub_env(), policy)
     assert len([one for one in warned if "a memory forgets" in str(one.message)]) == 1
     whole = rollout(primed(policy, stub_env()), policy)
-    assert not torch.allclose(dropped["action_value"], whole["action_value"], atol=1e-3)  # it is no false alarm
+    assert not torch.allclose(
+        dropped["action_value"], whole["action_value"], atol=1e-3
+    )  # it is no false alarm
 
 
 def test_the_warning_is_one_line_that_names_the_entries() -> None:

@@ -81,7 +81,9 @@ def test_next_pixels_at_an_end_is_the_true_final_frame_and_the_root_is_fresh() -
     count = data["next", "pixels"][..., 0, 0, 0]  # the stub draws its step count
     assert (count[ended] == 5).all()
     assert (data["pixels"][:, 5, 0, 0, 0] == 0).all()
-    assert torch.equal(data["next", "pixels"][:, :-1][~ended[:, :-1]], data["pixels"][:, 1:][~ended[:, :-1]])
+    assert torch.equal(
+        data["next", "pixels"][:, :-1][~ended[:, :-1]], data["pixels"][:, 1:][~ended[:, :-1]]
+    )
 
 
 def test_done_is_terminated_or_truncated_and_a_time_limit_only_truncates() -> None:
@@ -91,10 +93,16 @@ def test_done_is_terminated_or_truncated_and_a_time_limit_only_truncates() -> No
 
 
 def test_native_counts_are_those_of_torchrls_transforms() -> None:
-    transforms = Compose(InitTracker("start"), StepCounter(step_count_key="steps"), RewardSum(["reward"], ["total"]))
+    transforms = Compose(
+        InitTracker("start"), StepCounter(step_count_key="steps"), RewardSum(["reward"], ["total"])
+    )
     env = TransformedEnv(stub_env(seed=5), transforms)
     data = env.rollout(100, scripted, break_when_any_done=False)
-    for native, theirs in (("is_init", "start"), ("step_count", "steps"), ("episode_reward", "total")):
+    for native, theirs in (
+        ("is_init", "start"),
+        ("step_count", "steps"),
+        ("episode_reward", "total"),
+    ):
         assert torch.equal(data[native], data[theirs])
         assert torch.equal(data["next", native], data["next", theirs])
     plain = stub_env(seed=5).rollout(100, scripted, break_when_any_done=False)
@@ -113,14 +121,22 @@ def test_last_action_is_the_action_that_led_here_also_over_an_end() -> None:
 
 
 @pytest.mark.parametrize("game", [LOCKSTEP, MIXED])
-def test_frames_and_rewards_are_the_memory_that_jax_wrote(monkeypatch: pytest.MonkeyPatch, game: CompiledGame) -> None:
+def test_frames_and_rewards_are_the_memory_that_jax_wrote(
+    monkeypatch: pytest.MonkeyPatch, game: CompiledGame
+) -> None:
     env = stub_env(game)
     written = []
     compiled = env._compiled.step
-    monkeypatch.setattr(env._compiled, "step", lambda *args: written.append(compiled(*args)) or written[-1])
+    monkeypatch.setattr(
+        env._compiled, "step", lambda *args: written.append(compiled(*args)) or written[-1]
+    )
     td, following = env.step_and_maybe_reset(scripted(env.reset()))
     pixels, numbers = written[0].pixels, written[0].numbers
-    assert td["next", "pixels"].data_ptr() == following["pixels"].data_ptr() == pixels.unsafe_buffer_pointer()
+    assert (
+        td["next", "pixels"].data_ptr()
+        == following["pixels"].data_ptr()
+        == pixels.unsafe_buffer_pointer()
+    )
     assert td["next", "reward"].data_ptr() == numbers.unsafe_buffer_pointer()
 
 
@@ -159,7 +175,10 @@ def test_a_partial_reset_leaves_the_other_envs_bit_identical(mask: list[bool], s
     keys = ("pixels", "last_action", "step_count", "episode_reward", "is_init")
     assert_same(out[~chosen].select(*keys), td[~chosen].select(*keys))
     assert (out[chosen]["step_count"] == 0).all() and out[chosen]["is_init"].all()
-    fresh = env.get_state()["state", "clock", "serial"][chosen] != before["state", "clock", "serial"][chosen]
+    fresh = (
+        env.get_state()["state", "clock", "serial"][chosen]
+        != before["state", "clock", "serial"][chosen]
+    )
     assert fresh.all()
 
 
@@ -215,16 +234,22 @@ def test_a_snapshot_gives_the_same_future_on_another_env(game: CompiledGame) -> 
     env, other = stub_env(game, seed=1), stub_env(game, seed=99)
     td = env.rollout(10, scripted, break_when_any_done=False)[:, -1]
     snapshot = env.get_state()
-    expected = env.rollout(60, scripted, break_when_any_done=False, auto_reset=False, tensordict=env.observe())
+    expected = env.rollout(
+        60, scripted, break_when_any_done=False, auto_reset=False, tensordict=env.observe()
+    )
     other.rollout(3)
     root = other.set_state(snapshot)
     assert torch.equal(root["step_count"], td["next", "step_count"])
-    future = other.rollout(60, scripted, break_when_any_done=False, auto_reset=False, tensordict=root)
+    future = other.rollout(
+        60, scripted, break_when_any_done=False, auto_reset=False, tensordict=root
+    )
     assert_same(expected, future)
 
 
 @pytest.mark.parametrize("game", [GAME, MIXED])
-def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(tmp_path: Any, game: CompiledGame) -> None:
+def test_a_snapshot_can_be_loaded_by_reset_and_saved_without_pickle(
+    tmp_path: Any, game: CompiledGame
+) -> None:
     env = stub_env(game, seed=1)
     env.rollout(4)
     torch.save(env.get_state().to_dict(), tmp_path / "state.pt")
@@ -242,7 +267,11 @@ def test_what_is_observed_after_an_end_says_so_until_it_is_reset_or_loaded() -> 
     env.set_seed(3)  # episodes go on
     env.observe()["truncated"].zero_()
     root = env.reset(env.observe().set("_reset", odd))
-    assert root["done"].squeeze(-1).tolist() == env.observe()["done"].squeeze(-1).tolist() == (~odd).tolist()
+    assert (
+        root["done"].squeeze(-1).tolist()
+        == env.observe()["done"].squeeze(-1).tolist()
+        == (~odd).tolist()
+    )
     for _ in range(5):  # the others stay where they are until the odd ones have ended too
         assert env.observe()["done"].squeeze(-1).tolist() == (~odd).tolist()
         env.step(scripted(env.observe()).set("_step", odd))
@@ -254,7 +283,9 @@ def test_what_is_observed_after_an_end_says_so_until_it_is_reset_or_loaded() -> 
     other = stub_env(LOCKSTEP)
     other.load_state_dict(env.state_dict())
     assert_same(other.observe(), env.observe())
-    assert not env.set_state(env.get_state())["done"].any()  # a snapshot does not say what has ended
+    assert not env.set_state(env.get_state())[
+        "done"
+    ].any()  # a snapshot does not say what has ended
 
 
 def test_a_snapshot_is_a_private_copy() -> None:
@@ -278,7 +309,9 @@ def test_state_dict_of_the_env_restores_it(game: CompiledGame) -> None:
 
 
 @pytest.mark.parametrize("game", [GAME, MIXED])
-def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compiles_nothing(game: CompiledGame) -> None:
+def test_flipping_observability_in_mid_episode_changes_only_the_frames_and_compiles_nothing(
+    game: CompiledGame,
+) -> None:
     env, twin = stub_env(game, seed=6), stub_env(game, seed=6)
     actions = torch.randint(0, 5, (30, N))
     ours, theirs = env.reset(), twin.reset()
@@ -315,7 +348,9 @@ def test_a_step_from_the_state_in_the_tensordict_shows_the_twin_that_was_set_las
     env.set_observability("full")
     following = env.step(scripted(root))["next"]
     assert not env.observability.any() and not following["state", "partial"].any()
-    assert (following["pixels"][:, 1:4] != 0).any()  # the stub's partial frames hide the serial number
+    assert (
+        following["pixels"][:, 1:4] != 0
+    ).any()  # the stub's partial frames hide the serial number
 
 
 def test_one_hot_actions_mean_the_same_as_integers() -> None:
@@ -336,7 +371,9 @@ def test_one_hot_actions_mean_the_same_as_integers() -> None:
     action=st.lists(st.integers(0, 4), min_size=N, max_size=N),
     dtype=st.sampled_from([torch.int64, torch.int32, torch.uint8]),
 )
-def test_any_integer_type_is_taken_and_may_be_overwritten_at_once(action: list[int], dtype: torch.dtype) -> None:
+def test_any_integer_type_is_taken_and_may_be_overwritten_at_once(
+    action: list[int], dtype: torch.dtype
+) -> None:
     env, twin = stub_env(seed=3), stub_env(seed=3)
     tensor = torch.tensor(action, dtype=dtype)
     env.reset(), twin.reset()
@@ -350,7 +387,9 @@ def test_any_integer_type_is_taken_and_may_be_overwritten_at_once(action: list[i
 def test_what_the_policy_wrote_beside_the_action_is_kept_as_on_the_stock_path() -> None:
     def run(env: ArcadeEnv, stock: bool) -> tuple[TensorDictBase, TensorDictBase]:
         stale = torch.full((N, 1), 9.0)  # of the step before, in a tensordict that is used again
-        root = scripted(env.reset()).set("next", TensorDict({"memory": torch.arange(N), "reward": stale}, [N]))
+        root = scripted(env.reset()).set(
+            "next", TensorDict({"memory": torch.arange(N), "reward": stale}, [N])
+        )
         root["value"] = torch.ones(N)
         if stock:
             taken = env.step(root)
@@ -372,11 +411,15 @@ def test_real_games_pass_through(id: str) -> None:
 
 
 def test_make_hands_on_what_the_env_is_told() -> None:
-    env = make("MineSweeperEasy", num_envs=3, categorical_actions=False, state_in_td=True, task_in_td=True)
+    env = make(
+        "MineSweeperEasy", num_envs=3, categorical_actions=False, state_in_td=True, task_in_td=True
+    )
     assert env.one_hot and {"state", "task"} <= set(env.observation_spec.keys())
 
 
-@pytest.mark.parametrize("options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=["plain", "state", "mixed"])
+@pytest.mark.parametrize(
+    "options", [{}, {"state_in_td": True}, {"game": MIXED}], ids=["plain", "state", "mixed"]
+)
 def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
     """TorchRL hands ``_step`` to envs of a fixed batch size and trusts that they heed it."""
     env, twin = stub_env(seed=3, **options), stub_env(seed=3, **options)
@@ -388,7 +431,10 @@ def test_a_step_moves_the_marked_envs_alone(options: dict[str, Any]) -> None:
         stepped = env.step(scripted(before).set("_step", marked))["next"]
         assert_same(stepped[marked], whole[marked])
         assert (stepped["reward"][~marked] == 0).all()
-        assert_same(stepped.exclude("reward")[~marked], td.select(*stepped.exclude("reward").keys(True, True))[~marked])
+        assert_same(
+            stepped.exclude("reward")[~marked],
+            td.select(*stepped.exclude("reward").keys(True, True))[~marked],
+        )
         td, other = (env.step_mdp(TensorDict({"next": part}, [N])) for part in (stepped, whole))
     fresh = stub_env(seed=3, **options)
     first = fresh.step(scripted(fresh.reset()))["next"]

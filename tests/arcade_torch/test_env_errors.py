@@ -15,17 +15,45 @@ from tests.arcade_torch.stub import GAME
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"id": "CartPolEasy"}, ValueError, "unknown env id 'CartPolEasy': did you mean 'CartPoleEasy'?"),
+        (
+            {"id": "CartPolEasy"},
+            ValueError,
+            "unknown env id 'CartPolEasy': did you mean 'CartPoleEasy'?",
+        ),
         ({"num_envs": 0}, ValueError, "num_envs is 0, expected 1 or more"),
         ({"num_envs": -3}, ValueError, "num_envs is -3, expected 1 or more"),
         ({"num_envs": 2.5}, TypeError, "num_envs is 2.5, expected an int"),
         ({"num_envs": True}, TypeError, "num_envs is True, expected an int"),
-        ({"observability": "half"}, ValueError, "observability is 'half', allowed: 'full', 'partial', or bools"),
-        ({"observability": [True, [], None]}, ValueError, "observability is object (), expected bool (3,): allowed"),
-        ({"observability": [True]}, ValueError, "observability is bool (1,), expected bool (3,): allowed"),
-        ({"observability": torch.ones(3)}, ValueError, "observability is float32 (3,), expected bool (3,)"),
-        ({"observability": torch.ones(2, dtype=torch.bool)}, ValueError, "observability is bool (2,), expected bool"),
-        ({"observability": "full", "partial_obs": True}, ValueError, "observability and partial_obs are given: keep"),
+        (
+            {"observability": "half"},
+            ValueError,
+            "observability is 'half', allowed: 'full', 'partial', or bools",
+        ),
+        (
+            {"observability": [True, [], None]},
+            ValueError,
+            "observability is object (), expected bool (3,): allowed",
+        ),
+        (
+            {"observability": [True]},
+            ValueError,
+            "observability is bool (1,), expected bool (3,): allowed",
+        ),
+        (
+            {"observability": torch.ones(3)},
+            ValueError,
+            "observability is float32 (3,), expected bool (3,)",
+        ),
+        (
+            {"observability": torch.ones(2, dtype=torch.bool)},
+            ValueError,
+            "observability is bool (2,), expected bool",
+        ),
+        (
+            {"observability": "full", "partial_obs": True},
+            ValueError,
+            "observability and partial_obs are given: keep",
+        ),
         ({"partial_obs": "yes"}, TypeError, "partial_obs is 'yes', allowed: True, False"),
         ({"device": "tpu"}, ValueError, "device is 'tpu', allowed: 'cpu', 'cuda'"),
         ({"device": "meta"}, ValueError, "device is 'meta', allowed: 'cpu', 'cuda'"),
@@ -35,7 +63,9 @@ from tests.arcade_torch.stub import GAME
         ({"colour": 1}, TypeError, "has no option 'colour'"),
     ],
 )
-def test_make_explains_a_wrong_argument(options: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_make_explains_a_wrong_argument(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=re.escape(message)):
         make(**{"id": "CartPoleEasy", "num_envs": 3, **options})
 
@@ -50,12 +80,24 @@ def test_cuda_without_a_gpu_is_explained() -> None:
     ("action", "error", "message"),
     [
         (torch.zeros(3), TypeError, "action has dtype torch.float32, expected integers"),
-        (torch.zeros(3, dtype=torch.bool), TypeError, "action has dtype torch.bool, expected integers"),
-        (torch.zeros(3, 1, dtype=torch.int64), ValueError, "action has shape (3, 1), expected (3,)"),
+        (
+            torch.zeros(3, dtype=torch.bool),
+            TypeError,
+            "action has dtype torch.bool, expected integers",
+        ),
+        (
+            torch.zeros(3, 1, dtype=torch.int64),
+            ValueError,
+            "action has shape (3, 1), expected (3,)",
+        ),
         (torch.zeros(2, dtype=torch.int64), ValueError, "action has shape (2,), expected (3,)"),
         (torch.tensor([0, 5, 1]), ValueError, "actions range from 0 to 5, allowed: 0 to 4"),
         (torch.tensor([0, -1, 1]), ValueError, "actions range from -1 to 1, allowed: 0 to 4"),
-        (torch.tensor([0, 2**32, 1]), ValueError, "actions range from 0 to 4294967296, allowed: 0 to 4"),
+        (
+            torch.tensor([0, 2**32, 1]),
+            ValueError,
+            "actions range from 0 to 4294967296, allowed: 0 to 4",
+        ),
     ],
 )
 def test_a_wrong_action_is_explained_and_changes_nothing(
@@ -92,7 +134,10 @@ def broken(change: Any) -> TensorDict:
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        (lambda: ArcadeEnv(GAME, 4).get_state(), "the state is of batch size [4], this env has 3 envs"),
+        (
+            lambda: ArcadeEnv(GAME, 4).get_state(),
+            "the state is of batch size [4], this env has 3 envs",
+        ),
         (
             lambda: make("CartPoleEasy", 3).get_state(),
             "the state of env 0 is one of CartPoleEasy-v0, this env plays",
@@ -100,8 +145,11 @@ def broken(change: Any) -> TensorDict:
         (lambda: broken(lambda s: s.pop("game")), "the state has no entry 'game'"),
         (lambda: broken(lambda s: s["state"].pop("total")), "the state has no entry 'state.total'"),
         (
-            lambda: broken(lambda s: s.set(("state", "dice"), torch.zeros(3, 1, dtype=torch.int32))),
-            "state entry 'state.dice' is int32 (3, 1), StubEasy-v0 with 3 envs expects int32 (3, 2)",
+            lambda: broken(
+                lambda s: s.set(("state", "dice"), torch.zeros(3, 1, dtype=torch.int32))
+            ),
+            "state entry 'state.dice' is int32 (3, 1), StubEasy-v0 with 3 envs expects int32 (3, "
+            "2)",
         ),
         (
             lambda: broken(lambda s: s.set("step_count", torch.zeros(3))),

@@ -1,4 +1,6 @@
-"""An env lives where it was made: it names itself, moves to no other device, and is neither copied nor pickled."""
+"""An env lives where it was made: it names itself, moves to no other device, and is neither copied
+nor pickled.
+"""
 
 import copy
 import io
@@ -29,22 +31,37 @@ def rollout(env: EnvBase) -> TensorDictBase:
 def test_an_env_is_its_own_copy_on_its_own_device(device: Any) -> None:
     env = ArcadeEnv(GAME, N)
     assert env.to(device) is env
-    assert env.device == env.observation_spec.device == env.rollout(T)["pixels"].device == torch.device("cpu")
+    assert (
+        env.device
+        == env.observation_spec.device
+        == env.rollout(T)["pixels"].device
+        == torch.device("cpu")
+    )
 
 
-@pytest.mark.parametrize("device", ["meta", "cuda:7", "mps", torch.device("meta"), "nowhere", torch.float32])
+@pytest.mark.parametrize(
+    "device", ["meta", "cuda:7", "mps", torch.device("meta"), "nowhere", torch.float32]
+)
 def test_an_env_refuses_another_device_in_one_line_and_goes_on(device: Any) -> None:
     env, plain = ArcadeEnv(GAME, N, seed=2), ArcadeEnv(GAME, N, seed=2)
-    with pytest.raises(ValueError, match=r"^device is [^\n]*(allowed: 'cpu', 'cuda'|torch sees no GPU|GPUs)[^\n]*$"):
+    with pytest.raises(
+        ValueError, match=r"^device is [^\n]*(allowed: 'cpu', 'cuda'|torch sees no GPU|GPUs)[^\n]*$"
+    ):
         env.to(device)
-    assert env.device == env.observation_spec.device == env.action_spec.device == torch.device("cpu")
+    assert (
+        env.device == env.observation_spec.device == env.action_spec.device == torch.device("cpu")
+    )
     assert (rollout(env) == rollout(plain)).all()
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
-def test_the_refusal_says_how_to_get_an_env_there(wrap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_refusal_says_how_to_get_an_env_there(
+    wrap: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env, plain = (wrap(ArcadeEnv(GAME, N, seed=2)) for _ in range(2))
-    monkeypatch.setattr("arcade_torch.env.pick_devices", lambda device: (torch.device("cuda", 0), None))
+    monkeypatch.setattr(
+        "arcade_torch.env.pick_devices", lambda device: (torch.device("cuda", 0), None)
+    )
     message = "this env stays on cpu, where it was made: make one with device='cuda:0'"
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         env.to("cuda")
@@ -53,7 +70,9 @@ def test_the_refusal_says_how_to_get_an_env_there(wrap: Any, monkeypatch: pytest
 
 @pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
 def test_torchrls_collector_may_name_the_device(wrap: Any) -> None:
-    collector = Collector(wrap(ArcadeEnv(GAME, N)), frames_per_batch=N * T, total_frames=N * T, device="cpu")
+    collector = Collector(
+        wrap(ArcadeEnv(GAME, N)), frames_per_batch=N * T, total_frames=N * T, device="cpu"
+    )
     assert [batch.shape for batch in collector] == [(N, T)]
 
 
@@ -71,7 +90,10 @@ def test_a_copy_of_an_env_is_refused_in_one_line(way: str, wrapped: bool) -> Non
     env: Any = ArcadeEnv(GAME, N)
     if wrapped and way != "copy":  # a shallow copy of a transformed env holds the env itself
         env = TransformedEnv(env, StepCounter())
-    message = "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to its set_state()"
+    message = (
+        "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to its "
+        "set_state()"
+    )
     with pytest.raises(TypeError, match=f"^{re.escape(message)}$"):
         copied_by(way, env)
 
@@ -82,7 +104,10 @@ def test_what_the_refusal_of_a_copy_advises_works() -> None:
     other = ArcadeEnv(GAME, N, seed=4)
     action = torch.ones(N, dtype=torch.int64)
     roots = other.set_state(env.get_state()), env.observe()
-    one, two = (each.step(root.set("action", action)) for each, root in zip((other, env), roots, strict=True))
+    one, two = (
+        each.step(root.set("action", action))
+        for each, root in zip((other, env), roots, strict=True)
+    )
     assert (one["next"].exclude("done") == two["next"].exclude("done")).all()
 
 
@@ -103,7 +128,10 @@ def test_factories_go_on_working(kind: Any, created: bool) -> None:
     ("options", "text"),
     [
         ({}, "ArcadeEnv(StubEasy-v0, num_envs=3, observability='full', device='cpu')"),
-        ({"observability": "partial"}, "ArcadeEnv(StubEasy-v0, num_envs=3, observability='partial', device='cpu')"),
+        (
+            {"observability": "partial"},
+            "ArcadeEnv(StubEasy-v0, num_envs=3, observability='partial', device='cpu')",
+        ),
         (
             {"observability": [True, False, True]},
             "ArcadeEnv(StubEasy-v0, num_envs=3, observability='mixed', device='cpu')",

@@ -61,7 +61,7 @@ class Raw(Fused):
         return self.env.step_raw(torch.arange(N) % 5).pixels
 
 
-# -- what is reused ---------------------------------------------------------------------------------------------------
+# -- what is reused --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", [Fused, Stock, Raw])
@@ -87,7 +87,9 @@ def places_of(monkeypatch: pytest.MonkeyPatch, memory: FrameMemory) -> list[int]
 def test_the_collector_goes_round_in_few_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     env = ArcadeEnv(GAME, N)
     places = places_of(monkeypatch, env._memory)
-    collector = ArcadeCollector(env, scripted, N * 8, compress=torch.clone)  # else it draws into the window
+    collector = ArcadeCollector(
+        env, scripted, N * 8, compress=torch.clone
+    )  # else it draws into the window
     for _ in range(5):
         collector.collect()
     assert len(places) == 40 and len(set(places)) <= 3
@@ -101,7 +103,9 @@ def test_gymnasiums_batch_reuses_frames_too(monkeypatch: pytest.MonkeyPatch, cop
     for _ in range(20):
         frames = batch.step_and_reset(action, copy)[1]
         held.append((frames[1:], frames[1:].copy()))
-    assert (len(set(places)) <= 3) == copy, "frames that were handed out without a copy are still held"
+    assert (len(set(places)) <= 3) == copy, (
+        "frames that were handed out without a copy are still held"
+    )
     assert all((seen == copied).all() for seen, copied in held)
     held.clear()
     del frames
@@ -113,17 +117,21 @@ def test_gymnasiums_batch_reuses_frames_too(monkeypatch: pytest.MonkeyPatch, cop
 
 @pytest.mark.parametrize("game", [GAME, MIXED])
 @pytest.mark.parametrize("function", ["step", "step_only"])
-def test_xla_writes_the_frames_into_the_memory_that_it_is_given(game: CompiledGame, function: str) -> None:
+def test_xla_writes_the_frames_into_the_memory_that_it_is_given(
+    game: CompiledGame, function: str
+) -> None:
     """The program says so; a copy would need memory of its own."""
     batch = ArcadeEnv(game, N)._live.batch
     spare = jax.ShapeDtypeStruct((N, 8, 8, 3), jnp.uint8)
     lowered = getattr(game, function).lower(batch, jnp.zeros(N, jnp.int32), spare)
     header = lowered.compile().as_text().splitlines()[0]
     number = len(jax.tree.leaves(batch)) + 1
-    assert re.search(rf"input_output_alias={{ {{\d+}}: \({number}, {{}}, m\w+-alias\) }}", header), header
+    assert re.search(
+        rf"input_output_alias={{ {{\d+}}: \({number}, {{}}, m\w+-alias\) }}", header
+    ), header
 
 
-# -- what is never touched --------------------------------------------------------------------------------------------
+# -- what is never touched -------------------------------------------------------------------------
 
 HOLDERS: dict[str, Callable[[torch.Tensor], Any]] = {
     "tensor": lambda frames: frames,
@@ -144,7 +152,9 @@ HOLDERS: dict[str, Callable[[torch.Tensor], Any]] = {
     "indexed tensordict": lambda frames: TensorDict({"pixels": frames}, [N])[2:],
     "lazy stack": lambda frames: TensorDict.lazy_stack([TensorDict({"pixels": frames}, [N])] * 2),
     "closure": lambda frames: lambda: frames,
-    "cycle": lambda frames: (lambda self: (self.append(self), self.append(frames[1:3]), self)[-1])([]),
+    "cycle": lambda frames: (lambda self: (self.append(self), self.append(frames[1:3]), self)[-1])(
+        []
+    ),
 }
 
 
@@ -162,7 +172,9 @@ def content(held: Any) -> Any:
 @pytest.mark.parametrize("path", [Fused, Stock, Raw])
 @pytest.mark.parametrize("holder", HOLDERS)
 def test_frames_that_somebody_holds_never_change(path: type[Fused], holder: str) -> None:
-    """Held in turns for up to seven steps, so that memory is free in between; what is held is not offered to JAX."""
+    """Held in turns for up to seven steps, so that memory is free in between; what is held is not
+    offered to JAX.
+    """
     step, held = path(), []
     for number in range(40):
         frames = step()
@@ -175,13 +187,17 @@ def test_frames_that_somebody_holds_never_change(path: type[Fused], holder: str)
         free = [frames.unsafe_buffer_pointer() for frames, seen in blocks if seen() is None]
         for seen, copied, place in held:
             np.testing.assert_array_equal(content(seen), copied)
-            assert place not in free or holder == "shared memory"  # which moved the frames elsewhere
+            assert (
+                place not in free or holder == "shared memory"
+            )  # which moved the frames elsewhere
         if number % 7 == 6:
             del held[::2]
 
 
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
-def test_a_rollout_and_all_that_came_out_of_the_steps_before_keep_their_frames(game: CompiledGame) -> None:
+def test_a_rollout_and_all_that_came_out_of_the_steps_before_keep_their_frames(
+    game: CompiledGame,
+) -> None:
     env = ArcadeEnv(game, N, seed=4)
     td, held = env.reset(), []
     for number in range(60):
@@ -207,13 +223,17 @@ def test_a_transformed_env_and_a_branch_from_a_snapshot_keep_their_frames() -> N
     again = one.clone()
     for _ in range(10):
         base.step(scripted(base.set_state(state)))
-    assert torch.equal(one["next", "pixels"], again["next", "pixels"]) and torch.equal(one["pixels"], again["pixels"])
+    assert torch.equal(one["next", "pixels"], again["next", "pixels"]) and torch.equal(
+        one["pixels"], again["pixels"]
+    )
     assert torch.equal(data["next", "pixels"], copied["next", "pixels"])
 
 
 @settings(deadline=None)
 @given(
-    orders=st.lists(st.sampled_from(["step", "hold", "hold", "drop first", "drop last", "reset"]), max_size=60),
+    orders=st.lists(
+        st.sampled_from(["step", "hold", "hold", "drop first", "drop last", "reset"]), max_size=60
+    ),
     path=st.sampled_from([Fused, Stock, Raw]),
     holders=st.lists(st.sampled_from(sorted(HOLDERS)), min_size=1, max_size=4),
 )
@@ -272,7 +292,9 @@ class CanvasGame(StubGame):
     """A game whose state is its picture, and whose step may leave it as it is."""
 
     def reset(self, key: jax.Array) -> Any:
-        return super().reset(key), jnp.broadcast_to(jax.random.bits(key, dtype=jnp.uint8), (8, 8, 3))
+        return super().reset(key), jnp.broadcast_to(
+            jax.random.bits(key, dtype=jnp.uint8), (8, 8, 3)
+        )
 
     def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
         inner, *rest = super().step(key, state[0], action)
@@ -292,17 +314,21 @@ def test_a_game_whose_state_is_its_picture_keeps_both(path: type[Fused]) -> None
     assert torch.equal(step.env.observe()["pixels"], held[0])
 
 
-# -- windows that are drawn into --------------------------------------------------------------------------------------
+# -- windows that are drawn into -------------------------------------------------------------------
 
 
 def collector(game: CompiledGame = GAME, copies: bool = False, **options: Any) -> ArcadeCollector:
     """A collector whose steps draw into the window, or one that copies frames there."""
     compress = torch.clone if copies else None
-    return ArcadeCollector(ArcadeEnv(game, N, seed=3), scripted, N * 6, compress=compress, **options)
+    return ArcadeCollector(
+        ArcadeEnv(game, N, seed=3), scripted, N * 6, compress=compress, **options
+    )
 
 
 @pytest.mark.parametrize("game", [GAME, LOCKSTEP, MIXED])
-def test_steps_draw_straight_into_the_window(monkeypatch: pytest.MonkeyPatch, game: CompiledGame) -> None:
+def test_steps_draw_straight_into_the_window(
+    monkeypatch: pytest.MonkeyPatch, game: CompiledGame
+) -> None:
     """All frames of a window but the first, which stood there when the window before it ended."""
     one, twin = collector(game), collector(game, copies=True)
     copied: list[int] = []
@@ -310,7 +336,11 @@ def test_steps_draw_straight_into_the_window(monkeypatch: pytest.MonkeyPatch, ga
     for number in range(5):
         expected = twin.collect()
         with monkeypatch.context() as patch:
-            patch.setattr(torch.Tensor, "copy_", lambda to, source: (copied.append(to.data_ptr()), copy(to, source))[1])
+            patch.setattr(
+                torch.Tensor,
+                "copy_",
+                lambda to, source: (copied.append(to.data_ptr()), copy(to, source))[1],
+            )
             pixels = one.collect()["pixels"]
         places = [pixels[:, step].data_ptr() for step in range(6)]
         assert [copied.count(place) for place in places] == [1, 0, 0, 0, 0, 0], number
@@ -325,23 +355,32 @@ def test_xla_writes_one_frame_of_a_window_and_copies_none(game: CompiledGame) ->
     batch = ArcadeEnv(game, N)._live.batch
     window = jax.ShapeDtypeStruct((N, 5, 8, 8, 3), jnp.uint8)
     text = game._step_into.lower(window, 2, batch, jnp.zeros(N, jnp.int32)).compile().as_text()
-    assert re.search(r"input_output_alias=\{ \{0\}: \(0, \{\}, m\w+-alias\) \}", text.splitlines()[0])
+    assert re.search(
+        r"input_output_alias=\{ \{0\}: \(0, \{\}, m\w+-alias\) \}", text.splitlines()[0]
+    )
     assert not re.search(rf"= u8\[{N},5,8,8,3\]\S* copy\(", text)
 
 
 @settings(deadline=None, max_examples=40)
 @given(
     orders=st.lists(
-        st.sampled_from(["collect", "iterate", "hold", "drop first", "drop last", "reset", "other"]), max_size=12
+        st.sampled_from(
+            ["collect", "iterate", "hold", "drop first", "drop last", "reset", "other"]
+        ),
+        max_size=12,
     ),
-    holder=st.sampled_from(["tensor", "slice", "unbound", "detached", "numpy slice", "capsule", "tensordict", "cycle"]),
+    holder=st.sampled_from(
+        ["tensor", "slice", "unbound", "detached", "numpy slice", "capsule", "tensordict", "cycle"]
+    ),
     overlap=st.sampled_from([0, 2, 8]),
     final=st.sampled_from(["all", "truncated", "none"]),
 )
 def test_whatever_is_held_and_dropped_windows_are_those_of_a_collector_that_copies(
     orders: list[str], holder: str, overlap: int, final: Any
 ) -> None:
-    one, twin = (collector(copies=copies, overlap=overlap, final_frames=final) for copies in (False, True))
+    one, twin = (
+        collector(copies=copies, overlap=overlap, final_frames=final) for copies in (False, True)
+    )
     held: list[tuple[Any, Any]] = []
     for order in orders:
         if order.startswith("drop") and held:
@@ -350,10 +389,18 @@ def test_whatever_is_held_and_dropped_windows_are_those_of_a_collector_that_copi
             for each in (one, twin):
                 each.reset() if order == "reset" else each.env.step_raw(torch.arange(N) % 5)
         elif order in ("collect", "iterate", "hold"):
-            ours, theirs = (next(each.iterator()) if order == "iterate" else each.collect() for each in (one, twin))
+            ours, theirs = (
+                next(each.iterator()) if order == "iterate" else each.collect()
+                for each in (one, twin)
+            )
             assert (ours == theirs).all()
             if order == "hold":
-                held.append((HOLDERS[holder](ours["pixels"]), content(HOLDERS[holder](theirs["pixels"].clone()))))
+                held.append(
+                    (
+                        HOLDERS[holder](ours["pixels"]),
+                        content(HOLDERS[holder](theirs["pixels"].clone())),
+                    )
+                )
             del ours, theirs
         for seen, copied in held:
             np.testing.assert_array_equal(content(seen), copied)
@@ -361,7 +408,9 @@ def test_whatever_is_held_and_dropped_windows_are_those_of_a_collector_that_copi
 
 @pytest.mark.parametrize("same", [False, True])
 def test_a_policy_may_hold_the_frames_that_it_saw(same: bool) -> None:
-    """Within the window, whatever is drawn beside them; and beyond it, unless one storage was asked for."""
+    """Within the window, whatever is drawn beside them; and beyond it, unless one storage was asked
+    for.
+    """
     held: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def policy(td: TensorDictBase) -> TensorDictBase:
@@ -378,7 +427,9 @@ def test_a_policy_may_hold_the_frames_that_it_saw(same: bool) -> None:
             held.clear()
     assert len(set(windows)) == (1 if same else 4)
     held.clear()
-    assert len({one.collect()["pixels"].data_ptr() for _ in range(8)}) <= 2, "memory that nobody sees is used again"
+    assert len({one.collect()["pixels"].data_ptr() for _ in range(8)}) <= 2, (
+        "memory that nobody sees is used again"
+    )
 
 
 @pytest.mark.parametrize("without", [jax.disable_jit, jax.debug_nans])
@@ -394,7 +445,11 @@ def test_a_jax_that_draws_elsewhere_has_its_frames_copied(monkeypatch: pytest.Mo
     monkeypatch.setattr("arcade_torch.rollout_buffer.draws_in_place", lambda: False)
     one, places = collector(), []
     step = one.env.step_raw
-    monkeypatch.setattr(one.env, "step_raw", lambda action, **how: (places.append(how["into"]), step(action, **how))[1])
+    monkeypatch.setattr(
+        one.env,
+        "step_raw",
+        lambda action, **how: (places.append(how["into"]), step(action, **how))[1],
+    )
     assert all((one.collect() == twin.collect()).all() for _ in range(3))
     assert places == [None] * 18
 

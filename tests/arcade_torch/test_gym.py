@@ -1,4 +1,6 @@
-"""Gymnasium: registered without cost, the same bits as ArcadeEnv, and Gymnasium's own rules at the ends."""
+"""Gymnasium: registered without cost, the same bits as ArcadeEnv, and Gymnasium's own rules at the
+ends.
+"""
 
 import subprocess
 import sys
@@ -23,7 +25,9 @@ MODES = tuple(AutoresetMode)
 
 
 def output_of(code: str) -> str:
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout.strip()
 
@@ -33,7 +37,9 @@ def equal(left: object, right: object) -> bool:
     if isinstance(left, dict) and isinstance(right, dict):
         return left.keys() == right.keys() and all(equal(left[key], right[key]) for key in left)
     if isinstance(left, tuple) and isinstance(right, tuple):
-        return len(left) == len(right) and all(equal(a, b) for a, b in zip(left, right, strict=True))
+        return len(left) == len(right) and all(
+            equal(a, b) for a, b in zip(left, right, strict=True)
+        )
     if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
         if left.dtype != right.dtype or left.shape != right.shape:
             return False
@@ -52,24 +58,35 @@ def random_actions(steps: int, envs: int) -> np.ndarray:
     [
         "import arcade_torch, gymnasium",
         "import gymnasium, arcade_torch",
-        "import arcade_torch, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",
+        "import arcade_torch, importlib.util; importlib.util.find_spec('gymnasium'); import "
+        "gymnasium",
         "import arcade_torch, importlib; importlib.reload(arcade_torch); import gymnasium",
         "import arcade_torch; from gymnasium.envs.registration import registry; import gymnasium",
     ],
 )
 def test_the_games_are_registered_whoever_is_imported_first(imports: str) -> None:
-    code = f"{imports}\nimport sys\nn = sum(id.startswith('arcade_torch/') for id in gymnasium.registry)"
+    code = (
+        f"{imports}\nimport sys\nn = sum(id.startswith('arcade_torch/') for id in "
+        "gymnasium.registry)"
+    )
     assert output_of(f"{code}\nprint(n, sorted({{'jax', 'torch'}} & set(sys.modules)))") == "30 []"
 
 
 def test_the_registered_ids_are_those_of_the_games() -> None:
-    theirs = {id.removeprefix("arcade_torch/") for id in gymnasium.registry if id.startswith("arcade_torch/")}
+    theirs = {
+        id.removeprefix("arcade_torch/")
+        for id in gymnasium.registry
+        if id.startswith("arcade_torch/")
+    }
     assert theirs - set(probe_ids()) == set(arcade_torch.registered_ids())
 
 
 def test_an_environment_loads_no_torch() -> None:
     """And Gymnasium imports the package itself when the id names it."""
-    code = f"import gymnasium, sys; env = gymnasium.make('arcade_torch:{GAME}'); env.reset(); env.step(4)"
+    code = (
+        f"import gymnasium, sys; env = gymnasium.make('arcade_torch:{GAME}'); env.reset(); "
+        "env.step(4)"
+    )
     assert output_of(f"{code}; print('torch' in sys.modules)") == "False"
 
 
@@ -77,21 +94,30 @@ def test_an_environment_loads_no_torch() -> None:
 def test_env_and_vector_env_have_the_bits_of_arcade_env(observability: str) -> None:
     """Frames, rewards, ends and counts over many episodes: env 0 alone, all envs as a vector."""
     num_envs, steps = 3, 100
-    theirs = arcade_torch.make("MineSweeperEasy", num_envs=num_envs, observability=observability, seed=5)
+    theirs = arcade_torch.make(
+        "MineSweeperEasy", num_envs=num_envs, observability=observability, seed=5
+    )
     alone = gymnasium.make(GAME, observability=observability)
-    many = gymnasium.make_vec(GAME, num_envs=num_envs, observability=observability, autoreset_mode="SameStep")
+    many = gymnasium.make_vec(
+        GAME, num_envs=num_envs, observability=observability, autoreset_mode="SameStep"
+    )
     root = theirs.reset()
     assert equal(alone.reset(seed=5)[0], root["pixels"][0].numpy())
     assert equal(many.reset(seed=5)[0], root["pixels"].numpy())
     ends = 0
     for action in random_actions(steps, num_envs):
         step, root = theirs.step_and_maybe_reset(root.set("action", torch.from_numpy(action)))
-        after = {key: value.squeeze(-1).numpy() for key, value in step["next"].items() if key != "pixels"}
+        after = {
+            key: value.squeeze(-1).numpy() for key, value in step["next"].items() if key != "pixels"
+        }
         frame, reward, terminated, truncated, info = alone.step(action[0])
         assert equal(frame, step["next", "pixels"][0].numpy())
         assert type(reward) is float and reward == after["reward"][0]
         assert (terminated, truncated) == (after["terminated"][0], after["truncated"][0])
-        assert info == {"episode_reward": after["episode_reward"][0], "step_count": after["step_count"][0]}
+        assert info == {
+            "episode_reward": after["episode_reward"][0],
+            "step_count": after["step_count"][0],
+        }
         frames, rewards, terminations, truncations, infos = many.step(action)
         assert equal(frames, root["pixels"].numpy())
         assert (rewards == after["reward"]).all()
@@ -113,7 +139,9 @@ def test_the_vector_env_is_gymnasium_s_own_to_the_bit(mode: AutoresetMode) -> No
     sync = SyncVectorEnv([lambda: ArcadeGymEnv("MineSweeperEasy")] * num_envs, autoreset_mode=mode)
     ours = gymnasium.make_vec(GAME, num_envs=num_envs, autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] is mode
-    assert ours.observation_space == sync.observation_space and ours.action_space == sync.action_space
+    assert (
+        ours.observation_space == sync.observation_space and ours.action_space == sync.action_space
+    )
     assert equal(ours.reset(seed=seeds), sync.reset(seed=seeds))
     kinds, resets = np.zeros(2, bool), set()
     for action in random_actions(80, num_envs):
@@ -125,7 +153,9 @@ def test_the_vector_env_is_gymnasium_s_own_to_the_bit(mode: AutoresetMode) -> No
         if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
             mask = {"reset_mask": terminated | truncated}
             seed = seeds if terminated[1] else None  # seeds count in the envs that are reset
-            assert equal(ours.reset(seed=seed, options=dict(mask)), sync.reset(seed=seed, options=dict(mask)))
+            assert equal(
+                ours.reset(seed=seed, options=dict(mask)), sync.reset(seed=seed, options=dict(mask))
+            )
             resets.add("without a seed" if seed is None else "seeded")
     assert kinds.all() and len(resets) == (2 if mode is AutoresetMode.DISABLED else 0)
 
@@ -187,7 +217,10 @@ def test_without_a_seed_np_random_decides_and_with_one_nothing_else() -> None:
     one, two = (ArcadeVectorEnv("MineSweeperEasy", 3) for _ in range(2))
 
     def shots(envs: ArcadeVectorEnv, seed: int | None = None) -> list[np.ndarray]:
-        return [envs.reset(seed=seed)[0], *(envs.step(np.full(3, action))[0] for action in (4, 3, 4))]
+        return [
+            envs.reset(seed=seed)[0],
+            *(envs.step(np.full(3, action))[0] for action in (4, 3, 4)),
+        ]
 
     one.np_random, two.np_random = (np.random.default_rng(7) for _ in range(2))
     drawn = shots(one)
@@ -207,11 +240,19 @@ def test_without_a_seed_np_random_decides_and_with_one_nothing_else() -> None:
 
 
 def test_rules_sizes_and_game_options_reach_the_game() -> None:
-    env = gymnasium.make("arcade_torch/BreakoutEasy-v0", obs_size=256, rules="reference", tail="previous")
+    env = gymnasium.make(
+        "arcade_torch/BreakoutEasy-v0", obs_size=256, rules="reference", tail="previous"
+    )
     game = env.unwrapped._batch.game
     assert (game.obs_size, game.rules, game.tail) == (256, "reference", "previous")
-    assert env.observation_space.shape == (256, 256, 3) and env.reset(seed=0)[0].shape == (256, 256, 3)
-    envs = gymnasium.make_vec("arcade_torch/BreakoutEasy-v0", num_envs=2, rules="reference", random_start=True)
+    assert env.observation_space.shape == (256, 256, 3) and env.reset(seed=0)[0].shape == (
+        256,
+        256,
+        3,
+    )
+    envs = gymnasium.make_vec(
+        "arcade_torch/BreakoutEasy-v0", num_envs=2, rules="reference", random_start=True
+    )
     assert (envs._batch.game.rules, envs._batch.game.random_start) == ("reference", True)
 
 
@@ -233,7 +274,9 @@ def test_render_gives_the_frame_that_is_seen() -> None:
 
 
 def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    pygame = pytest.importorskip("pygame", reason="needs the play extra: pip install 'arcade-torch[play]'")
+    pygame = pytest.importorskip(
+        "pygame", reason="needs the play extra: pip install 'arcade-torch[play]'"
+    )
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env = gymnasium.make(GAME, render_mode="human")
     for look in (lambda: env.reset(seed=0), lambda: env.step(4)):
@@ -256,8 +299,16 @@ def test_a_window_without_pygame_says_how_to_get_it(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"observability": "half"}, ValueError, "observability is 'half', allowed: 'full', 'partial'"),
-        ({"observability": [True, False]}, ValueError, r"observability is bool \(2,\), expected bool \(1,\)"),
+        (
+            {"observability": "half"},
+            ValueError,
+            "observability is 'half', allowed: 'full', 'partial'",
+        ),
+        (
+            {"observability": [True, False]},
+            ValueError,
+            r"observability is bool \(2,\), expected bool \(1,\)",
+        ),
         ({"observability": "full", "partial_obs": True}, ValueError, "partial_obs is its alias"),
         ({"partial_obs": "yes"}, TypeError, "partial_obs is 'yes'"),
         ({"obs_size": 64}, ValueError, "obs_size is 64, allowed: 128, 256"),
@@ -272,15 +323,21 @@ def test_bad_arguments_are_refused_with_one_clear_line(
 ) -> None:
     with pytest.raises(error, match=message):
         ArcadeGymEnv("MineSweeperEasy", **arguments)
-    with pytest.raises(error, match=message.replace("render_mode is", "render_mode of a vector environment is")):
+    with pytest.raises(
+        error, match=message.replace("render_mode is", "render_mode of a vector environment is")
+    ):
         ArcadeVectorEnv("MineSweeperEasy", 1, **arguments)
 
 
 @pytest.mark.parametrize(
-    "seed", [1.5, True, "12", [1, 2.0], [True, 2], [None, 2], ["1", 2], {1, 2}, np.ones(2)], ids=repr
+    "seed",
+    [1.5, True, "12", [1, 2.0], [True, 2], [None, 2], ["1", 2], {1, 2}, np.ones(2)],
+    ids=repr,
 )
 def test_a_seed_that_is_no_whole_number_is_refused_in_one_line(seed: object) -> None:
-    with pytest.raises(TypeError, match=r"^seed is .*, expected a whole number from 0 to 4294967295$"):
+    with pytest.raises(
+        TypeError, match=r"^seed is .*, expected a whole number from 0 to 4294967295$"
+    ):
         seed_keys(seed, 2)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,6 @@
-"""What Gymnasium's users expect of any env: copies, pickles, a time limit to read, numpy's numbers as arguments."""
+"""What Gymnasium's users expect of any env: copies, pickles, a time limit to read, numpy's numbers
+as arguments.
+"""
 
 import copy
 import pickle
@@ -94,10 +96,15 @@ def test_a_shorter_limit_is_kept() -> None:
     env = gymnasium.make("arcade_torch/AutoEncodeEasy-v0", max_episode_steps=5)
     env.reset(seed=0)
     assert [env.step(0)[3] for _ in range(5)] == [False] * 4 + [True]
-    with pytest.raises(ValueError, match="max_episode_steps is 5, but AutoEncodeEasy-v0 ends after"):
+    with pytest.raises(
+        ValueError, match="max_episode_steps is 5, but AutoEncodeEasy-v0 ends after"
+    ):
         gymnasium.make_vec("arcade_torch/AutoEncodeEasy-v0", num_envs=2, max_episode_steps=5)
     envs = gymnasium.make_vec("arcade_torch/AutoEncodeEasy-v0", num_envs=2)
-    assert gymnasium.make_vec(envs.spec, num_envs=2).spec.max_episode_steps == envs.spec.max_episode_steps
+    assert (
+        gymnasium.make_vec(envs.spec, num_envs=2).spec.max_episode_steps
+        == envs.spec.max_episode_steps
+    )
 
 
 class Mine(ArcadeGymEnv):
@@ -116,7 +123,9 @@ def test_a_copy_of_a_subclass_keeps_what_its_user_put_there(way: str) -> None:
     env.note = [1]
     twin = WAYS[way](env)
     assert (twin.word, twin.note) == ("mine", [1]) and twin.note is not env.note
-    assert [twin.action_space.sample() for _ in range(9)] == [env.action_space.sample() for _ in range(9)]
+    assert [twin.action_space.sample() for _ in range(9)] == [
+        env.action_space.sample() for _ in range(9)
+    ]
     np.testing.assert_equal(twin.step(4), env.step(4))
 
 
@@ -127,7 +136,9 @@ def test_a_second_window_is_refused_and_the_first_stays(monkeypatch: pytest.Monk
     first = gymnasium.make(ID, render_mode="human")
     second = gymnasium.make(ID, render_mode="human")
     first.reset(seed=0)
-    with pytest.raises(RuntimeError, match=r"one window a process: close\(\) the env that has it first"):
+    with pytest.raises(
+        RuntimeError, match=r"one window a process: close\(\) the env that has it first"
+    ):
         second.reset(seed=0)
     first.step(0)
     first.close()
@@ -138,8 +149,12 @@ def test_a_second_window_is_refused_and_the_first_stays(monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: arcade_torch.make("CartPoleEasy", num_envs=np.int64(2), obs_size=np.int32(128), seed=np.uint32(3)),
-        lambda: arcade_torch.make("CartPoleEasy", np.int16(2), partial_obs=np.True_, categorical_actions=np.False_),
+        lambda: arcade_torch.make(
+            "CartPoleEasy", num_envs=np.int64(2), obs_size=np.int32(128), seed=np.uint32(3)
+        ),
+        lambda: arcade_torch.make(
+            "CartPoleEasy", np.int16(2), partial_obs=np.True_, categorical_actions=np.False_
+        ),
         lambda: arcade_torch.make("AutoEncodeEasy", 2, mdp_marker=np.False_, debug=np.True_),
         lambda: arcade_torch.make("MineSweeperEasy", 2, mine_reward=np.float64(-0.5)),
         lambda: gymnasium.make_vec(ID, num_envs=np.int64(2), obs_size=np.int64(128)),
@@ -166,7 +181,10 @@ def test_a_collector_takes_numbers_of_numpy() -> None:
         ({"frames_per_batch": "8"}, "frames_per_batch is '8', expected an int"),
         ({"frames_per_batch": 8, "total_frames": "x"}, "total_frames is 'x', expected an int"),
         ({"frames_per_batch": 8, "overlap": True}, "overlap is True, expected an int"),
-        ({"frames_per_batch": 8, "return_same_td": "no"}, "return_same_td is 'no', allowed: True, False"),
+        (
+            {"frames_per_batch": 8, "return_same_td": "no"},
+            "return_same_td is 'no', allowed: True, False",
+        ),
         ({"frames_per_batch": 8, "seed": "a"}, "seed is 'a', expected an int"),
     ],
 )
@@ -176,5 +194,7 @@ def test_a_collector_refuses_other_things_in_one_line(options: dict[str, Any], s
 
 
 def test_numbers_without_axes_are_numbers() -> None:
-    env = arcade_torch.make("CartPoleEasy", num_envs=torch.tensor(2), seed=np.array(3), obs_size=np.array(128))
+    env = arcade_torch.make(
+        "CartPoleEasy", num_envs=torch.tensor(2), seed=np.array(3), obs_size=np.array(128)
+    )
     assert env.num_envs == 2

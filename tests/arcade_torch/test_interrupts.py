@@ -31,7 +31,7 @@ def collector(game: Any = GAME, **options: Any) -> ArcadeCollector:
     return ArcadeCollector(ArcadeEnv(game, N, seed=3), None, N * STEPS, seed=1, **options)
 
 
-# -- at random moments, in a process of its own ------------------------------------------------------------------------
+# -- at random moments, in a process of its own ----------------------------------------------------
 
 
 def interrupted(game: str, same: bool, interrupts: int) -> str:
@@ -39,14 +39,18 @@ def interrupted(game: str, same: bool, interrupts: int) -> str:
     words += [game, "--interrupts", str(interrupts), *["--same"] * same]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(words, capture_output=True, text=True, cwd=root, env=environment, timeout=600)
+    done = subprocess.run(
+        words, capture_output=True, text=True, cwd=root, env=environment, timeout=600
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
 
 @pytest.mark.parametrize("same", [False, True])
 def test_ctrl_c_at_random_moments_harms_nothing(same: bool) -> None:
-    """Before: 56 to 59 of 200 interrupts lost memory that tensors lay over; with one storage, a segmentation fault."""
+    """Before: 56 to 59 of 200 interrupts lost memory that tensors lay over; with one storage, a
+    segmentation fault.
+    """
     assert f"same={same}: 40 interrupts" in interrupted("CartPoleEasy", same, 40)
 
 
@@ -57,12 +61,14 @@ def test_a_thousand_interrupts_harm_nothing(game: str, same: bool) -> None:
     assert "170 interrupts" in interrupted(game, same, 170)
 
 
-# -- at every instruction ----------------------------------------------------------------------------------------------
+# -- at every instruction --------------------------------------------------------------------------
 
 
 @contextmanager
 def raising_at(number: int) -> Iterator[list[int]]:
-    """Raise KeyboardInterrupt before the instruction of that number that the bridge executes; counts them."""
+    """Raise KeyboardInterrupt before the instruction of that number that the bridge executes;
+    counts them.
+    """
     count = [0]
 
     def trace(frame: FrameType, event: str, argument: Any) -> Any:
@@ -105,7 +111,9 @@ def interrupt_everywhere(same: bool, every: int) -> None:
         except KeyboardInterrupt:
             assert one.frames in (frames, frames + N * STEPS)
         if not same:
-            assert all(torch.equal(held[key], value) for key, value in copy.items(True, True)), number
+            assert all(torch.equal(held[key], value) for key, value in copy.items(True, True)), (
+                number
+            )
         held = one.collect()
         follows_on(held)
         copy = held.clone()
@@ -122,7 +130,7 @@ def test_an_interrupt_at_every_instruction_loses_that_window_alone(same: bool) -
     interrupt_everywhere(same, every=1)
 
 
-# -- steps that fail while they run ------------------------------------------------------------------------------------
+# -- steps that fail while they run ----------------------------------------------------------------
 
 
 class FailingGame(StubGame):
@@ -156,7 +164,9 @@ class FailingGame(StubGame):
 @pytest.mark.parametrize("same", [False, True])
 @pytest.mark.parametrize("where", ["step", "render"])
 def test_a_step_that_fails_while_it_runs_loses_its_window_alone(where: str, same: bool) -> None:
-    """Before: ``Buffer has been deleted or donated``, and every second ``collect`` failed for ever."""
+    """Before: ``Buffer has been deleted or donated``, and every second ``collect`` failed for
+    ever.
+    """
     game = FailingGame(where, risk=0.3, max_steps=5)
     one = collector(CompiledGame(game), return_same_td=same)
     held = one.collect()
@@ -164,7 +174,9 @@ def test_a_step_that_fails_while_it_runs_loses_its_window_alone(where: str, same
     for number in range(20):
         calls = [0]
 
-        def policy(td: TensorDictBase, number: int = number, calls: list[int] = calls) -> TensorDictBase:
+        def policy(
+            td: TensorDictBase, number: int = number, calls: list[int] = calls
+        ) -> TensorDictBase:
             game.fails = calls[0] == number % STEPS
             calls[0] += 1
             return td.set("action", torch.zeros(N, dtype=torch.int64))
@@ -191,7 +203,10 @@ def test_an_env_whose_step_failed_stays_where_it_was(where: str) -> None:
     root = env.reset()
     pixels = root["pixels"].clone()
     before = env.get_state()
-    for step in (lambda: env.step(root.clone().set("action", action)), lambda: env.step_raw(action)):
+    for step in (
+        lambda: env.step(root.clone().set("action", action)),
+        lambda: env.step_raw(action),
+    ):
         game.fails = True
         with pytest.raises(Exception, match="told to fail"):
             step()
@@ -204,10 +219,12 @@ def test_an_env_whose_step_failed_stays_where_it_was(where: str) -> None:
 def test_steps_of_a_game_that_calls_back_do_not_draw_where_tensors_lie() -> None:
     assert ArcadeEnv(GAME, N).draws_safely()
     for where in ("step", "render"):
-        assert not ArcadeEnv(CompiledGame(FailingGame(where, risk=0.3, max_steps=5)), N).draws_safely()
+        assert not ArcadeEnv(
+            CompiledGame(FailingGame(where, risk=0.3, max_steps=5)), N
+        ).draws_safely()
 
 
-# -- others that fail --------------------------------------------------------------------------------------------------
+# -- others that fail ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("where", ["policy", "compress"])

@@ -20,9 +20,13 @@ N = 4
 
 
 def random_policy(td: TensorDictBase) -> TensorDictBase:
-    """Actions that depend on the count of steps and the row alone, so that every env can be played apart."""
+    """Actions that depend on the count of steps and the row alone, so that every env can be played
+    apart.
+    """
     rows = torch.arange(td.shape[0])
-    td["action"] = (td["step_count"].squeeze(-1) * 7 + rows * 3 + td["step_count"].squeeze(-1) // 5) % 5
+    td["action"] = (
+        td["step_count"].squeeze(-1) * 7 + rows * 3 + td["step_count"].squeeze(-1) // 5
+    ) % 5
     return td
 
 
@@ -37,7 +41,9 @@ def test_real_games_share_an_env_and_pass_torchrls_checker(env: ArcadeEnv) -> No
     assert [game.id for game in env.games] == ["BattleShipEasy-v0", "TetrisEasy-v0"]
     assert env.game.id == "BattleShipEasy-v0+TetrisEasy-v0"
     data = env.rollout(3)
-    assert (data["task"] == env.task.unsqueeze(-1)).all() and (data["next", "task"] == data["task"]).all()
+    assert (data["task"] == env.task.unsqueeze(-1)).all() and (
+        data["next", "task"] == data["task"]
+    ).all()
     assert make(IDS, num_envs=N)._compiled is env._compiled, "a second env compiles nothing"
 
 
@@ -52,7 +58,10 @@ def test_every_env_shows_what_it_shows_in_its_game_alone() -> None:
 
 
 def test_an_id_that_stands_twice_gets_two_shares() -> None:
-    assert make(["CartPoleEasy", "TetrisEasy", "CartPoleEasy-v0"], num_envs=6).task.tolist() == [0] * 4 + [1] * 2
+    assert (
+        make(["CartPoleEasy", "TetrisEasy", "CartPoleEasy-v0"], num_envs=6).task.tolist()
+        == [0] * 4 + [1] * 2
+    )
     assert make(["TetrisEasy", "CartPoleEasy"], num_envs=5).task.tolist() == [0] * 3 + [1] * 2
 
 
@@ -73,15 +82,22 @@ def test_a_policy_may_read_the_task_in_either_collector() -> None:
             return td
 
     batch = ArcadeCollector(ArcadeEnv(MIXED, 6), ByTask(), frames_per_batch=48).collect()
-    assert torch.equal(batch["action"], batch["task"] + 2) and batch["task"].unique().tolist() == [0, 1]
+    assert torch.equal(batch["action"], batch["task"] + 2) and batch["task"].unique().tolist() == [
+        0,
+        1,
+    ]
 
 
 def test_the_state_of_a_mixture_names_the_game_of_every_env() -> None:
     state = ArcadeEnv(MIXED, 6).get_state()
     assert set(state["state"].keys()) == {"StubEasy-v0", "CoinEasy-v0"}
     assert state["game"].unique().numel() == 2
-    with pytest.raises(ValueError, match="the state of env 4 is one of another game, this env plays 2"):
-        ArcadeEnv(MIXED, 6).set_state(state.clone().set("game", state["game"][:1].expand(6).clone()))
+    with pytest.raises(
+        ValueError, match="the state of env 4 is one of another game, this env plays 2"
+    ):
+        ArcadeEnv(MIXED, 6).set_state(
+            state.clone().set("game", state["game"][:1].expand(6).clone())
+        )
 
 
 @pytest.mark.parametrize(
@@ -89,24 +105,37 @@ def test_the_state_of_a_mixture_names_the_game_of_every_env() -> None:
     [
         ({"id": []}, ValueError, "the list of env ids is empty: name at least one game"),
         ({"id": ()}, ValueError, "the list of env ids is empty"),
-        ({"id": ["CartPoleEasy", "TetrsEasy"]}, ValueError, "unknown env id 'TetrsEasy': did you mean 'TetrisEasy'?"),
+        (
+            {"id": ["CartPoleEasy", "TetrsEasy"]},
+            ValueError,
+            "unknown env id 'TetrsEasy': did you mean 'TetrisEasy'?",
+        ),
         ({"id": ["CartPoleEasy", 3]}, TypeError, "the env id is 3, expected a string"),
-        ({"id": 3}, TypeError, "the env id is 3, expected a string such as 'CartPoleEasy', or a list of them"),
+        (
+            {"id": 3},
+            TypeError,
+            "the env id is 3, expected a string such as 'CartPoleEasy', or a list of them",
+        ),
         ({"num_envs": 1}, ValueError, "num_envs is 1, too few for CartPoleEasy-v0+TetrisEasy-v0"),
         ({"arrow": "log"}, TypeError, "TetrisEasy-v0 has no option 'arrow'"),
         ({"obs_size": [128, 256]}, ValueError, "obs_size is [128, 256], allowed: 128, 256"),
     ],
 )
-def test_make_explains_a_wrong_mixture(options: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_make_explains_a_wrong_mixture(
+    options: dict[str, Any], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=re.escape(message)):
         make(**{"id": ["CartPoleEasy", "TetrisEasy"], "num_envs": 3, **options})
 
 
-# -- both twins at once -----------------------------------------------------------------------------------------------
+# -- both twins at once ----------------------------------------------------------------------------
 
 
 def test_each_env_of_a_mixed_batch_shows_the_twin_it_was_told_also_from_mid_episode_on() -> None:
-    flags, later = torch.tensor([True, False, True, False]), torch.tensor([True, True, False, False])
+    flags, later = (
+        torch.tensor([True, False, True, False]),
+        torch.tensor([True, True, False, False]),
+    )
     mixed = make("MineSweeperEasy", N, observability=flags, seed=2)
     twins = [make("MineSweeperEasy", N, observability=word, seed=2) for word in ("full", "partial")]
     roots = [env.reset() for env in (mixed, *twins)]
@@ -134,7 +163,9 @@ def test_each_env_of_a_mixed_batch_shows_the_twin_it_was_told_also_from_mid_epis
 
 
 def test_the_collector_follows_when_twins_are_switched_between_two_windows() -> None:
-    """In the frames that are acted on and in those at ends; the games begin with different twins."""
+    """In the frames that are acted on and in those at ends; the games begin with different
+    twins.
+    """
     flags = torch.tensor([True, False, True, False, False, True])
 
     def frames(batch: TensorDictBase) -> torch.Tensor:

@@ -1,7 +1,9 @@
-"""Before the first update, what a memory replays is what it acted, by every path from collector to loss.
+"""Before the first update, what a memory replays is what it acted, by every path from collector to
+loss.
 
-The difference in log-probability is the one number that finds experience and memory out of step: rows that leak into
-each other, starts that are not marked, states that were not stored. Nothing else does, training goes on in silence.
+The difference in log-probability is the one number that finds experience and memory out of step:
+rows that leak into each other, starts that are not marked, states that were not stored. Nothing
+else does, training goes on in silence.
 """
 
 from collections.abc import Callable
@@ -19,7 +21,12 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.envs import TransformedEnv
-from torchrl.modules import ActorValueOperator, ProbabilisticActor, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    ActorValueOperator,
+    ProbabilisticActor,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.modules.utils import get_primers_from_module
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -28,7 +35,13 @@ from torchrl.trainers.algorithms import PPOTrainer
 from arcade_torch.agents import PPOLoss, PQNLoss, make_actor, make_policy
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.models import ActorCriticNetwork, MemoryModule, MemoryNetwork, make_memory, memory_names
+from arcade_torch.models import (
+    ActorCriticNetwork,
+    MemoryModule,
+    MemoryNetwork,
+    make_memory,
+    memory_names,
+)
 from tests.agents.fakes import Stream, lambda_return, look_into, play
 from tests.arcade_torch.stub import GAME
 
@@ -40,7 +53,9 @@ Recipe = Callable[[TensorDictSequential], "Collector | ArcadeCollector"]
 def make_agent(name: str) -> ActorValueOperator:
     torch.manual_seed(1)
     layers = nn.Sequential(nn.Flatten(-3), nn.Linear(192, 8), nn.Tanh())
-    encoder = TensorDictModule(lambda pixels: layers(pixels.float() / 255), ["pixels"], ["features"])
+    encoder = TensorDictModule(
+        lambda pixels: layers(pixels.float() / 255), ["pixels"], ["features"]
+    )
     encoder.layers = layers
     memory = MemoryModule(make_memory(name, 8, 8), "features", "remembered", store="step")
     policy = ProbabilisticActor(
@@ -76,12 +91,18 @@ def log_ratio(policy: TensorDictSequential, batch: TensorDictBase) -> float:
     return float((again - batch["action_log_prob"]).abs().max())
 
 
-def slices(sampler: SliceSamplerWithoutReplacement | SamplerWithoutReplacement) -> TensorDictReplayBuffer:
-    return TensorDictReplayBuffer(storage=LazyTensorStorage(N * T), sampler=sampler, batch_size=6 * SLICE)
+def slices(
+    sampler: SliceSamplerWithoutReplacement | SamplerWithoutReplacement,
+) -> TensorDictReplayBuffer:
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(N * T), sampler=sampler, batch_size=6 * SLICE
+    )
 
 
 def slice_sampler() -> SliceSamplerWithoutReplacement:
-    return SliceSamplerWithoutReplacement(slice_len=SLICE, traj_key=("collector", "traj_ids"), strict_length=False)
+    return SliceSamplerWithoutReplacement(
+        slice_len=SLICE, traj_key=("collector", "traj_ids"), strict_length=False
+    )
 
 
 @pytest.fixture(params=memory_names())
@@ -110,7 +131,9 @@ def test_a_collected_window_replays_and_so_do_slices_of_it(name: str, recipe: Re
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("sampler", ["slices", "steps"])
-def test_torchrls_ppo_trainer_replays_slices_and_not_shuffled_steps(name: str, sampler: str) -> None:
+def test_torchrls_ppo_trainer_replays_slices_and_not_shuffled_steps(
+    name: str, sampler: str
+) -> None:
     agent = make_agent(name)
     policy, critic = agent.get_policy_operator(), agent.get_value_operator()
     loss = ClipPPOLoss(policy, critic)
@@ -129,7 +152,9 @@ def test_torchrls_ppo_trainer_replays_slices_and_not_shuffled_steps(name: str, s
         loss_module=loss,
         optimizer=torch.optim.Adam(loss.parameters(), lr=1e-2),
         gae=advantages,
-        replay_buffer=slices(slice_sampler() if sampler == "slices" else SamplerWithoutReplacement()),
+        replay_buffer=slices(
+            slice_sampler() if sampler == "slices" else SamplerWithoutReplacement()
+        ),
         progress_bar=False,
         seed=0,
     )
@@ -164,7 +189,9 @@ def test_gae_in_recurrent_mode_gives_the_values_that_were_acted(name: str) -> No
         live, going_on = ~batch["next", "terminated"], ~batch["next", "done"]
         expected, advantage = torch.empty_like(acted), torch.zeros(N, 1)
         for t in reversed(range(T)):
-            delta = batch["next", "reward"][:, t] + 0.9 * next_value[:, t] * live[:, t] - acted[:, t]
+            delta = (
+                batch["next", "reward"][:, t] + 0.9 * next_value[:, t] * live[:, t] - acted[:, t]
+            )
             expected[:, t] = advantage = delta + 0.9 * 0.8 * advantage * going_on[:, t]
         gae = GAE(gamma=0.9, lmbda=0.8, value_network=critic)
         with set_recurrent_mode(True):
@@ -174,7 +201,7 @@ def test_gae_in_recurrent_mode_gives_the_values_that_were_acted(name: str) -> No
     collector.shutdown()
 
 
-# -- our networks and losses ------------------------------------------------------------------------------------------
+# -- our networks and losses -----------------------------------------------------------------------
 
 
 class Frames(nn.Module):
@@ -194,7 +221,9 @@ class Frames(nn.Module):
 OVERLAP, Q, LOGITS = 4, ("action_value", "memory"), ("logits", ("memory", "actor"))
 
 
-def make_memory_network(name: str, outputs: int, key: str, state: str | tuple[str, ...]) -> MemoryNetwork:
+def make_memory_network(
+    name: str, outputs: int, key: str, state: str | tuple[str, ...]
+) -> MemoryNetwork:
     head = nn.Linear(8, outputs)
     return MemoryNetwork(Frames(), make_memory(name, 13, 8), head, out_key=key, state_key=state)  # type: ignore[arg-type]
 
@@ -221,17 +250,23 @@ paths = pytest.mark.parametrize("path", ["truncated", "all", "iterated", "Collec
 
 
 @paths
-def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_frames(name: str, path: str) -> None:
+def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_frames(
+    name: str, path: str
+) -> None:
     torch.manual_seed(1)
     network = make_memory_network(name, 5, *Q)
     policy = make_policy(network, epsilon=0.5)
     batch = window(policy, path)
     done = batch["next", "done"].squeeze(-1)
-    assert done[:, :-1].any() and not done[:, :-1].any(0).all() and batch["action_value"].std() > 1e-3
+    assert (
+        done[:, :-1].any() and not done[:, :-1].any(0).all() and batch["action_value"].std() > 1e-3
+    )
     loss = PQNLoss(network)
     q, target, after = look_into(loss, batch)
     torch.testing.assert_close(q, batch["action_value"].detach(), **CLOSE)
-    dense = batch["next", "pixels"] if path != "truncated" else window(policy, "all")["next", "pixels"]
+    dense = (
+        batch["next", "pixels"] if path != "truncated" else window(policy, "all")["next", "pixels"]
+    )
     first = batch.get("initial_state", None)
     if first is None:
         stored = [(key, batch[key][:, 0]) for key in network.state_keys]
@@ -251,7 +286,9 @@ def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_
 
 
 @paths
-def test_the_loss_of_ppo_reads_the_policy_and_the_values_that_were_acted(name: str, path: str) -> None:
+def test_the_loss_of_ppo_reads_the_policy_and_the_values_that_were_acted(
+    name: str, path: str
+) -> None:
     torch.manual_seed(1)
     critic = make_memory_network(name, 1, "state_value", ("memory", "critic"))
     network = ActorCriticNetwork(make_memory_network(name, 5, *LOGITS), critic)

@@ -1,4 +1,6 @@
-"""What went wrong in silence: episode numbers given twice, torch's defaults in the storage, counts above 2 ** 24."""
+"""What went wrong in silence: episode numbers given twice, torch's defaults in the storage, counts
+above 2 ** 24.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -22,10 +24,12 @@ GAME = CompiledGame(StubGame(risk=0.2, max_steps=9))
 
 
 def collector(**options: Any) -> ArcadeCollector:
-    return ArcadeCollector(ArcadeEnv(GAME, N, seed=3), None, N * STEPS, total_frames=-1, seed=1, **options)
+    return ArcadeCollector(
+        ArcadeEnv(GAME, N, seed=3), None, N * STEPS, total_frames=-1, seed=1, **options
+    )
 
 
-# -- episode numbers ---------------------------------------------------------------------------------------------------
+# -- episode numbers -------------------------------------------------------------------------------
 
 
 def ids(batch: TensorDict) -> set[int]:
@@ -87,7 +91,9 @@ def test_no_slice_spans_two_episodes_after_a_reset() -> None:
     """Before: 79 of 100 did; TorchRL's collector 0."""
     torch.manual_seed(0)
     sampler = SliceSampler(slice_len=3, traj_key=("collector", "traj_ids"))
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2000), sampler=sampler, batch_size=300)
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(2000), sampler=sampler, batch_size=300
+    )
     one = collector()
     windows = one.iterator()
     for _ in range(6):
@@ -104,10 +110,13 @@ def test_a_saved_collector_goes_on_with_its_numbers() -> None:
     saved = one.state_dict()
     other = collector()
     other.load_state_dict(saved)
-    assert torch.equal(next(one.iterator())["collector", "traj_ids"], next(other.iterator())["collector", "traj_ids"])
+    assert torch.equal(
+        next(one.iterator())["collector", "traj_ids"],
+        next(other.iterator())["collector", "traj_ids"],
+    )
 
 
-# -- torch's defaults --------------------------------------------------------------------------------------------------
+# -- torch's defaults ------------------------------------------------------------------------------
 
 
 @pytest.fixture(params=[torch.float64, torch.float16, torch.bfloat16, "meta"], ids=str)
@@ -153,7 +162,9 @@ def test_defaults_of_torch_change_nothing_of_what_is_stored(defaults: Any) -> No
     assert expected() == WANTED
     for entries in WANTED.values():
         assert {device for _, device in entries.values()} == {"cpu"}
-        assert all(dtype == torch.float32 for dtype, _ in entries.values() if dtype.is_floating_point)
+        assert all(
+            dtype == torch.float32 for dtype, _ in entries.values() if dtype.is_floating_point
+        )
 
 
 def test_rewards_are_the_same_numbers_whatever_torch_takes_for_granted(defaults: Any) -> None:
@@ -165,7 +176,7 @@ def test_rewards_are_the_same_numbers_whatever_torch_takes_for_granted(defaults:
     assert torch.equal(batch["action"], again["action"])
 
 
-# -- counts ------------------------------------------------------------------------------------------------------------
+# -- counts ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", ["step", "fused", "collector", "gymnasium"])
@@ -191,28 +202,46 @@ def test_steps_are_counted_beyond_what_a_float32_holds(path: str) -> None:
         one.collect()
         env.set_state(state)
         batch = one.collect()
-        assert batch["next", "step_count"][0].flatten().tolist() == [first + 1, first + 2, first + 3]
+        assert batch["next", "step_count"][0].flatten().tolist() == [
+            first + 1,
+            first + 2,
+            first + 3,
+        ]
         assert batch["step_count"][0].flatten().tolist() == [first, first + 1, first + 2]
         return
     root["action"] = torch.zeros(N, dtype=torch.int64)
-    stepped = env.step(root)["next"] if path == "step" else env.step_and_maybe_reset(root)[0]["next"]
+    stepped = (
+        env.step(root)["next"] if path == "step" else env.step_and_maybe_reset(root)[0]["next"]
+    )
     assert stepped["step_count"].unique().tolist() == [first + 1]
 
 
-# -- sizes and actions -------------------------------------------------------------------------------------------------
+# -- sizes and actions -----------------------------------------------------------------------------
 
 
-def test_a_batch_that_no_memory_holds_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_that_no_memory_holds_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Before: ``make_vec(num_envs=2**21)`` ended in a MemoryError of 96 GiB."""
-    for make in (arcade_torch.make, lambda id, num_envs: gymnasium.make_vec(f"arcade_torch/{id}", num_envs=num_envs)):
-        with pytest.raises(ValueError, match="num_envs is above 1048576, the most that a batch may hold"):
+    for make in (
+        arcade_torch.make,
+        lambda id, num_envs: gymnasium.make_vec(f"arcade_torch/{id}", num_envs=num_envs),
+    ):
+        with pytest.raises(
+            ValueError, match="num_envs is above 1048576, the most that a batch may hold"
+        ):
             make("CartPoleEasy-v0", num_envs=2**21)
-    with pytest.raises(ValueError, match=r"num_envs is 1048576: the frames of one step take 206 GB, this machine has"):
+    with pytest.raises(
+        ValueError,
+        match=r"num_envs is 1048576: the frames of one step take 206 GB, this machine has",
+    ):
         check_fits(2**20, 256)
     check_fits(64, 128)
 
 
-@pytest.mark.parametrize("wrong", [[0, 0, 0, 0, 0], [1, 1, 0, 0, 0], [0, 2, 0, 0, 0], [0, 1, 0, -1, 1]])
+@pytest.mark.parametrize(
+    "wrong", [[0, 0, 0, 0, 0], [1, 1, 0, 0, 0], [0, 2, 0, 0, 0], [0, 1, 0, -1, 1]]
+)
 def test_what_is_not_one_hot_is_refused(wrong: list[int]) -> None:
     """Before: zeros were action 0, and of two ones the first counted."""
     env = ArcadeEnv(GAME, 2, categorical_actions=False)
@@ -221,5 +250,7 @@ def test_what_is_not_one_hot_is_refused(wrong: list[int]) -> None:
     assert env.step(root.clone().set("action", right))["next", "last_action"].tolist() == [3, 4]
     right[1] = torch.tensor(wrong)
     for step in (env.step, env.step_and_maybe_reset):
-        with pytest.raises(ValueError, match=r"action of env 1 is .*, expected one-hot: a single 1 among zeros"):
+        with pytest.raises(
+            ValueError, match=r"action of env 1 is .*, expected one-hot: a single 1 among zeros"
+        ):
             step(root.clone().set("action", right))

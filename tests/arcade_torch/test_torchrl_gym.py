@@ -1,4 +1,6 @@
-"""The Gymnasium environments inside TorchRL's ``GymEnv`` and ``GymWrapper``: the numbers of ``ArcadeEnv``."""
+"""The Gymnasium environments inside TorchRL's ``GymEnv`` and ``GymWrapper``: the numbers of
+``ArcadeEnv``.
+"""
 
 import gymnasium
 import pytest
@@ -27,7 +29,9 @@ class Scripted:
 
 
 def ours(num_envs: int, seed: int) -> TensorDictBase:
-    env = arcade_torch.make("MineSweeperEasy", num_envs=num_envs, observability="partial", seed=seed)
+    env = arcade_torch.make(
+        "MineSweeperEasy", num_envs=num_envs, observability="partial", seed=seed
+    )
     env.reset()  # as TorchRL's wrapper does when it is given a seed
     return env.rollout(STEPS, Scripted(), break_when_any_done=False)
 
@@ -38,7 +42,9 @@ def assert_same_numbers(theirs: TensorDictBase, expected: TensorDictBase) -> Non
     assert torch.equal(theirs[frames], expected["pixels"])
     assert torch.equal(theirs["next", frames], expected["next", "pixels"])
     for key in ENDS:
-        assert torch.equal(theirs["next", key].to(expected["next", key].dtype), expected["next", key]), key
+        assert torch.equal(
+            theirs["next", key].to(expected["next", key].dtype), expected["next", key]
+        ), key
 
 
 def test_torchrls_gymenv_makes_a_game_by_its_id() -> None:
@@ -50,7 +56,9 @@ def test_torchrls_gymenv_makes_a_game_by_its_id() -> None:
 
 
 def test_torchrls_gymenv_still_refuses_options_the_game_does_not_have() -> None:
-    with pytest.raises(TypeError, match=r"^MineSweeperEasy-v0 has no option 'wind': its options are [^\n]*$"):
+    with pytest.raises(
+        TypeError, match=r"^MineSweeperEasy-v0 has no option 'wind': its options are [^\n]*$"
+    ):
         GymEnv(GAME, wind=1)
 
 
@@ -76,10 +84,14 @@ def test_torchrls_wrapper_refuses_the_mode_that_loses_steps() -> None:
 
 
 def test_torchrl_reads_the_infos() -> None:
-    env = GymWrapper(gymnasium.make(GAME, observability="partial"), categorical_action_encoding=True)
+    env = GymWrapper(
+        gymnasium.make(GAME, observability="partial"), categorical_action_encoding=True
+    )
     env = env.auto_register_info_dict()
     env.set_seed(5)
     data = env.rollout(STEPS, Scripted(), break_when_any_done=False)
     expected = ours(1, seed=5)[0]
     for key in ("step_count", "episode_reward"):
-        assert torch.equal(data["next", key].reshape(-1, 1), expected["next", key].to(data["next", key].dtype))
+        assert torch.equal(
+            data["next", key].reshape(-1, 1), expected["next", key].to(data["next", key].dtype)
+        )

@@ -11,7 +11,13 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, ReplayBuffer
 from torchrl.envs import StepCounter, ToTensorImage, TransformedEnv
-from torchrl.modules import GRUModule, ProbabilisticActor, QValueModule, ValueOperator, set_recurrent_mode
+from torchrl.modules import (
+    GRUModule,
+    ProbabilisticActor,
+    QValueModule,
+    ValueOperator,
+    set_recurrent_mode,
+)
 from torchrl.modules.utils import get_primers_from_module
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -36,7 +42,10 @@ def encoder() -> TensorDictModule:
 
 def recurrent_policy() -> TensorDictSequential:
     torch.manual_seed(1)
-    keys = {"in_keys": ["features", "recurrent_state", "is_init"], "out_keys": ["hidden", ("next", "recurrent_state")]}
+    keys = {
+        "in_keys": ["features", "recurrent_state", "is_init"],
+        "out_keys": ["hidden", ("next", "recurrent_state")],
+    }
     memory = GRUModule(input_size=8, hidden_size=8, **keys)
     head = TensorDictModule(nn.Linear(8, 5), ["hidden"], ["action_value"])
     greedy = QValueModule(spec=stub_env().action_spec_unbatched, action_space="categorical")
@@ -54,7 +63,11 @@ def test_a_recurrent_policy_gives_the_data_of_torchrls_collector_with_a_primer()
     policy = recurrent_policy()
     primed = TransformedEnv(stub_env(seed=2), get_primers_from_module(policy))
     stock = Collector(
-        primed, policy, frames_per_batch=N * T, total_frames=4 * N * T, auto_register_policy_transforms=False
+        primed,
+        policy,
+        frames_per_batch=N * T,
+        total_frames=4 * N * T,
+        auto_register_policy_transforms=False,
     )
     ours = ArcadeCollector(stub_env(seed=2), policy, N * T, 4 * N * T)
     one, two = torch.cat(list(stock), 1), torch.cat(list(ours), 1)
@@ -83,7 +96,9 @@ def test_large_states_can_be_left_out_of_the_storage() -> None:
 
 def test_a_module_without_its_primer_is_explained() -> None:
     module = TensorDictModule(lambda memory: memory, ["memory"], [("next", "memory")])
-    with pytest.raises(KeyError, match=r"the policy reads 'memory' and writes it .* make_tensordict_primer"):
+    with pytest.raises(
+        KeyError, match=r"the policy reads 'memory' and writes it .* make_tensordict_primer"
+    ):
         ArcadeCollector(stub_env(), module, N * T).collect()
 
 
@@ -134,7 +149,10 @@ def test_batches_go_into_a_memory_mapped_replay_buffer(tmp_path: Any) -> None:
 def make_ppo(policy_net: nn.Module) -> tuple[ProbabilisticActor, ValueOperator, ClipPPOLoss]:
     body = TensorDictSequential(encoder(), TensorDictModule(policy_net, ["features"], ["logits"]))
     actor = ProbabilisticActor(
-        body, in_keys=["logits"], distribution_class=torch.distributions.Categorical, return_log_prob=True
+        body,
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
     )
     critic_net = nn.Sequential(nn.Flatten(-3), nn.Linear(192, 1))
     critic = ValueOperator(nn.Sequential(_Float(), critic_net), in_keys=["pixels"])

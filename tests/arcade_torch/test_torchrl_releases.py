@@ -1,4 +1,6 @@
-"""What TorchRL changes from release to release, and works alike under 0.14, 0.15 and the nightly build."""
+"""What TorchRL changes from release to release, and works alike under 0.14, 0.15 and the nightly
+build.
+"""
 
 import importlib
 import warnings
@@ -68,13 +70,19 @@ def test_a_given_state_counts_with_set_state_alone() -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         anew = env.reset(given.clone())
-    honoured = any(issubclass(warning.category, FutureWarning) for warning in said)  # by 0.14, which says so
-    assert torch.equal(anew["step_count"], root["step_count"] if honoured else torch.zeros_like(root["step_count"]))
+    honoured = any(
+        issubclass(warning.category, FutureWarning) for warning in said
+    )  # by 0.14, which says so
+    assert torch.equal(
+        anew["step_count"], root["step_count"] if honoured else torch.zeros_like(root["step_count"])
+    )
 
 
 @pytest.mark.parametrize("form", ["dense", "cat"])
 def test_our_batches_are_dense_whatever_form_trajectories_have(form: str) -> None:
-    """From 0.16 trajectory batches of TorchRL's collectors are "cat"; ours are [envs, time], always."""
+    """From 0.16 trajectory batches of TorchRL's collectors are "cat"; ours are [envs, time],
+    always.
+    """
     batch = next(ArcadeCollector(ArcadeEnv(GAME, N, seed=3), None, N * 8).iterator())
     assert batch.shape == (N, 8)
     if form == "cat":
@@ -95,7 +103,12 @@ def container() -> Iterator[type]:
 def test_make_is_a_target_of_hydra(container: type) -> None:
     """Hydra hands over lists of its own (``ListConfig``), which are sequences and no lists."""
     config = container.create(  # type: ignore[attr-defined]
-        {"id": ["CartPoleEasy", "MineSweeperEasy"], "num_envs": 4, "observability": "partial", "seed": 1}
+        {
+            "id": ["CartPoleEasy", "MineSweeperEasy"],
+            "num_envs": 4,
+            "observability": "partial",
+            "seed": 1,
+        }
     )
     env = arcade_torch.make(**config)
     assert env.num_envs == 4 and len(env.games) == 2 and env.observability.all()

@@ -1,4 +1,6 @@
-"""A small POMDP with both kinds of end, and recurrent networks for it: what the tests of TorchRL's losses share."""
+"""A small POMDP with both kinds of end, and recurrent networks for it: what the tests of TorchRL's
+losses share.
+"""
 
 import torch
 from tensordict import TensorDictBase
@@ -30,8 +32,12 @@ class Eye(Encoder):
         return torch.tanh(self.linear(frames.flatten(1).to(self.like.dtype) / 255))
 
 
-def network(memory: str, out_key: str = "action_value", tower: str = "value", store: str = "step") -> nn.Module:
-    """Encoder, memory ("block" in the names of its parameters) and head; with TorchRL's GRU if asked for."""
+def network(
+    memory: str, out_key: str = "action_value", tower: str = "value", store: str = "step"
+) -> nn.Module:
+    """Encoder, memory ("block" in the names of its parameters) and head; with TorchRL's GRU if
+    asked for.
+    """
     outputs = 1 if out_key == "state_value" else ACTIONS
     if memory == CONTROL:
         keys = {
@@ -59,7 +65,9 @@ def network(memory: str, out_key: str = "action_value", tower: str = "value", st
 
 
 def q_actor(memory: str, store: str = "step") -> TensorDictSequential:
-    return TensorDictSequential(network(memory, store=store), QValueModule(action_space="categorical"))
+    return TensorDictSequential(
+        network(memory, store=store), QValueModule(action_space="categorical")
+    )
 
 
 def make_env(seed: int = 2) -> ArcadeEnv:
@@ -67,7 +75,9 @@ def make_env(seed: int = 2) -> ArcadeEnv:
 
 
 def collected(policy: nn.Module, seed: int = 2, windows: int = 2) -> TensorDictBase:
-    """The last of some windows [ENVS, STEPS] in TorchRL's layout: next frames, and the state of every step."""
+    """The last of some windows [ENVS, STEPS] in TorchRL's layout: next frames, and the state of
+    every step.
+    """
     collector = ArcadeCollector(make_env(seed), policy, ENVS * STEPS, windows * ENVS * STEPS)
     batch = list(collector)[-1]
     inside = batch["next"][:, 1:-1]
@@ -79,10 +89,15 @@ def collected(policy: nn.Module, seed: int = 2, windows: int = 2) -> TensorDictB
 def explorer(memory: str) -> tuple[TensorDictSequential, TensorDictSequential]:
     """A network of Q-values with a greedy head, and the same with random actions in between."""
     greedy = q_actor(memory)
-    return greedy, TensorDictSequential(*greedy, EGreedyModule(spec=make_env().action_spec_unbatched, eps_init=0.5))
+    return greedy, TensorDictSequential(
+        *greedy, EGreedyModule(spec=make_env().action_spec_unbatched, eps_init=0.5)
+    )
 
 
 def actor_critic(memory: str) -> tuple[nn.Module, nn.Module, TensorDictSequential]:
     """A stochastic actor, a critic, and both in a row for the collector."""
-    actor, critic = make_actor(network(memory, "logits", "actor")), network(memory, "state_value", "critic")
+    actor, critic = (
+        make_actor(network(memory, "logits", "actor")),
+        network(memory, "state_value", "critic"),
+    )
     return actor, critic, TensorDictSequential(critic, actor)

@@ -1,4 +1,6 @@
-"""Gymnasium's own checker: a cover of all games, difficulties, sizes and twins by default, all 120 when asked."""
+"""Gymnasium's own checker: a cover of all games, difficulties, sizes and twins by default, all 120
+when asked.
+"""
 
 import importlib.util
 import re
@@ -20,7 +22,12 @@ COVER = [(f"{game}{DIFFICULTIES[i % 3]}-v0", SIZES[i % 2]) for i, game in enumer
 def check(id: str, obs_size: int, observability: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The checker without a warning; without pygame it cannot try the window."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = gymnasium.make(f"arcade_torch/{id}", obs_size=obs_size, observability=observability, render_mode="rgb_array")
+    env = gymnasium.make(
+        f"arcade_torch/{id}",
+        obs_size=obs_size,
+        observability=observability,
+        render_mode="rgb_array",
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=not HAS_PYGAME)
@@ -54,6 +61,8 @@ def test_gymnasium_s_checker_passes_on_all_configurations(
 def test_the_checker_would_notice_a_broken_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     env = gymnasium.make("arcade_torch/CartPoleEasy-v0").unwrapped
     original = type(env)._look
-    monkeypatch.setattr(type(env), "_look", lambda self, frames: original(self, frames).astype("float32"))
+    monkeypatch.setattr(
+        type(env), "_look", lambda self, frames: original(self, frames).astype("float32")
+    )
     with pytest.raises(AssertionError):
         check_env(env, skip_render_check=True)

@@ -8,7 +8,9 @@ import pytest
 from arcade_torch import registered_ids
 from tests.contracts.test_gymnasium import COVER, SIZES, TWINS
 
-pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'")
+pytest.importorskip(
+    "stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'"
+)
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
@@ -31,7 +33,9 @@ def test_stable_baselines3_s_checker_passes(id: str, obs_size: int, observabilit
 @pytest.mark.parametrize("observability", TWINS)
 @pytest.mark.parametrize("obs_size", SIZES)
 @pytest.mark.parametrize("id", registered_ids())
-def test_stable_baselines3_s_checker_passes_on_all_configurations(id: str, obs_size: int, observability: str) -> None:
+def test_stable_baselines3_s_checker_passes_on_all_configurations(
+    id: str, obs_size: int, observability: str
+) -> None:
     check(id, obs_size, observability)
 
 

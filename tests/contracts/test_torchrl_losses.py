@@ -1,7 +1,7 @@
 """Every memory model inside every loss of TorchRL that takes discrete actions, and inside ours.
 
-A cell passes if the loss is finite, every network's memory receives a gradient, and the targets (where there are any)
-move under ``SoftUpdate``. The table of docs/losses.md is made by
+A cell passes if the loss is finite, every network's memory receives a gradient, and the targets
+(where there are any) move under ``SoftUpdate``. The table of docs/losses.md is made by
 
     python -m tests.contracts.test_torchrl_losses
 """
@@ -60,7 +60,9 @@ def collect_once(kind: str, memory: str) -> tuple[nn.ModuleList, TensorDictBase]
         return nn.ModuleList([value]), collected(policy)
     actor = make_actor(network(memory, "logits", "actor"))
     other = network(memory, "state_value", "critic") if kind == "actor-critic" else network(memory)
-    return nn.ModuleList([actor, other]), collected(TensorDictSequential(other, actor)).exclude("state_value")
+    return nn.ModuleList([actor, other]), collected(TensorDictSequential(other, actor)).exclude(
+        "state_value"
+    )
 
 
 def experience(kind: str, memory: str) -> Any:
@@ -80,7 +82,9 @@ def of_values(make: Callable[..., LossModule], has_targets: bool = True, **optio
 
 
 def of_policies(make: Callable[..., LossModule], advantages: str, **options: object) -> Row:
-    """A loss of actor and critic; advantages by ``GAE`` in one of its forms, or by the loss itself."""
+    """A loss of actor and critic; advantages by ``GAE`` in one of its forms, or by the loss
+    itself.
+    """
 
     def cell(memory: str) -> tuple[LossModule, TensorDictBase]:
         actor, critic, batch = experience("actor-critic", memory)
@@ -101,13 +105,17 @@ def of_policies(make: Callable[..., LossModule], advantages: str, **options: obj
 def discrete_sac(memory: str) -> tuple[LossModule, TensorDictBase]:
     """Two critics under ``vmap``."""
     actor, value, batch = experience("actor-value", memory)
-    return DiscreteSACLoss(actor, value, action_space="categorical", num_actions=ACTIONS, num_qvalue_nets=2), batch
+    return DiscreteSACLoss(
+        actor, value, action_space="categorical", num_actions=ACTIONS, num_qvalue_nets=2
+    ), batch
 
 
 CATEGORICAL = {"action_space": "categorical"}
 LOSSES: dict[str, Row] = {
     "DQNLoss(delay_value=True)": of_values(TorchRLDQNLoss, delay_value=True, **CATEGORICAL),
-    "DQNLoss(double_dqn=True)": of_values(TorchRLDQNLoss, delay_value=True, double_dqn=True, **CATEGORICAL),
+    "DQNLoss(double_dqn=True)": of_values(
+        TorchRLDQNLoss, delay_value=True, double_dqn=True, **CATEGORICAL
+    ),
     **{
         f"{loss.__name__}, {text}": of_policies(loss, form)
         for loss in (ClipPPOLoss, A2CLoss, ReinforceLoss)
@@ -131,7 +139,11 @@ def memory_gradients(loss: LossModule) -> dict[str, float]:
     found: dict[str, float] = {}
     for name, parameter in loss.named_parameters():
         owner, _, rest = name.partition(".")
-        if owner.endswith("_params") and not owner.startswith("target_") and is_memory(rest.replace("___", ".")):
+        if (
+            owner.endswith("_params")
+            and not owner.startswith("target_")
+            and is_memory(rest.replace("___", "."))
+        ):
             grad = 0.0 if parameter.grad is None else float(parameter.grad.abs().max())
             found[owner] = max(grad, found.get(owner, 0.0))
     return found
@@ -151,7 +163,11 @@ def check(loss: LossModule, batch: TensorDictBase, has_targets: bool) -> None:
     assert losses and all(bool(value.isfinite().all()) for value in losses), "a loss is not finite"
     sum(losses).backward()  # type: ignore[union-attr]
     gradients = memory_gradients(loss)
-    networks = {name for name, _ in loss.named_children() if name.endswith("_params") and name not in targets}
+    networks = {
+        name
+        for name, _ in loss.named_children()
+        if name.endswith("_params") and name not in targets
+    }
     assert set(gradients) == networks
     assert all(0 < value < float("inf") for value in gradients.values()), f"gradients {gradients}"
     if updater is not None:
@@ -163,7 +179,9 @@ def check(loss: LossModule, batch: TensorDictBase, has_targets: bool) -> None:
         for name, params in targets.items():
             moved = (params.data - before[name].data).flatten_keys(".")
             memory = [value for key, value in moved.items() if is_memory(key) and value.numel()]
-            assert memory and all(bool(((value - 0.5).abs() < 1e-4).all()) for value in memory), "targets did not move"
+            assert memory and all(bool(((value - 0.5).abs() < 1e-4).all()) for value in memory), (
+                "targets did not move"
+            )
 
 
 def is_memory(name: str) -> bool:
@@ -181,14 +199,20 @@ def outcome(loss: str, memory: str) -> str:
             warnings.simplefilter("ignore")
             check(*cell.make(memory), has_targets=cell.has_targets)
     except Exception as error:  # the control is expected to fail, in whatever way
-        return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"
+        return (
+            f"{type(error).__name__}: "
+            f"{str(error).strip().splitlines()[0] if str(error).strip() else ''}"
+        )
     return "yes"
 
 
 def table() -> str:
     """The table of docs/losses.md."""
     columns = (*MEMORIES, CONTROL)
-    lines = [f"| loss | {' | '.join(f'`{name}`' for name in columns)} |", f"|---|{'---|' * len(columns)}"]
+    lines = [
+        f"| loss | {' | '.join(f'`{name}`' for name in columns)} |",
+        f"|---|{'---|' * len(columns)}",
+    ]
     for loss in LOSSES:
         cells = ["yes" if outcome(loss, memory) == "yes" else "no" for memory in columns]
         lines.append(f"| {loss} | {' | '.join(cells)} |")
@@ -206,7 +230,9 @@ def test_the_memory_learns_in_the_loss(loss: str, memory: str) -> None:
 
 
 def test_the_table_in_the_documentation_is_that_of_the_matrix() -> None:
-    assert table() in PAGE.read_text(encoding="utf-8"), "run: python -m tests.contracts.test_torchrl_losses"
+    assert table() in PAGE.read_text(encoding="utf-8"), (
+        "run: python -m tests.contracts.test_torchrl_losses"
+    )
 
 
 def write_page() -> None:

@@ -24,7 +24,9 @@ def going_on(batch):
 
 
 class Walk:
-    """A rollout without resets, and beyond ends: states and outcomes of N envs over T steps, numpy [T, N, ...]."""
+    """A rollout without resets, and beyond ends: states and outcomes of N envs over T steps, numpy
+    [T, N, ...].
+    """
 
     def __init__(self, game, actions, seed=0):
         envs = actions.shape[1]
@@ -35,8 +37,12 @@ class Walk:
             batch, outcome = compiled.step(going_on(batch), action.astype(np.int32))
             states.append(batch.state)
             outcomes.append(outcome)
-        self.states = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *states)
-        self.outcomes = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *outcomes)
+        self.states = jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *states
+        )
+        self.outcomes = jax.tree.map(
+            lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *outcomes
+        )
         self.last = batch
 
 
@@ -48,7 +54,9 @@ def random_actions(steps, envs, seed=0):
 def one(game, **changes):
     """A state of the game (from key 0) with some of its variables replaced."""
     state = game.reset(jax.random.PRNGKey(0))
-    return state._replace(**{name: jnp.asarray(value, getattr(state, name).dtype) for name, value in changes.items()})
+    return state._replace(
+        **{name: jnp.asarray(value, getattr(state, name).dtype) for name, value in changes.items()}
+    )
 
 
 _compiled = {}

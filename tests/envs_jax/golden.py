@@ -3,9 +3,10 @@
     python -m tests.envs_jax.golden            compares
     python -m tests.envs_jax.golden --write    writes the file anew, after a change that was meant
 
-A walk is 32 steps in 4 envs, two of each twin, with ends and resets as they come. Integers, and frames of games whose
-state has no floats, are hashed: they are equal on every machine. Floats, and the frames that depend on them, differ in
-the last bits between processors: their means are kept instead. The flags of an end count once, as outcomes.
+A walk is 32 steps in 4 envs, two of each twin, with ends and resets as they come. Integers, and
+frames of games whose state has no floats, are hashed: they are equal on every machine. Floats, and
+the frames that depend on them, differ in the last bits between processors: their means are kept
+instead. The flags of an end count once, as outcomes.
 """
 
 import argparse
@@ -34,7 +35,9 @@ def actions() -> np.ndarray:
 
 
 def walk(id: str, rules: str) -> tuple[Any, dict[int, jax.Array]]:
-    """States, outcomes and counts of all steps (leaves [STEPS, ENVS, ...]), and the frames by size."""
+    """States, outcomes and counts of all steps (leaves [STEPS, ENVS, ...]), and the frames by
+    size.
+    """
     games = {size: BatchedGame(make(id, obs_size=size, rules=rules)) for size in SIZES}
     batched = games[SIZES[0]]
 
@@ -51,7 +54,9 @@ def walk(id: str, rules: str) -> tuple[Any, dict[int, jax.Array]]:
         return (seen, outcome), frames
 
     partial = jnp.arange(ENVS) % 2 == 1
-    result: tuple[Any, dict[int, jax.Array]] = jax.jit(run)(env_keys(SEED, ENVS), partial, actions())
+    result: tuple[Any, dict[int, jax.Array]] = jax.jit(run)(
+        env_keys(SEED, ENVS), partial, actions()
+    )
     return result
 
 
@@ -66,23 +71,44 @@ def digest(arrays: list[Any]) -> str:
 def record(id: str, rules: str) -> dict[str, Any]:
     """What is kept of a walk."""
     tree, frames = walk(id, rules)
-    leaves = {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]}
-    for name in [name for name in leaves if name.startswith("[0]") and name.endswith((".terminated", ".truncated"))]:
+    leaves = {
+        jax.tree_util.keystr(path): np.asarray(x)
+        for path, x in jax.tree_util.tree_flatten_with_path(tree)[0]
+    }
+    for name in [
+        name
+        for name in leaves
+        if name.startswith("[0]") and name.endswith((".terminated", ".truncated"))
+    ]:
         del leaves[name]  # states and batches keep the outcomes of their last step
     floats = {name: leaf for name, leaf in leaves.items() if leaf.dtype == np.float32}
-    out: dict[str, Any] = {"integers": digest([leaf for name, leaf in leaves.items() if name not in floats])}
-    out["floats"] = {name: round(float(leaf.astype(np.float64).mean()), 5) for name, leaf in floats.items()}
+    out: dict[str, Any] = {
+        "integers": digest([leaf for name, leaf in leaves.items() if name not in floats])
+    }
+    out["floats"] = {
+        name: round(float(leaf.astype(np.float64).mean()), 5) for name, leaf in floats.items()
+    }
     inexact = any(".state" in name for name in floats)
     for size, drawn in frames.items():
-        out[f"frames {size}"] = round(float(np.asarray(drawn).mean()), 2) if inexact else digest([drawn])
+        out[f"frames {size}"] = (
+            round(float(np.asarray(drawn).mean()), 2) if inexact else digest([drawn])
+        )
     return out
 
 
 def random_numbers() -> str:
     """Hash of numbers from ``jax.random``, which a version of JAX may change."""
     key = jax.random.PRNGKey(5)
-    draws = [jax.random.bits(key, (9,)), jax.random.permutation(key, 9), jax.random.randint(key, (9,), 0, 1000)]
-    draws += [jax.random.uniform(key, (9,)) < 0.5, jax.random.split(key, 3), jax.random.fold_in(key, 7)]
+    draws = [
+        jax.random.bits(key, (9,)),
+        jax.random.permutation(key, 9),
+        jax.random.randint(key, (9,), 0, 1000),
+    ]
+    draws += [
+        jax.random.uniform(key, (9,)) < 0.5,
+        jax.random.split(key, 3),
+        jax.random.fold_in(key, 7),
+    ]
     return digest(draws)
 
 
@@ -109,7 +135,12 @@ def load() -> dict[str, Any]:
 def write() -> None:
     """Write the file anew."""
     walks = {f"{id} {rules}": record(id, rules) for id in registered_ids() for rules in RULES}
-    stored = {"written by": COMMAND, "jax": jax.__version__, "jax.random": random_numbers(), "walks": walks}
+    stored = {
+        "written by": COMMAND,
+        "jax": jax.__version__,
+        "jax.random": random_numbers(),
+        "walks": walks,
+    }
     FILE.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
 
 
@@ -120,7 +151,9 @@ def main() -> int:
     if parser.parse_args().write:
         write()
         return 0
-    wrong = {name: differences(kept, record(*name.split())) for name, kept in load()["walks"].items()}
+    wrong = {
+        name: differences(kept, record(*name.split())) for name, kept in load()["walks"].items()
+    }
     for name, what in wrong.items():
         print(f"{name}: {', '.join(what) or 'equal'}")
     return int(any(wrong.values()))

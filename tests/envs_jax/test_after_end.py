@@ -1,4 +1,6 @@
-"""After an end nothing changes: state, frame and flags stay, the reward is 0, in every game and on every way."""
+"""After an end nothing changes: state, frame and flags stay, the reward is 0, in every game and on
+every way.
+"""
 
 import functools
 from typing import NamedTuple
@@ -39,7 +41,9 @@ def play(begin, advance):
 
 
 def assert_stays(states, reward, terminated, truncated):
-    """Leaves [STEPS, ENVS, ...]: from the first end of each env on, all is as at that end, and nothing is paid."""
+    """Leaves [STEPS, ENVS, ...]: from the first end of each env on, all is as at that end, and
+    nothing is paid.
+    """
     done = terminated | truncated
     assert done.any()
     late = 0
@@ -63,7 +67,9 @@ def test_a_state_stays_in_pure_jax(id, rules):
 
     states, (reward, terminated, truncated) = play(jax.vmap(game.reset), advance)
     assert_stays(states, reward, terminated, truncated)
-    assert np.array_equal(states.terminated, terminated) and np.array_equal(states.truncated, truncated)
+    assert np.array_equal(states.terminated, terminated) and np.array_equal(
+        states.truncated, truncated
+    )
 
 
 class SmallState(NamedTuple):
@@ -116,7 +122,12 @@ def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     rows = batched.rows(ENVS)[0]
     part = lambda leaf: leaf[:, rows]  # noqa: E731
     counts = (batches.step_count, batches.episode_reward, batches.key, frames)
-    assert_stays((state, *map(part, counts)), part(outcome.reward), part(outcome.terminated), part(outcome.truncated))
+    assert_stays(
+        (state, *map(part, counts)),
+        part(outcome.reward),
+        part(outcome.terminated),
+        part(outcome.truncated),
+    )
 
     last = jax.tree.map(lambda leaf: jnp.asarray(leaf[-1]), batches)
     mask = np.arange(ENVS) % 2 == 0
@@ -132,11 +143,16 @@ def test_step_env_of_the_adapter_stays_and_step_begins_anew():
     obs, state = env.reset(jax.random.PRNGKey(0), params)
     step_env, step = jax.jit(env.step_env), jax.jit(env.step)
     for number in range(40):
-        obs, state, reward, done, info = step_env(jax.random.PRNGKey(number), state, jnp.int32(number % 4), params)
+        obs, state, reward, done, info = step_env(
+            jax.random.PRNGKey(number), state, jnp.int32(number % 4), params
+        )
     assert bool(done) and bool(info["truncated"])
     again, same, reward, done, _ = step_env(jax.random.PRNGKey(99), state, jnp.int32(4), params)
     assert np.array_equal(again, obs) and reward == 0 and bool(done)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(state), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(state), strict=True)
+    )
     _, fresh, _, done, _ = step(jax.random.PRNGKey(99), state, jnp.int32(4), params)
     assert bool(done) and not bool(fresh.truncated) and fresh.timestep == 0
 
@@ -148,7 +164,10 @@ def test_a_batch_without_flags_has_not_ended():
     state = whole.state._replace(terminated=None, truncated=None)
     bare = whole._replace(terminated=None, truncated=None, state=state)
     one, two = (batched.step(batch, jnp.zeros(2, jnp.int32))[0] for batch in (whole, bare))
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
+    )
 
 
 @pytest.mark.parametrize("id", EASY)

@@ -28,7 +28,9 @@ def compiled_step(id, rules):
 
 
 def step(game, state, action):
-    new, reward, terminated, truncated = compiled_step(game.id, game.rules)(KEY, state, jnp.int32(action))
+    new, reward, terminated, truncated = compiled_step(game.id, game.rules)(
+        KEY, state, jnp.int32(action)
+    )
     return new, float(reward), bool(terminated), bool(truncated)
 
 
@@ -44,9 +46,9 @@ def run(game, state, actions):
 
 def read_history(frames, screen, rows=9):
     """Codes of the history, int [N, rows * 9]."""
-    return screen.history.read(frames[:, :, : screen.history.x + 9 * screen.history.atlas.shape[1]], 9, 9)[
-        :, :rows
-    ].reshape(len(frames), -1)
+    return screen.history.read(
+        frames[:, :, : screen.history.x + 9 * screen.history.atlas.shape[1]], 9, 9
+    )[:, :rows].reshape(len(frames), -1)
 
 
 # The deal and the suits, shared with CountRecall
@@ -198,7 +200,13 @@ def test_card_selector_and_stack_can_be_read_back(id, size):
     """A6 and A7: the stack is legible at every size, and an answered card is gone from it."""
     game = make(id, obs_size=size)
     cards = CARDS[id]
-    for timestep, count, selected in ((0, 0, 0), (5, 0, 1), (cards - 1, 0, 2), (cards, 0, 3), (cards + 20, 7, 0)):
+    for timestep, count, selected in (
+        (0, 0, 0),
+        (5, 0, 1),
+        (cards - 1, 0, 2),
+        (cards, 0, 3),
+        (cards + 20, 7, 0),
+    ):
         state = one(game, timestep=timestep, given=count, selected=selected, score=count)
         full, partial = (draw(game, state, flag)[None] for flag in (False, True))
         suits = np.asarray(state.cards)
@@ -208,12 +216,17 @@ def test_card_selector_and_stack_can_be_read_back(id, size):
         assert np.array_equal(read_history(full, game.screen, len(expected) // 9)[0], expected)
         assert not read_history(partial, game.screen, len(expected) // 9).any()
         for frame in (full, partial):
-            assert game.screen.card.read(frame)[0] == (1 + suits[timestep] if timestep < cards else 0)
+            assert game.screen.card.read(frame)[0] == (
+                1 + suits[timestep] if timestep < cards else 0
+            )
             assert game.screen.selector.read(frame)[0] == 1 + selected
             assert game.screen.score.read(frame)[0] == count
         low = game.screen.history.y
         differs = (full != partial).any((0, 2, 3))
-        assert not differs[:low].any() and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()
+        assert (
+            not differs[:low].any()
+            and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()
+        )
 
 
 @pytest.mark.parametrize(
@@ -234,7 +247,9 @@ def test_the_marker_option_decides_whether_answers_show_in_the_mdp(rules, marker
     assert (codes > 0).sum() == (16 if removed else 26)
     more = state._replace(given=jnp.int32(11))
     assert np.array_equal(render(more, False), render(state, False)) is not removed
-    assert np.array_equal(render(more, True), render(state, True)), "the POMDP never shows the count"
+    assert np.array_equal(render(more, True), render(state, True)), (
+        "the POMDP never shows the count"
+    )
 
 
 def test_every_visible_variable_changes_the_mdp_picture():
@@ -251,7 +266,9 @@ def test_every_visible_variable_changes_the_mdp_picture():
         {"score": 1},
         {"given": 1},
     ):
-        changed = base._replace(**{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()})
+        changed = base._replace(
+            **{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
     to_come = base._replace(cards=base.cards.at[15].set((base.cards[15] + 1) % 4))
     assert np.array_equal(frame, draw(game, to_come, False)), "cards to come are hidden"
@@ -284,7 +301,9 @@ def test_the_oracles_reach_the_highest_return_of_the_reference():
 @pytest.mark.parametrize("id", ["AutoEncodeEasy", "AutoEncodeHard"])
 def test_memory_of_the_frames_recovers_everything(id):
     game = make(id)
-    np.testing.assert_allclose(play(game, make_oracle(game, "frames"), 32, frames=True).returns, 1, atol=1e-5)
+    np.testing.assert_allclose(
+        play(game, make_oracle(game, "frames"), 32, frames=True).returns, 1, atol=1e-5
+    )
 
 
 def test_a_blind_player_is_right_in_one_of_four_answers():

@@ -15,13 +15,24 @@ from .conftest import ALL_IDS, batched, random_actions
 
 FAMILIES = ["CartPoleEasy", "NoisyCartPoleHard", "MineSweeperEasy"]
 EVERY_GAME = FAMILIES + [
-    f"{game}Easy" for game in ("AutoEncode", "BattleShip", "Breakout", "CountRecall", "Navigator", "Skittles", "Tetris")
+    f"{game}Easy"
+    for game in (
+        "AutoEncode",
+        "BattleShip",
+        "Breakout",
+        "CountRecall",
+        "Navigator",
+        "Skittles",
+        "Tetris",
+    )
 ]
 
 
 def same(a, b):
     """Whether two pytrees agree bit for bit."""
-    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return all(
+        np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
 
 
 def rows(tree, index):
@@ -68,7 +79,9 @@ def test_a_masked_reset_leaves_the_others_untouched(id, mask, steps, seed):
         batch, _ = game.step(batch, action)
     after = game.reset_where(batch, mask)
     assert same(rows(after, ~mask), rows(batch, ~mask))
-    assert (np.asarray(after.step_count)[mask] == 0).all() and (np.asarray(after.episode_reward)[mask] == 0).all()
+    assert (np.asarray(after.step_count)[mask] == 0).all() and (
+        np.asarray(after.episode_reward)[mask] == 0
+    ).all()
     assert np.array_equal(after.last_action, batch.last_action)
     assert (np.asarray(after.key)[mask] != np.asarray(batch.key)[mask]).any(axis=-1).all()
 
@@ -82,10 +95,14 @@ def test_twins_step_in_lockstep(id, rules):
     for action in random_actions(50, 16):
         full, _, outcome, frames = game.step_auto(full, action)
         partial, _, outcome_partial, frames_partial = game.step_auto(partial, action)
-        assert same(full._replace(partial=partial.partial), partial) and same(outcome, outcome_partial)
+        assert same(full._replace(partial=partial.partial), partial) and same(
+            outcome, outcome_partial
+        )
         hidden += not np.array_equal(frames, frames_partial)
         differ = (np.asarray(frames) != np.asarray(frames_partial)).any((0, 2, 3))
-        assert not differ[:14].any() and not differ[115:].any(), "number and name are the same in both"
+        assert not differ[:14].any() and not differ[115:].any(), (
+            "number and name are the same in both"
+        )
     assert hidden > 25, "the twins ought to look different"
 
 
@@ -98,7 +115,9 @@ def test_the_frame_is_a_function_of_state_and_twin_alone(id):
         assert np.array_equal(frames, game.render(batch))
         switched = batch._replace(partial=~np.asarray(batch.partial))
         again = switched._replace(
-            partial=~np.asarray(switched.partial), key=batch.key * 0, last_action=batch.last_action * 0
+            partial=~np.asarray(switched.partial),
+            key=batch.key * 0,
+            last_action=batch.last_action * 0,
         )
         assert np.array_equal(game.render(again), frames)
 
@@ -134,8 +153,13 @@ def test_long_random_rollouts_keep_the_contract(id, rules):
     partial=hnp.arrays(bool, 16),
 )
 def test_any_play_from_any_seed_keeps_the_contract(id, seed, small, actions, partial):
-    """Ends are one of two kinds, returns stay in the documented range, no frame is blank, nothing is not a number."""
-    game, size = batched(id), 1 if small and id in FAMILIES else 16  # each size is a compilation more
+    """Ends are one of two kinds, returns stay in the documented range, no frame is blank, nothing
+    is not a number.
+    """
+    game, size = (
+        batched(id),
+        1 if small and id in FAMILIES else 16,
+    )  # each size is a compilation more
     low, high = game.game.return_range
     batch = game.init(env_keys(seed, size), jnp.asarray(partial[:size]))
     for action in actions[:, :size]:
@@ -146,8 +170,12 @@ def test_any_play_from_any_seed_keeps_the_contract(id, seed, small, actions, par
         returns = np.asarray(stepped.episode_reward)[done]
         assert ((returns >= low - 1e-5) & (returns <= high + 1e-5)).all()
         assert frames.dtype == np.uint8 and frames.shape == (size, 128, 128, 3)
-        assert (frames.reshape(size, -1, 3).max(1) > frames.reshape(size, -1, 3).min(1)).any(1).all(), "a blank frame"
-        floats = [leaf for leaf in jax.tree.leaves((stepped, batch, outcome)) if leaf.dtype == np.float32]
+        assert (
+            (frames.reshape(size, -1, 3).max(1) > frames.reshape(size, -1, 3).min(1)).any(1).all()
+        ), "a blank frame"
+        floats = [
+            leaf for leaf in jax.tree.leaves((stepped, batch, outcome)) if leaf.dtype == np.float32
+        ]
         assert all(np.isfinite(leaf).all() for leaf in floats)
 
 
@@ -156,7 +184,9 @@ LIMIT_NAMES = ("time", "timestep", "moves")  # what the games call the steps tak
 
 @pytest.mark.parametrize("id", EVERY_GAME)
 def test_a_new_episode_is_what_reset_gives_for_the_key_of_its_env(id):
-    """After an end the state and the frame are those of `reset` with the derived key; other envs just go on."""
+    """After an end the state and the frame are those of `reset` with the derived key; other envs
+    just go on.
+    """
     game = batched(id)
     batch = game.init(env_keys(4, 16), jnp.arange(16) % 2 == 0)
     for action in random_actions(3, 16, seed=2):
@@ -164,13 +194,17 @@ def test_a_new_episode_is_what_reset_gives_for_the_key_of_its_env(id):
     clock = next(name for name in LIMIT_NAMES if hasattr(batch.state, name))
     at_limit = np.arange(16) % 3 == 0
     time = jnp.where(at_limit, game.game.max_steps - 1, getattr(batch.state, clock))
-    batch = batch._replace(state=batch.state._replace(**{clock: time.astype(getattr(batch.state, clock).dtype)}))
+    batch = batch._replace(
+        state=batch.state._replace(**{clock: time.astype(getattr(batch.state, clock).dtype)})
+    )
     root, stepped, outcome, frames = game.step_auto(batch, np.zeros(16, np.int32))
     done = np.asarray(outcome.done)
     assert (done >= at_limit).all() and not done.all()
     keep, use = jax.vmap(jax.random.split, out_axes=1)(stepped.key)
     fresh = jax.jit(jax.vmap(game.game.reset))(use)
-    assert same(rows(root.state, done), rows(fresh, done)) and same(rows(root.state, ~done), rows(stepped.state, ~done))
+    assert same(rows(root.state, done), rows(fresh, done)) and same(
+        rows(root.state, ~done), rows(stepped.state, ~done)
+    )
     assert np.array_equal(np.asarray(root.key)[done], np.asarray(keep)[done])
     drawn = game.render(batch._replace(state=fresh))
     assert np.array_equal(np.asarray(frames)[done], np.asarray(drawn)[done])
@@ -187,7 +221,10 @@ def test_ten_thousand_random_episodes_return_what_the_table_allows(id):
 
 
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), actions=hnp.arrays(np.int32, (20, 16), elements=st.integers(0, 4)))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    actions=hnp.arrays(np.int32, (20, 16), elements=st.integers(0, 4)),
+)
 def test_equal_seeds_and_actions_give_equal_bits(seed, actions):
     game = batched("MineSweeperEasy")
 

@@ -37,7 +37,9 @@ def step(game, state, action):
 @functools.cache
 def fresh(id, rules="default"):
     """First states of many envs, with numpy leaves."""
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, 4096)))
+    return jax.tree.map(
+        np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, 4096))
+    )
 
 
 def sea(game, ships=(), shots=(), x=0, y=0, **changes):
@@ -89,16 +91,23 @@ def test_every_sea_holds_straight_ships_of_two_three_three_and_four_cells(id):
 
 def test_a_ship_takes_every_free_place_with_equal_chance():
     """Counting through the draws visits each legal place exactly once and then begins again."""
-    put = {n: jax.jit(jax.vmap(place_ship, in_axes=(0, None, None)), static_argnums=2) for n in set(SHIPS)}
+    put = {
+        n: jax.jit(jax.vmap(place_ship, in_axes=(0, None, None)), static_argnums=2)
+        for n in set(SHIPS)
+    }
     generator = np.random.default_rng(0)
     for length in sorted(set(SHIPS)):
         for density in (0.0, 0.1, 0.25):
             occupied = generator.random((8, 8)) < density
             expected = places(occupied, length)
-            ships = np.asarray(put[length](jnp.arange(112, dtype=jnp.uint32), jnp.asarray(occupied), length))
+            ships = np.asarray(
+                put[length](jnp.arange(112, dtype=jnp.uint32), jnp.asarray(occupied), length)
+            )
             found = [frozenset(map(tuple, np.argwhere(ship))) for ship in ships]
             assert sorted(map(sorted, found[: len(expected)])) == sorted(map(sorted, expected))
-            assert found[len(expected) :] == [found[i % len(expected)] for i in range(len(expected), 112)]
+            assert found[len(expected) :] == [
+                found[i % len(expected)] for i in range(len(expected), 112)
+            ]
 
 
 def test_touching_ships_are_allowed():
@@ -116,7 +125,9 @@ def test_the_cursor_starts_on_any_cell_with_equal_chance_whatever_the_sea(id):
     assert count.min() > 0 and abs(chi2 - (cells - 1)) < 4 * np.sqrt(2 * (cells - 1))
     rate = 12 / cells
     on_ship = states.board[np.arange(4096), states.x, states.y].mean()
-    assert abs(on_ship - rate) < 4 * np.sqrt(rate * (1 - rate) / 4096), "cursor and ships ought to be independent"
+    assert abs(on_ship - rate) < 4 * np.sqrt(rate * (1 - rate) / 4096), (
+        "cursor and ships ought to be independent"
+    )
 
 
 def test_the_cursor_of_the_reference_never_starts_in_the_last_column_or_row():
@@ -176,7 +187,9 @@ def test_firing_at_one_water_cell_ends_at_the_lowest_return(id, rules):
     ("reference", 32, FIRE, True),
     ("reference", 32, UP, False),
 ])  # fmt: skip
-def test_the_repeats_are_judged_after_the_shot_or_late_in_the_reference(rules, repeats, action, ends):
+def test_the_repeats_are_judged_after_the_shot_or_late_in_the_reference(
+    rules, repeats, action, ends
+):
     game = make("BattleShipEasy", rules=rules)
     state = sea(game, shots=[(0, 0)], repeats=repeats, timestep=60)
     assert step(game, state, action)[2] is ends
@@ -198,14 +211,18 @@ def test_the_twelfth_hit_wins(rules):
     game = make("BattleShipEasy", rules=rules)
     state = sea(game, ships=[(4, 2)], x=4, y=2, hits=11)
     new, reward, terminated, truncated = step(game, state, FIRE)
-    assert (int(new.hits), terminated, truncated) == (12, True, False) and reward == pytest.approx(1 / 12)
+    assert (int(new.hits), terminated, truncated) == (12, True, False) and reward == pytest.approx(
+        1 / 12
+    )
     assert step(game, state._replace(timestep=jnp.int32(127)), FIRE)[2:] == (True, True)
 
 
 @settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    actions=hnp.arrays(np.int32, (30, 16), elements=st.sampled_from([UP, DOWN, LEFT, RIGHT, FIRE, FIRE, FIRE])),
+    actions=hnp.arrays(
+        np.int32, (30, 16), elements=st.sampled_from([UP, DOWN, LEFT, RIGHT, FIRE, FIRE, FIRE])
+    ),
 )
 def test_any_play_keeps_the_books(seed, actions):
     """Marks, counters and return agree at every moment; nothing but shots changes them."""
@@ -220,10 +237,14 @@ def test_any_play_keeps_the_books(seed, actions):
     assert np.array_equal(state.board, first)
     assert np.array_equal(state.hits, (state.board & state.guesses).sum((1, 2)))
     assert np.array_equal(state.guesses.sum((1, 2)) + state.repeats, shots)
-    np.testing.assert_allclose(batch.episode_reward, state.hits / 12 - state.repeats / 32, atol=1e-5)
+    np.testing.assert_allclose(
+        batch.episode_reward, state.hits / 12 - state.repeats / 32, atol=1e-5
+    )
 
 
-@pytest.mark.parametrize(("id", "size"), [("BattleShipEasy", 256), ("BattleShipMedium", 128), ("BattleShipHard", 128)])
+@pytest.mark.parametrize(
+    ("id", "size"), [("BattleShipEasy", 256), ("BattleShipMedium", 128), ("BattleShipHard", 128)]
+)
 def test_all_marks_and_the_cursor_can_be_read_back(id, size):
     game, compiled, side = make(id, obs_size=size), batched(id, obs_size=size), SIDES[id]
     batch = compiled.init(env_keys(4, 8), jnp.zeros(8, bool))
@@ -247,7 +268,10 @@ def test_a_mark_appears_in_both_twins_in_the_frame_after_its_shot():
     before = sea(game, ships=[(2, 3)], x=2, y=3)
     after = step(game, before, FIRE)[0]
     for partial in (False, True):
-        codes = [game.screen.board.read(draw(game, state, partial)[None], 8, 8)[0] for state in (before, after)]
+        codes = [
+            game.screen.board.read(draw(game, state, partial)[None], 8, 8)[0]
+            for state in (before, after)
+        ]
         assert (codes[0][3, 2], codes[1][3, 2]) == (KINDS, KINDS + HIT)
 
 
@@ -277,9 +301,13 @@ def test_every_visible_variable_changes_the_picture():
         {"board": base.board.at[0, 0].set(1)},
         {"hits": 7},
     ):
-        changed = base._replace(**{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()})
+        changed = base._replace(
+            **{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
-    unseen = base._replace(board=base.board.at[5, 5].set(1), repeats=jnp.int32(9), timestep=jnp.int32(80))
+    unseen = base._replace(
+        board=base.board.at[5, 5].set(1), repeats=jnp.int32(9), timestep=jnp.int32(80)
+    )
     assert np.array_equal(frame, draw(game, unseen, False)), "ships, repeats and time are not shown"
 
 
@@ -315,7 +343,9 @@ def test_a_closed_walk_that_fires_where_no_mark_is_seen_wins_without_any_memory(
 
     def play(carry, _):
         state, over, earned = carry
-        seen = state.guesses[state.x, state.y] == 1  # the POMDP's picture shows the mark under the cursor
+        seen = (
+            state.guesses[state.x, state.y] == 1
+        )  # the POMDP's picture shows the mark under the cursor
         action = jnp.where(seen, jnp.asarray(moves)[state.x, state.y], FIRE)
         state, reward, terminated, truncated = game.step(KEY, state, action)
         return (state, over | terminated | truncated, earned + jnp.where(over, 0.0, reward)), None

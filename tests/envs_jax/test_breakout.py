@@ -1,4 +1,6 @@
-"""Breakout, checked against a plain program of its rules and against what its pictures ought to tell."""
+"""Breakout, checked against a plain program of its rules and against what its pictures ought to
+tell.
+"""
 
 from types import SimpleNamespace
 
@@ -67,7 +69,9 @@ def plain_step(s, action, width, rules):
 def compiled_step(game):
     key = (game.id, game.rules)
     if key not in COMPILED:
-        COMPILED[key] = jax.jit(jax.vmap(lambda state, action: game.step(jax.random.PRNGKey(0), state, action)))
+        COMPILED[key] = jax.jit(
+            jax.vmap(lambda state, action: game.step(jax.random.PRNGKey(0), state, action))
+        )
     return COMPILED[key]
 
 
@@ -184,7 +188,9 @@ def test_a_brick_touched_right_after_another_lets_the_ball_pass_and_pays_by_defa
     game = make(HARD, rules=rules)
     state = one(game, ball_x=3, ball_y=4, ball_dir=UP_RIGHT, strike=True)
     new, reward, _, _ = step(game, state, 0)
-    assert (int(new.ball_x), int(new.ball_y), int(new.ball_dir)) == (4, 3, UP_RIGHT), "passes through in both"
+    assert (int(new.ball_x), int(new.ball_y), int(new.ball_dir)) == (4, 3, UP_RIGHT), (
+        "passes through in both"
+    )
     assert not new.bricks[2, 4] and bool(new.strike)
     paid = rules == "default"
     assert (reward, int(new.score)) == (pytest.approx(VALUES[2] if paid else 0.0), int(paid))
@@ -241,10 +247,16 @@ def test_the_frames_of_the_pomdp_suffice_to_clear_the_wall():
 
 
 def test_clumsy_play_pays_what_the_bricks_say():
-    """A follower who moves at random 3 times in 10: whatever the path, the return is the bricks' worth and the loss."""
+    """A follower who moves at random 3 times in 10: whatever the path, the return is the bricks'
+    worth and the loss.
+    """
     game, compiled = make("BreakoutEasy"), batched("BreakoutEasy")
     oracle, rng = make_oracle(game), np.random.default_rng(0)
-    batch, running, checked = compiled.init(env_keys(0, 64), jnp.zeros(64, bool)), np.ones(64, bool), 0
+    batch, running, checked = (
+        compiled.init(env_keys(0, 64), jnp.zeros(64, bool)),
+        np.ones(64, bool),
+        0,
+    )
     for _ in range(400):
         action = oracle.act(jax.tree.map(np.asarray, batch.state), running)
         action = np.where(rng.random(64) < 0.3, rng.integers(0, 5, 64), action).astype(np.int32)
@@ -264,7 +276,9 @@ def test_clumsy_play_pays_what_the_bricks_say():
 def test_random_play_loses_the_ball_soon():
     episodes = play(make("BreakoutEasy"), RandomPlayer(), 256)
     assert -0.96 < episodes.returns.mean() < -0.90
-    assert episodes.returns.min() == pytest.approx(-0.975, abs=1e-5), "the ball always meets one brick first"
+    assert episodes.returns.min() == pytest.approx(-0.975, abs=1e-5), (
+        "the ball always meets one brick first"
+    )
 
 
 def codes_of(game, frames):
@@ -290,7 +304,9 @@ def test_ball_tail_bricks_and_paddle_can_be_read_back(size):
     game = make(HARD, obs_size=size)
     bricks = np.ones((6, 10), bool)
     bricks[4, 2:5] = False
-    state = one(game, ball_x=5, ball_y=8, ball_dir=DOWN_LEFT, pos=3, bricks=bricks, last_x=5, last_y=8)
+    state = one(
+        game, ball_x=5, ball_y=8, ball_dir=DOWN_LEFT, pos=3, bricks=bricks, last_x=5, last_y=8
+    )
     expected = np.zeros((20, 10), int)
     expected[1:7] = np.where(bricks, np.arange(1, 7)[:, None], 0)
     expected[19, 3:7] = 1  # the paddle has the colour of the uppermost bricks
@@ -312,7 +328,9 @@ def test_the_literal_tail_is_where_the_ball_was():
     assert codes_of(game, render(moved, False)[None])[0, 9, 4] == picture.TAIL * KINDS
     for direction in range(4):
         same = render(moved._replace(ball_dir=jnp.int32(direction)), False)
-        assert np.array_equal(same, render(moved, False)), "the literal tail does not tell the direction"
+        assert np.array_equal(same, render(moved, False)), (
+            "the literal tail does not tell the direction"
+        )
     with pytest.raises(ValueError, match="tail is 'long'"):
         make(HARD, tail="long")
     with pytest.raises(TypeError, match="random_start"):
@@ -327,9 +345,12 @@ def test_in_play_the_pomdp_hides_the_ball_on_its_way_down_and_the_tail_always():
     for _ in range(60):
         state = jax.tree.map(np.asarray, batch.state)
         full, partial = (
-            codes_of(game, compiled.render(batch._replace(partial=jnp.full(8, flag)))) for flag in (False, True)
+            codes_of(game, compiled.render(batch._replace(partial=jnp.full(8, flag))))
+            for flag in (False, True)
         )
-        assert np.array_equal(full % KINDS, partial % KINDS), "bricks and paddle are the same in both"
+        assert np.array_equal(full % KINDS, partial % KINDS), (
+            "bricks and paddle are the same in both"
+        )
         marks = partial // KINDS
         up = state.ball_dir < 2
         assert np.array_equal(marks.sum((1, 2)), np.where(up, picture.BALL, 0))
@@ -344,8 +365,17 @@ def test_every_visible_variable_changes_the_mdp_picture():
     base = one(game, ball_x=4, ball_y=10, ball_dir=UP_LEFT)
     frame = draw(game, base, False)
     fewer = base.bricks.at[3, 3].set(False)
-    for changes in ({"ball_x": 5}, {"ball_y": 9}, {"ball_dir": 3}, {"pos": 4}, {"bricks": fewer}, {"score": 1}):
-        changed = base._replace(**{name: jnp.asarray(v, getattr(base, name).dtype) for name, v in changes.items()})
+    for changes in (
+        {"ball_x": 5},
+        {"ball_y": 9},
+        {"ball_dir": 3},
+        {"pos": 4},
+        {"bricks": fewer},
+        {"score": 1},
+    ):
+        changed = base._replace(
+            **{name: jnp.asarray(v, getattr(base, name).dtype) for name, v in changes.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
 
 

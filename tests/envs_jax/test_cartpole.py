@@ -20,13 +20,24 @@ def classic(pose, action):
     x, x_dot, theta, theta_dot = (float(v) for v in pose)
     force = {2: -10.0, 3: 10.0}.get(int(action), 0.0)
     temp = (force + 0.05 * theta_dot**2 * math.sin(theta)) / 1.1
-    theta_acc = (9.8 * math.sin(theta) - math.cos(theta) * temp) / (0.5 * (4 / 3 - 0.1 * math.cos(theta) ** 2 / 1.1))
+    theta_acc = (9.8 * math.sin(theta) - math.cos(theta) * temp) / (
+        0.5 * (4 / 3 - 0.1 * math.cos(theta) ** 2 / 1.1)
+    )
     x_acc = temp - 0.05 * theta_acc * math.cos(theta) / 1.1
-    return np.array([x + 0.02 * x_dot, x_dot + 0.02 * x_acc, theta + 0.02 * theta_dot, theta_dot + 0.02 * theta_acc])
+    return np.array(
+        [
+            x + 0.02 * x_dot,
+            x_dot + 0.02 * x_acc,
+            theta + 0.02 * theta_dot,
+            theta_dot + 0.02 * theta_acc,
+        ]
+    )
 
 
 def poses(walk):
-    return np.stack([walk.states.x, walk.states.x_dot, walk.states.theta, walk.states.theta_dot], -1)
+    return np.stack(
+        [walk.states.x, walk.states.x_dot, walk.states.theta, walk.states.theta_dot], -1
+    )
 
 
 def test_the_trajectory_equals_the_classic_equations():
@@ -48,7 +59,9 @@ def test_pushing_one_way_ends_after_about_ten_paid_steps():
 
 @pytest.mark.parametrize("rules", ["default", "reference"])
 def test_the_return_is_the_share_of_steps_survived(rules):
-    """The step that crosses a limit is paid; the reference ends one unpaid step later with the same return."""
+    """The step that crosses a limit is paid; the reference ends one unpaid step later with the same
+    return.
+    """
     walk = Walk(make("CartPoleEasy", rules=rules), np.full((15, 32), 2))
     crossed = (np.abs(walk.states.theta[1:]) > 0.20944).argmax(0) + 1
     end = walk.outcomes.done.argmax(0) + 1
@@ -60,7 +73,13 @@ def test_the_return_is_the_share_of_steps_survived(rules):
 
 
 @pytest.mark.parametrize(
-    ("id", "limit"), [("CartPoleEasy", 200), ("CartPoleMedium", 400), ("CartPoleHard", 600), ("NoisyCartPoleHard", 200)]
+    ("id", "limit"),
+    [
+        ("CartPoleEasy", 200),
+        ("CartPoleMedium", 400),
+        ("CartPoleHard", 600),
+        ("NoisyCartPoleHard", 200),
+    ],
 )
 def test_the_time_limit_truncates_but_does_not_terminate(id, limit):
     game = make(id)
@@ -98,7 +117,8 @@ def test_noise_changes_pictures_but_not_the_dynamics():
 
 
 @pytest.mark.parametrize(
-    ("id", "sigma"), [("NoisyCartPoleEasy", 0.1), ("NoisyCartPoleMedium", 0.2), ("NoisyCartPoleHard", 0.3)]
+    ("id", "sigma"),
+    [("NoisyCartPoleEasy", 0.1), ("NoisyCartPoleMedium", 0.2), ("NoisyCartPoleHard", 0.3)],
 )
 def test_the_noise_has_the_level_s_standard_deviation(id, sigma):
     noise = Walk(make(id), random_actions(50, 64)).states.noise
@@ -148,7 +168,10 @@ def test_the_pole_is_exactly_the_pixels_near_its_segment(size, theta):
     """Row intervals against the plain definition: distance to a segment at most the radius."""
     geo = Geometry(size)
     rows, columns, pivot = np.arange(*geo.strip), np.arange(geo.field), 30.0
-    low, high = (np.asarray(v) for v in pole_span(geo, jnp.float32(pivot), jnp.float32(theta), jnp.asarray(rows)))
+    low, high = (
+        np.asarray(v)
+        for v in pole_span(geo, jnp.float32(pivot), jnp.float32(theta), jnp.asarray(rows))
+    )
     drawn = (columns >= low[:, None]) & (columns <= high[:, None])
     dx, dy = math.sin(theta), -math.cos(theta)
     px, py = columns[None] - pivot, rows[:, None] - geo.pivot_y
@@ -161,22 +184,34 @@ def test_the_pole_is_exactly_the_pixels_near_its_segment(size, theta):
 
 @pytest.mark.parametrize(("size", "radius", "head"), [(128, 3, 6), (256, 5, 8)])
 def test_cart_pole_and_arrows_stand_where_the_published_ones_do(size, radius, head):
-    """The upright pole over the middle of the cart; each arrow in its box, as thick and with as long a head as its
-    speed says (classes 0 to 3). The ring of the bent one begins at its top, for it turns clockwise."""
+    """The upright pole over the middle of the cart; each arrow in its box, as thick and with as
+    long a head as its speed says (classes 0 to 3). The ring of the bent one begins at its top, for
+    it turns clockwise."""
     game, unit = make("CartPoleEasy", obs_size=size), size // 128
-    pole = [(24 * unit - radius, 56 * unit + radius + 1), (48 * unit - radius, 48 * unit + radius + 1)]
+    pole = [
+        (24 * unit - radius, 56 * unit + radius + 1),
+        (48 * unit - radius, 48 * unit + radius + 1),
+    ]
     for number, (speed, thickness) in enumerate(((0.5, 2), (1.0, 2), (3.0, 4), (4.0, 4))):
         frame = draw(game, one(game, x=0.0, theta=0.0, x_dot=speed, theta_dot=speed), False)
         field = frame[16 * unit : 112 * unit, 16 * unit : 112 * unit]
-        places = [np.nonzero((field == colour).all(-1)) for colour in ((245, 74, 140), (191, 120, 69))]
+        places = [
+            np.nonzero((field == colour).all(-1)) for colour in ((245, 74, 140), (191, 120, 69))
+        ]
         cart, copper = ([(at.min(), at.max() + 1) for at in place] for place in places)
         assert cart == [(48 * unit, 64 * unit), (32 * unit, 64 * unit)] and copper == pole
         ink = (field == (204, 204, 204)).all(-1)
-        flat, bent = (ink[69 * unit : 91 * unit, left : left + 22 * unit] for left in (5 * unit, 69 * unit))
+        flat, bent = (
+            ink[69 * unit : 91 * unit, left : left + 22 * unit] for left in (5 * unit, 69 * unit)
+        )
         assert ink.sum() == flat.sum() + bent.sum(), "nothing beside the boxes"
         across, shaft, middle = flat.sum(0), 22 * unit - head - number, 11 * unit
-        assert (across[:shaft] == thickness).all() and across[shaft] > thickness and across[-2:].any()
-        assert bent[0].any() and not bent[:, :middle].any() and bent[:, middle].sum() == thickness, "its ring begins"
+        assert (
+            (across[:shaft] == thickness).all() and across[shaft] > thickness and across[-2:].any()
+        )
+        assert (
+            bent[0].any() and not bent[:, :middle].any() and bent[:, middle].sum() == thickness
+        ), "its ring begins"
 
 
 def test_noise_beyond_the_limits_is_drawn_at_the_limits():
@@ -199,7 +234,9 @@ def test_logarithmic_arrows_have_eight_pictures_for_speeds_up_to_four(size):
     speeds = np.linspace(0, 4, 4001).astype(np.float32)
     level = np.asarray(arrow_level(speeds, "log", 22))
     assert sorted(set(level)) == [0, 1, 2, 3]
-    np.testing.assert_allclose([speeds[(level == k).argmax()] for k in (1, 2, 3)], [0.65, 1.72, 3.48], atol=0.01)
+    np.testing.assert_allclose(
+        [speeds[(level == k).argmax()] for k in (1, 2, 3)], [0.65, 1.72, 3.48], atol=0.01
+    )
     for pictures in arrow_pictures(Geometry(size), "log"):
         levels = len(pictures) // 2
         shown = np.concatenate([pictures[:4], pictures[levels : levels + 4]])
@@ -223,13 +260,17 @@ def test_linear_arrows_tell_every_length_apart(size):
 
 @pytest.mark.parametrize("slot", [0, 1])
 def test_arrows_point_where_the_velocity_goes(slot):
-    """The flat arrow's head is right of the middle for v > 0; the bent one's quarter ring is upper right."""
+    """The flat arrow's head is right of the middle for v > 0; the bent one's quarter ring is upper
+    right.
+    """
     name = ("x_dot", "theta_dot")[slot]
     game, frames = make("CartPoleEasy"), {}
     for v in (-1.0, 1.0):
         place = game.screen.arrows[slot]
         frame = draw(game, one(game, **{name: v}), False)
-        frames[v] = (frame[place.y : place.y + 22, place.x : place.x + 22] != np.array(CHARCOAL)).any(-1)
+        frames[v] = (
+            frame[place.y : place.y + 22, place.x : place.x + 22] != np.array(CHARCOAL)
+        ).any(-1)
     if slot == 0:
         assert frames[1.0][:, 11:].sum() > frames[1.0][:, :11].sum()
         assert np.array_equal(frames[-1.0], frames[1.0][:, ::-1])

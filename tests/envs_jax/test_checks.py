@@ -1,4 +1,6 @@
-"""A game of one's own that does not keep the contract is refused with one line that says what is wrong."""
+"""A game of one's own that does not keep the contract is refused with one line that says what is
+wrong.
+"""
 
 import re
 from typing import NamedTuple
@@ -7,7 +9,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from arcade_torch.envs_jax import BatchedGame, Game, check_game, make, probe_ids, register, registered_ids
+from arcade_torch.envs_jax import (
+    BatchedGame,
+    Game,
+    check_game,
+    make,
+    probe_ids,
+    register,
+    registered_ids,
+)
 from tests.own_registry import own_registry  # noqa: F401
 
 
@@ -42,8 +52,15 @@ def step_giving(**changes):
     """A step that gives something else in some places."""
 
     def step(self, key, state, action):
-        following = {"state": state, "reward": jnp.float32(0), "terminated": jnp.bool_(0), "truncated": jnp.bool_(0)}
-        return tuple({**following, **{name: make(state) for name, make in changes.items()}}.values())
+        following = {
+            "state": state,
+            "reward": jnp.float32(0),
+            "terminated": jnp.bool_(0),
+            "truncated": jnp.bool_(0),
+        }
+        return tuple(
+            {**following, **{name: make(state) for name, make in changes.items()}}.values()
+        )
 
     return step
 
@@ -61,22 +78,52 @@ WRONG = [
         {"render": lambda s, state, partial: jnp.zeros((128, 128, 3))},
         "render gives float32 [128, 128, 3], wanted uint8 [128, 128, 3]",
     ),
-    ({"render": lambda s, state, partial: (0, 1)}, "render gives a tuple, wanted uint8 [128, 128, 3]"),
     (
-        {"render": lambda s, state, partial: jnp.zeros((128, 128, 3), jnp.uint8) if partial else None},
-        "render cannot be traced by JAX, wanted a pure function of arrays; use jnp.where instead of if",
+        {"render": lambda s, state, partial: (0, 1)},
+        "render gives a tuple, wanted uint8 [128, 128, 3]",
     ),
-    ({"step": step_giving(reward=lambda s: s.count)}, "step gives reward as int32 [], wanted float32 []"),
-    ({"step": step_giving(reward=lambda s: jnp.zeros(1))}, "step gives reward as float32 [1], wanted float32 []"),
-    ({"step": step_giving(terminated=lambda s: s.count)}, "step gives terminated as int32 [], wanted bool []"),
-    ({"step": step_giving(truncated=lambda s: s.seen)}, "step gives truncated as bool [3], wanted bool []"),
-    ({"step": lambda s, key, state, action: (state, 0.0, False)}, "step gives 3 values, wanted 4: state, reward"),
-    ({"step": lambda s, key, state, action: state.count}, "step gives a ShapeDtypeStruct, wanted 4: state, reward"),
+    (
+        {
+            "render": lambda s, state, partial: (
+                jnp.zeros((128, 128, 3), jnp.uint8) if partial else None
+            )
+        },
+        "render cannot be traced by JAX, wanted a pure function of arrays; use jnp.where instead "
+        "of if",
+    ),
+    (
+        {"step": step_giving(reward=lambda s: s.count)},
+        "step gives reward as int32 [], wanted float32 []",
+    ),
+    (
+        {"step": step_giving(reward=lambda s: jnp.zeros(1))},
+        "step gives reward as float32 [1], wanted float32 []",
+    ),
+    (
+        {"step": step_giving(terminated=lambda s: s.count)},
+        "step gives terminated as int32 [], wanted bool []",
+    ),
+    (
+        {"step": step_giving(truncated=lambda s: s.seen)},
+        "step gives truncated as bool [3], wanted bool []",
+    ),
+    (
+        {"step": lambda s, key, state, action: (state, 0.0, False)},
+        "step gives 3 values, wanted 4: state, reward",
+    ),
+    (
+        {"step": lambda s, key, state, action: state.count},
+        "step gives a ShapeDtypeStruct, wanted 4: state, reward",
+    ),
     (
         {"step": step_giving(state=lambda s: (s.count, s.seen))},
-        "step gives a state of another structure, with [0], [1]; wanted that of reset, a State with count, seen",
+        "step gives a state of another structure, with [0], [1]; wanted that of reset, a State "
+        "with count, seen",
     ),
-    ({"step": step_giving(state=lambda s: None)}, "step gives a state of another structure, with nothing; wanted that"),
+    (
+        {"step": step_giving(state=lambda s: None)},
+        "step gives a state of another structure, with nothing; wanted that",
+    ),
     (
         {"step": step_giving(state=lambda s: s._replace(count=s.count + 0.5))},
         "step gives state entry count as float32 [], wanted int32 []",
@@ -89,7 +136,10 @@ WRONG = [
         {"reset": lambda s, key: (), "step": step_giving()},
         "reset gives a state without any array, wanted a named tuple of arrays",
     ),
-    ({"reset": lambda s, key: key.no_such}, "reset cannot be traced by JAX, wanted a pure function of arrays (Attr"),
+    (
+        {"reset": lambda s, key: key.no_such},
+        "reset cannot be traced by JAX, wanted a pure function of arrays (Attr",
+    ),
     ({"max_steps": 0}, "max_steps is 0, wanted an int of 1 or more"),
     ({"obs_size": 128.0}, "obs_size is 128.0, wanted an int of 1 or more"),
     ({"return_range": (1.0, 0.0)}, "return_range is (1.0, 0.0), wanted (lowest, highest)"),
@@ -122,11 +172,19 @@ def test_a_factory_that_does_not_make_what_it_was_asked_for_is_refused(own_regis
     register("RightEasy-v0", lambda *, id, obs_size, rules: Right())
     register("OtherEasy-v0", lambda *, id, obs_size, rules: Right())
     register("NoneEasy-v0", lambda *, id, obs_size, rules: None)
-    with pytest.raises(ValueError, match="the factory of RightEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted"):
+    with pytest.raises(
+        ValueError,
+        match="the factory of RightEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted",
+    ):
         make("RightEasy", obs_size=256)
-    with pytest.raises(ValueError, match="the factory of OtherEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted"):
+    with pytest.raises(
+        ValueError,
+        match="the factory of OtherEasy-v0 made 'RightEasy-v0' with obs_size 128, wanted",
+    ):
         make("OtherEasy")
-    with pytest.raises(ValueError, match="the factory of NoneEasy-v0 made a NoneType, wanted a Game"):
+    with pytest.raises(
+        ValueError, match="the factory of NoneEasy-v0 made a NoneType, wanted a Game"
+    ):
         make("NoneEasy")
 
 
@@ -140,7 +198,9 @@ def test_an_attribute_that_is_missing_is_named():
 
 def test_nothing_is_compiled_by_the_check():
     compiled = []
-    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: compiled.append(name))
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name)
+    )
     check_game(Right())
     assert not [name for name in compiled if "backend_compile" in name]
 

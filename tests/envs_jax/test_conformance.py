@@ -14,7 +14,11 @@ NAMED = sorted(set(re.findall(r"`([\w/]+\.py)::(test_\w+)`", PAGE)))
 
 def test_tests_are_named_at_all():
     assert len(NAMED) > 50
-    rows = [line for line in PAGE.splitlines() if line.startswith("| ") and not line.startswith("| what")]
+    rows = [
+        line
+        for line in PAGE.splitlines()
+        if line.startswith("| ") and not line.startswith("| what")
+    ]
     assert all("::test_" in row or "below" in row for row in rows if not row.startswith("| game"))
 
 

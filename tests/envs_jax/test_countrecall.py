@@ -18,7 +18,11 @@ from arcade_torch.envs_jax.render import Slot
 from .conftest import batched, draw, going_on, one, random_actions
 from .test_autoencode import read_history
 
-LEVELS = {"CountRecallEasy": (26, 2, 13), "CountRecallMedium": (52, 2, 26), "CountRecallHard": (78, 4, 20)}
+LEVELS = {
+    "CountRecallEasy": (26, 2, 13),
+    "CountRecallMedium": (52, 2, 26),
+    "CountRecallHard": (78, 4, 20),
+}
 UP, DOWN, LEFT, RIGHT, FIRE = range(5)
 KEY = jax.random.PRNGKey(0)
 
@@ -41,8 +45,12 @@ def test_packs_are_full_and_independent(id):
     fresh = jax.tree.map(np.asarray, compiled.init(env_keys(0, 1024), jnp.zeros(1024, bool)).state)
     for pack in (fresh.cards, fresh.queries):
         assert (np.sort(pack) == np.sort(np.arange(cards) % suits)).all()
-        assert ((pack == 0).mean(0) > 0.8 / suits).all() and ((pack == 0).mean(0) < 1.2 / suits + 0.05).all()
-    assert abs((fresh.cards == fresh.queries).mean() - 1 / suits) < 0.01, "queries ought not to follow the cards"
+        assert ((pack == 0).mean(0) > 0.8 / suits).all() and (
+            (pack == 0).mean(0) < 1.2 / suits + 0.05
+        ).all()
+    assert abs((fresh.cards == fresh.queries).mean() - 1 / suits) < 0.01, (
+        "queries ought not to follow the cards"
+    )
     assert all((leaf == 0).all() for leaf in fresh[2:])
     assert (compiled.game.max_steps, compiled.game.level.most) == (100 + cards, most)
 
@@ -60,14 +68,21 @@ def test_the_right_answer_counts_the_cards_of_earlier_turns(id):
             new, reward, *_ = step(game, here, FIRE)
             right = answer == count
             assert reward == (pytest.approx(1 / len(cards)) if right else 0)
-            assert (int(new.score), int(new.timestep), int(new.answer), int(new.moves)) == (right, turn + 1, answer, 1)
+            assert (int(new.score), int(new.timestep), int(new.answer), int(new.moves)) == (
+                right,
+                turn + 1,
+                answer,
+                1,
+            )
         assert turn or count == 0
 
 
 def test_the_counter_moves_by_one_and_the_other_actions_only_pass_time():
     game = make("CountRecallEasy")
     for action, change in ((UP, 1), (DOWN, -1), (LEFT, 0), (RIGHT, 0)):
-        new, reward, terminated, truncated = step(game, one(game, answer=5, timestep=3, moves=9), action)
+        new, reward, terminated, truncated = step(
+            game, one(game, answer=5, timestep=3, moves=9), action
+        )
         assert (int(new.answer), int(new.timestep), int(new.moves)) == (5 + change, 3, 10)
         assert (reward, terminated, truncated) == (0, False, False)
 
@@ -95,7 +110,9 @@ def test_the_counter_of_the_reference_goes_anywhere_and_is_drawn_as_it_is():
         frame = draw(game, one(game, answer=answer, score=26), False)[None]
         assert game.screen.counter.read(frame)[0] - 99 == answer
         assert digits(game.screen.score).read(frame)[0] == 26
-    assert np.array_equal(draw(game, one(game, answer=-120), False), draw(game, one(game, answer=-99), False))
+    assert np.array_equal(
+        draw(game, one(game, answer=-120), False), draw(game, one(game, answer=-99), False)
+    )
 
 
 @pytest.mark.parametrize("rules", ["default", "reference"])
@@ -111,7 +128,9 @@ def test_the_last_turn_terminates_and_the_limit_truncates(id, rules):
         (3, 98 + cards, FIRE, (False, False)),
         (cards - 1, 99 + cards, FIRE, (True, True)),
     ):
-        new, _, terminated, truncated = step(game, one(game, timestep=timestep, moves=moves), action)
+        new, _, terminated, truncated = step(
+            game, one(game, timestep=timestep, moves=moves), action
+        )
         assert (terminated, truncated) == ends
     assert step(game, new, FIRE)[1] == 0, "there is no turn after the last"
 
@@ -154,7 +173,9 @@ def test_whatever_is_played_the_score_equals_a_recount(seed, up):
 
 
 def digits(slot):
-    """The columns of a slot in which some digit stands; the counter's place covers empty ones of the score's."""
+    """The columns of a slot in which some digit stands; the counter's place covers empty ones of
+    the score's.
+    """
     used = np.flatnonzero((slot.pictures != slot.pictures[0, 0, 0]).any((0, 1, 3)))
     low, high = used.min(), used.max() + 1
     return Slot(slot.pictures[:, :, low:high], slot.x + int(low), slot.y)
@@ -163,11 +184,19 @@ def digits(slot):
 @pytest.mark.parametrize("size", [128, 256])
 @pytest.mark.parametrize("id", ["CountRecallEasy", "CountRecallHard"])
 def test_everything_shown_can_be_read_back(id, size):
-    """R5: the history has as many legible symbols as turns were confirmed, and the POMDP hides it alone."""
+    """R5: the history has as many legible symbols as turns were confirmed, and the POMDP hides it
+    alone.
+    """
     game = make(id, obs_size=size)
     cards, _, most = LEVELS[id]
     rows = -(-cards // 9)
-    for turn, answer, score in ((0, 0, 0), (1, 9, 1), (20, 10, 7), (cards - 1, most, cards - 1), (cards, 3, cards)):
+    for turn, answer, score in (
+        (0, 0, 0),
+        (1, 9, 1),
+        (20, 10, 7),
+        (cards - 1, most, cards - 1),
+        (cards, 3, cards),
+    ):
         state = one(game, timestep=turn, answer=answer, score=score)
         full, partial = (draw(game, state, flag)[None] for flag in (False, True))
         expected = np.zeros(9 * rows, int)
@@ -181,7 +210,10 @@ def test_everything_shown_can_be_read_back(id, size):
             assert digits(game.screen.score).read(frame)[0] == score
         low = game.screen.history.y
         differs = (full != partial).any((0, 2, 3))
-        assert not differs[:low].any() and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()
+        assert (
+            not differs[:low].any()
+            and not differs[low + 9 * game.screen.history.atlas.shape[1] :].any()
+        )
 
 
 @pytest.mark.parametrize("size", [128, 256])
@@ -206,12 +238,17 @@ def test_every_visible_variable_changes_the_mdp_picture():
         {"answer": 5},
         {"score": 1},
     ):
-        changed = base._replace(**{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()})
+        changed = base._replace(
+            **{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
     to_come = base._replace(
-        cards=base.cards.at[15].set(1 - base.cards[15]), queries=base.queries.at[3].set(1 - base.queries[3])
+        cards=base.cards.at[15].set(1 - base.cards[15]),
+        queries=base.queries.at[3].set(1 - base.queries[3]),
     )
-    assert np.array_equal(frame, draw(game, to_come, False)), "cards to come and earlier queries are hidden"
+    assert np.array_equal(frame, draw(game, to_come, False)), (
+        "cards to come and earlier queries are hidden"
+    )
 
 
 def test_the_plan_is_as_good_as_trying_every_choice():
@@ -234,7 +271,11 @@ def test_the_plan_is_as_good_as_trying_every_choice():
 
 @pytest.mark.parametrize(
     ("id", "mean", "all_right"),
-    [("CountRecallEasy", 1, 1), ("CountRecallMedium", 0.993, 0.85), ("CountRecallHard", 0.959, 0.29)],
+    [
+        ("CountRecallEasy", 1, 1),
+        ("CountRecallMedium", 0.993, 0.85),
+        ("CountRecallHard", 0.959, 0.29),
+    ],
 )
 def test_the_state_oracle_reaches_what_the_limit_leaves(id, mean, all_right):
     """R3: the documented means of the best play."""
@@ -245,7 +286,8 @@ def test_the_state_oracle_reaches_what_the_limit_leaves(id, mean, all_right):
 
 
 @pytest.mark.parametrize(
-    ("id", "least"), [("CountRecallEasy", 0.9999), ("CountRecallMedium", 0.975), ("CountRecallHard", 0.895)]
+    ("id", "least"),
+    [("CountRecallEasy", 0.9999), ("CountRecallMedium", 0.975), ("CountRecallHard", 0.895)],
 )
 def test_counting_the_frames_recovers_most_of_it(id, least):
     """All on Easy; elsewhere it cannot know which answers are better given up for want of moves."""

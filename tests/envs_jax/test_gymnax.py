@@ -16,12 +16,17 @@ KEY = jax.random.PRNGKey(0)
 
 
 def equal(one, two):
-    return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
+    return all(
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
+    )
 
 
 @pytest.fixture(scope="module")
 def walk():
-    """300 random steps of four envs in one scan: keys, states before, actions, what step gave; leaves [1200, ...]."""
+    """300 random steps of four envs in one scan: keys, states before, actions, what step gave;
+    leaves [1200, ...].
+    """
     env, params = gymnax.make("MineSweeperEasy")
 
     def step(state, key):
@@ -48,7 +53,9 @@ def test_steps_are_the_games_own_and_an_end_is_followed_by_a_reset(walk):
     assert equal(info["discount"], 1.0 - terminated)
     assert terminated.any() and (truncated & ~terminated).any()
     some = slice(None, None, 50)
-    drawn = jax.vmap(partial(env.game.render, partial=False))(jax.tree.map(lambda leaf: leaf[some], following))
+    drawn = jax.vmap(partial(env.game.render, partial=False))(
+        jax.tree.map(lambda leaf: leaf[some], following)
+    )
     assert equal(obs[some], drawn)
 
 
@@ -66,7 +73,9 @@ def test_the_twin_is_a_parameter_traced_or_static():
     assert params == (True, 64) and env.default_params.max_steps_in_episode == env.game.max_steps
     _, state = env.reset(KEY, params)
     _, state, *_ = env.step(KEY, state, 0, params)
-    both = jax.jit(jax.vmap(lambda hides: env.get_obs(state, params._replace(partial=hides))))(jnp.array([False, True]))
+    both = jax.jit(jax.vmap(lambda hides: env.get_obs(state, params._replace(partial=hides))))(
+        jnp.array([False, True])
+    )
     static = jax.jit(env.get_obs, static_argnums=1)
     for hides in (False, True):
         assert equal(both[int(hides)], env.game.render(state, hides))
@@ -80,10 +89,17 @@ def test_spaces_hold_what_is_given_and_taken_and_nothing_else():
     obs, _ = env.reset(KEY, params)
     assert (obs.shape, obs.dtype) == (seen.shape, seen.dtype) == ((256, 256, 3), jnp.uint8)
     sample = seen.sample(KEY)
-    assert (sample.shape, sample.dtype) == (seen.shape, seen.dtype) and sample.max() == 255 and sample.min() == 0
+    assert (
+        (sample.shape, sample.dtype) == (seen.shape, seen.dtype)
+        and sample.max() == 255
+        and sample.min() == 0
+    )
     assert seen.contains(obs) and not seen.contains(obs.astype(jnp.int32) - 1)
     drawn = jax.vmap(actions.sample)(jax.random.split(KEY, 64))
-    assert set(drawn.tolist()) == set(range(env.num_actions)) and jax.vmap(actions.contains)(drawn).all()
+    assert (
+        set(drawn.tolist()) == set(range(env.num_actions))
+        and jax.vmap(actions.contains)(drawn).all()
+    )
     assert not actions.contains(5) and not actions.contains(-1)
     assert env.name == "CartPoleEasy-v0"
 
@@ -113,9 +129,13 @@ def test_params_are_replaced_as_gymnax_does_and_refuse_what_would_do_nothing():
     assert hidden.partial is True and params.partial is False
     assert np.array_equal(env.get_obs(state, hidden), env.game.render(state, True))
     assert params.replace(max_steps_in_episode=32) == params == params.replace()
-    both = jax.vmap(lambda partial: env.get_obs(state, params.replace(partial=partial)))(jnp.array([False, True]))
+    both = jax.vmap(lambda partial: env.get_obs(state, params.replace(partial=partial)))(
+        jnp.array([False, True])
+    )
     assert np.array_equal(both[1], env.game.render(state, True))
-    with pytest.raises(TypeError, match="params have no 'max_steps', allowed: partial, max_steps_in_episode"):
+    with pytest.raises(
+        TypeError, match="params have no 'max_steps', allowed: partial, max_steps_in_episode"
+    ):
         params.replace(max_steps=3)
     with pytest.raises(ValueError, match="max_steps_in_episode is 10, allowed: 32") as refused:
         params.replace(max_steps_in_episode=10)

@@ -11,7 +11,9 @@ from arcade_torch.envs_jax import make, registered_ids
 from arcade_torch.envs_jax.batch import env_keys
 
 N = 4
-MOST_SCATTERS = 0  # pieces that a step would put into the frame one by one, each a kernel of its own
+MOST_SCATTERS = (
+    0  # pieces that a step would put into the frame one by one, each a kernel of its own
+)
 
 
 @pytest.mark.parametrize("game", [id for id in registered_ids() if "Easy" in id])
@@ -24,8 +26,12 @@ def test_a_step_for_a_gpu_draws_in_few_passes_and_without_loops(game: str) -> No
     names = [one or other for one, other in operations]
     assert {"gather", "convert"} <= set(names)  # the text is read as it is written
     assert names.count("scatter") <= MOST_SCATTERS
-    assert not {"while", "custom_call"} & set(names), "a loop or a call into a library in every step"
+    assert not {"while", "custom_call"} & set(names), (
+        "a loop or a call into a library in every step"
+    )
     filled = [
-        line for line in program.splitlines() if "broadcast_in_dim" in line and line.endswith(f"{N}x128x128x3xui8>")
+        line
+        for line in program.splitlines()
+        if "broadcast_in_dim" in line and line.endswith(f"{N}x128x128x3xui8>")
     ]
     assert len(filled) <= 1, "the frame is laid out once"

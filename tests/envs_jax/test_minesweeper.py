@@ -94,7 +94,9 @@ def test_the_cursor_of_the_reference_never_starts_in_the_last_column_or_row():
 def test_the_cursor_moves_one_cell_and_stops_at_the_border():
     game = make("MineSweeperEasy")
     for action, (dx, dy) in enumerate([(0, -1), (0, 1), (-1, 0), (1, 0)]):
-        new, reward, terminated, truncated = step(game, board(game, [(3, 3), (3, 2)], x=1, y=1), action)
+        new, reward, terminated, truncated = step(
+            game, board(game, [(3, 3), (3, 2)], x=1, y=1), action
+        )
         assert (int(new.x), int(new.y), int(new.timestep)) == (1 + dx, 1 + dy, 1)
         assert (reward, terminated, truncated) == (0, False, False)
         for x, y in ((0, 0), (3, 3)):
@@ -121,7 +123,9 @@ def test_a_mine_ends_the_game(options, expected):
     new, reward, terminated, truncated = step(game, board(game, [(2, 1)], x=2, y=1), 4)
     assert (reward, terminated, truncated) == (expected, True, False)
     assert int(new.score) == 0 and int(new.grid[2, 1]) == SWEPT
-    assert game.return_range[0] == pytest.approx(1 / 14 - 7 / 8 + min(expected, -1 / 8)), "a mine in place of a repeat"
+    assert game.return_range[0] == pytest.approx(1 / 14 - 7 / 8 + min(expected, -1 / 8)), (
+        "a mine in place of a repeat"
+    )
 
 
 @pytest.mark.parametrize("id", LEVELS)
@@ -158,7 +162,9 @@ def test_the_time_limit_truncates_but_does_not_terminate(rules, action):
     ("reference", 8, 4, True),
     ("reference", 8, 0, False),
 ])  # fmt: skip
-def test_the_repeats_are_judged_after_the_sweep_or_late_in_the_reference(rules, repeats, action, ends):
+def test_the_repeats_are_judged_after_the_sweep_or_late_in_the_reference(
+    rules, repeats, action, ends
+):
     game = make("MineSweeperEasy", rules=rules)
     state = board(game, [(3, 3)], repeats=repeats, timestep=20)
     state = state._replace(grid=state.grid.at[0, 0].set(SWEPT))
@@ -200,7 +206,9 @@ def test_the_pomdp_shows_the_number_under_the_cursor_alone(id):
     grid = np.full((game.level.side,) * 2, SWEPT, np.int8)
     neighbours = (np.arange(grid.size) % 9).reshape(grid.shape)
     state = one(game, x=2, y=1, grid=grid, neighbours=neighbours)
-    codes = game.screen.board.read(draw(game, state, True)[None], game.level.side, game.level.side)[0]
+    codes = game.screen.board.read(draw(game, state, True)[None], game.level.side, game.level.side)[
+        0
+    ]
     assert codes[1, 2] == KINDS + 1 + neighbours[2, 1]
     assert (np.delete(codes.ravel(), game.level.side + 2) == 0).all()
 
@@ -212,7 +220,10 @@ def test_every_visible_variable_changes_the_mdp_picture():
     swept = base.grid.at[0, 2].set(SWEPT)
     for changes in ({"x": 2}, {"y": 0}, {"grid": swept}, {"score": 5}):
         changed = base._replace(
-            **{name: jnp.asarray(value, getattr(base, name).dtype) for name, value in changes.items()}
+            **{
+                name: jnp.asarray(value, getattr(base, name).dtype)
+                for name, value in changes.items()
+            }
         )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
     more = base._replace(grid=swept, neighbours=base.neighbours.at[0, 2].add(1))

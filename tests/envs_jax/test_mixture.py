@@ -28,18 +28,27 @@ def walk(compiled, keys, actions, partial):
 
 
 @pytest.mark.parametrize(
-    ("games", "weights"), [(GAMES, (1, 2)), pytest.param(None, (1,) * 10, marks=pytest.mark.slow, id="all ten games")]
+    ("games", "weights"),
+    [(GAMES, (1, 2)), pytest.param(None, (1,) * 10, marks=pytest.mark.slow, id="all ten games")],
 )
 def test_env_i_walks_the_path_that_it_walks_in_its_game_alone(games, weights):
-    mixed, size = MixedGames(games or [make(id) for id in ALL_IDS if "Easy" in id], weights), 2 * sum(weights)
+    mixed, size = (
+        MixedGames(games or [make(id) for id in ALL_IDS if "Easy" in id], weights),
+        2 * sum(weights),
+    )
     games, parts = mixed.game.games, mixed.rows(size)
     keys, actions, partial = env_keys(5, size), random_actions(50, size), jnp.arange(size) % 2 == 0
     together = walk(mixed, keys, actions, partial)
-    apart = [walk(batched(g.id), keys[r], actions[:, r], partial[r]) for g, r in zip(games, parts, strict=True)]
+    apart = [
+        walk(batched(g.id), keys[r], actions[:, r], partial[r])
+        for g, r in zip(games, parts, strict=True)
+    ]
     ends = np.zeros(size, int)
     for now, *alone in zip(together, *apart, strict=True):
         root, stepped, outcome, frames = now
-        for game, part, (root1, stepped1, outcome1, frames1) in zip(games, parts, alone, strict=True):
+        for game, part, (root1, stepped1, outcome1, frames1) in zip(
+            games, parts, alone, strict=True
+        ):
             for ours, theirs in ((root, root1), (stepped, stepped1)):
                 assert same(rows(ours._replace(state=None), part), theirs._replace(state=None))
                 assert same(ours.state[game.id], theirs.state)
@@ -67,7 +76,9 @@ def test_widening_makes_every_leaf_as_long_as_the_batch_and_narrowing_undoes_it(
     wide = mixed.wide(batch)
     assert all(len(leaf) == 6 for leaf in jax.tree.leaves(wide))
     assert same(mixed.narrow(wide), batch)
-    assert not np.asarray(wide.state["CoinEasy-v0"].count)[:4].any(), "zero where another game is played"
+    assert not np.asarray(wide.state["CoinEasy-v0"].count)[:4].any(), (
+        "zero where another game is played"
+    )
 
 
 @given(weights=st.lists(st.integers(1, 9), min_size=1, max_size=6), extra=st.integers(0, 200))
@@ -86,7 +97,12 @@ def test_envs_are_split_in_order_and_as_the_weights_say(weights, extra):
 def test_a_mixture_is_known_by_what_its_games_have_in_common():
     game = MixedGames(GAMES, weights=(2, 1)).game
     assert game.id == "2*CartPoleEasy-v0+MineSweeperEasy-v0"
-    assert (game.max_steps, game.return_range[1], game.obs_size, game.rules) == (200, 1.0, 128, "default")
+    assert (game.max_steps, game.return_range[1], game.obs_size, game.rules) == (
+        200,
+        1.0,
+        128,
+        "default",
+    )
     assert game.return_range[0] == GAMES[1].return_range[0] < GAMES[0].return_range[0]
     assert game.num_actions == 5 and "2*CartPoleEasy-v0" in repr(game)
     assert MixedGames([GAMES[0], make("TetrisEasy", rules="reference")]).game.rules == "mixed"
@@ -96,14 +112,22 @@ def test_a_mixture_is_known_by_what_its_games_have_in_common():
     ("games", "weights", "message"),
     [
         ([], None, "the list of games is empty"),
-        ([StubGame(), StubGame()], None, "StubEasy-v0 is in the list of games twice: give it once, with a weight"),
+        (
+            [StubGame(), StubGame()],
+            None,
+            "StubEasy-v0 is in the list of games twice: give it once, with a weight",
+        ),
         (
             [StubGame(), GAMES[0]],
             None,
             "picture size, these have obs_size 8 (StubEasy-v0), 128 (CartPoleEasy-v0)",
         ),
         ([StubGame(), CoinGame()], (1,), "weights are (1,), expected 2 whole numbers of 1 or more"),
-        ([StubGame(), CoinGame()], (1, 0), "weights are (1, 0), expected 2 whole numbers of 1 or more"),
+        (
+            [StubGame(), CoinGame()],
+            (1, 0),
+            "weights are (1, 0), expected 2 whole numbers of 1 or more",
+        ),
         ([StubGame(), CoinGame()], (1.5, 1), "weights are (1.5, 1), expected 2 whole numbers"),
     ],
 )
@@ -113,5 +137,7 @@ def test_games_that_cannot_share_a_batch_are_refused(games, weights, message):
 
 
 def test_too_few_envs_are_refused():
-    with pytest.raises(ValueError, match=re.escape("num_envs is 1, too few for 2*StubEasy-v0+CoinEasy-v0")):
+    with pytest.raises(
+        ValueError, match=re.escape("num_envs is 1, too few for 2*StubEasy-v0+CoinEasy-v0")
+    ):
         MIXED.batched.rows(1)

@@ -37,7 +37,9 @@ def step(game, state, action):
 @functools.cache
 def fresh(id, rules="default", count=4096):
     """First states of many envs, with numpy leaves."""
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, count)))
+    return jax.tree.map(
+        np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, count))
+    )
 
 
 def chart(game, tnt=(), treasure=None, x=0, y=0, **changes):
@@ -56,14 +58,21 @@ def deviations(count, rate, total):
 
 
 def search(board, x, y):
-    """Length of a shortest path from (x, y) to the treasure, by breadth-first search; None where there is none."""
+    """Length of a shortest path from (x, y) to the treasure, by breadth-first search; None where
+    there is none.
+    """
     queue, seen = deque([(x, y, 0)]), {(x, y)}
     while queue:
         x, y, length = queue.popleft()
         if board[x, y] == TREASURE:
             return length
         for cell in ((x + 1, y), (x - 1, y), (x, y + 1), (x, y - 1)):
-            if min(cell) >= 0 and max(cell) < len(board) and cell not in seen and board[cell] != TNT:
+            if (
+                min(cell) >= 0
+                and max(cell) < len(board)
+                and cell not in seen
+                and board[cell] != TNT
+            ):
                 seen.add(cell)
                 queue.append((*cell, length + 1))
     return None
@@ -73,7 +82,9 @@ def search(board, x, y):
 def test_nine_distinct_cells_hold_seven_blocks_a_treasure_and_the_agent(id):
     states, side = fresh(id), SIDES[id]
     assert states.board.shape == (4096, side, side)
-    assert ((states.board == TNT).sum((1, 2)) == 7).all() and ((states.board == TREASURE).sum((1, 2)) == 1).all()
+    assert ((states.board == TNT).sum((1, 2)) == 7).all() and (
+        (states.board == TREASURE).sum((1, 2)) == 1
+    ).all()
     assert (states.board[np.arange(4096), states.x, states.y] == FREE).all()
     assert (states.timestep == 0).all()
 
@@ -95,13 +106,16 @@ def test_treasure_agent_and_blocks_are_uniform_and_the_first_two_independent(id)
 
 def test_distinct_draws_are_uniform_over_all_sets():
     sets = np.asarray(jax.jit(jax.vmap(lambda key: draw_distinct(key, 3, 6)))(env_keys(2, 4000)))
-    assert all(len(set(cells)) == 3 for cells in sets.tolist()) and sets.min() == 0 and sets.max() == 5
+    assert (
+        all(len(set(cells)) == 3 for cells in sets.tolist()) and sets.min() == 0 and sets.max() == 5
+    )
     count = np.unique(np.sort(sets, 1), axis=0, return_counts=True)[1]
     assert len(count) == 20 and deviations(count, 1 / 20, 4000).max() < 4.5
 
 
-# What was measured of the published game: the commonest treasure cells (x, y), their share, and the shares of episodes
-# with a block overwritten, with the agent on TNT, and with the agent on the treasure.
+# What was measured of the published game: the commonest treasure cells (x, y), their share, and the
+# shares of episodes with a block overwritten, with the agent on TNT, and with the agent on the
+# treasure.
 PUBLISHED = {
     "NavigatorEasy": ({(2, 2), (2, 3), (2, 4)}, 0.75, 0.104, 0.092, 0.018),
     "NavigatorMedium": ({(4, 0), (4, 9), (4, 1)}, 0.64, 0.048, 0.056, 0.011),
@@ -121,14 +135,19 @@ def test_the_reference_puts_treasure_and_agent_where_the_published_game_does(id)
     blocks = (states.board == TNT).sum((1, 2))
     assert set(blocks.tolist()) == {6, 7} and abs((blocks == 6).mean() - overwritten) < 0.015
     start = states.board[np.arange(4096), states.x, states.y]
-    assert abs((start == TNT).mean() - on_tnt) < 0.015 and abs((start == TREASURE).mean() - on_treasure) < 0.01
+    assert (
+        abs((start == TNT).mean() - on_tnt) < 0.015
+        and abs((start == TREASURE).mean() - on_treasure) < 0.01
+    )
 
 
 def test_the_agent_moves_one_cell_and_stops_at_the_border_at_a_cost():
     game = make("NavigatorEasy")
     for action, (dx, dy) in enumerate([(0, -1), (0, 1), (-1, 0), (1, 0), (0, 0)]):
         for x, y in ((3, 4), (0, 0), (7, 7)):
-            new, reward, terminated, truncated = step(game, chart(game, [(5, 5)], (1, 6), x=x, y=y), action)
+            new, reward, terminated, truncated = step(
+                game, chart(game, [(5, 5)], (1, 6), x=x, y=y), action
+            )
             assert (int(new.x), int(new.y)) == (min(max(x + dx, 0), 7), min(max(y + dy, 0), 7))
             assert (int(new.timestep), terminated, truncated) == (1, False, False)
             assert reward == pytest.approx(-0.5 / 64)
@@ -196,7 +215,10 @@ def test_the_return_range_is_attained(rules):
 
 
 @settings(max_examples=8, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), actions=hnp.arrays(np.int32, (30, 16), elements=st.integers(0, 4)))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    actions=hnp.arrays(np.int32, (30, 16), elements=st.integers(0, 4)),
+)
 def test_any_play_ends_as_its_path_says(seed, actions):
     """The end and the return of an episode follow from the path alone."""
     game = batched("NavigatorEasy")
@@ -215,18 +237,26 @@ def test_any_play_ends_as_its_path_says(seed, actions):
     assert np.array_equal(batch.state.board, board)
 
 
-@pytest.mark.parametrize(("id", "size"), [("NavigatorEasy", 256), ("NavigatorMedium", 128), ("NavigatorHard", 128)])
+@pytest.mark.parametrize(
+    ("id", "size"), [("NavigatorEasy", 256), ("NavigatorMedium", 128), ("NavigatorHard", 128)]
+)
 def test_map_and_agent_can_be_read_back(id, size):
-    """From every frame of the MDP and the first of the POMDP; afterwards the latter shows the agent on an empty map."""
+    """From every frame of the MDP and the first of the POMDP; afterwards the latter shows the agent
+    on an empty map.
+    """
     game, compiled, side = make(id, obs_size=size), batched(id, obs_size=size), SIDES[id]
     batch = compiled.init(env_keys(4, 8), jnp.zeros(8, bool))
     for timestep in (0, 1):
         # At the second look the agent stands on TNT in four envs, on the treasure in the others.
         board = np.asarray(batch.state.board).reshape(8, -1)
         if timestep:
-            place = np.where(np.arange(8) < 4, (board == TNT).argmax(1), (board == TREASURE).argmax(1)).astype(np.int32)
+            place = np.where(
+                np.arange(8) < 4, (board == TNT).argmax(1), (board == TREASURE).argmax(1)
+            ).astype(np.int32)
             batch = batch._replace(
-                state=batch.state._replace(x=place // side, y=place % side, timestep=jnp.ones(8, jnp.int32))
+                state=batch.state._replace(
+                    x=place // side, y=place % side, timestep=jnp.ones(8, jnp.int32)
+                )
             )
         agent = np.asarray(batch.state.x) * side + np.asarray(batch.state.y)
         for partial in (False, True):
@@ -258,11 +288,17 @@ def test_every_visible_variable_changes_the_mdp_picture():
     game = make("NavigatorEasy")
     base = chart(game, [(3, 3)], (5, 5))
     frame = draw(game, base, False)
-    boards = [base.board.at[0, 0].set(kind) for kind in (TNT, TREASURE)] + [base.board.at[3, 3].set(FREE)]
+    boards = [base.board.at[0, 0].set(kind) for kind in (TNT, TREASURE)] + [
+        base.board.at[3, 3].set(FREE)
+    ]
     for changes in ({"x": 3}, {"y": 1}, *({"board": board} for board in boards)):
-        changed = base._replace(**{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()})
+        changed = base._replace(
+            **{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in changes.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), changes
-    assert np.array_equal(frame, draw(game, base._replace(timestep=jnp.int32(9)), False)), "time is not shown"
+    assert np.array_equal(frame, draw(game, base._replace(timestep=jnp.int32(9)), False)), (
+        "time is not shown"
+    )
 
 
 @pytest.mark.parametrize("size", [128, 256])
@@ -275,16 +311,28 @@ def test_things_have_their_colours_and_show_around_the_agent(id, size):
         return (tiles[kind] == colour).all(-1).mean()
 
     assert share(FREE, MAUVE) == 1
-    assert 0.5 < share(TNT, RED) < 0.75 and share(TNT, (255, 255, 255)) > 0.1 and share(TNT, (0, 0, 0)) > 0.05
-    assert 0.55 < share(TREASURE, SKY) < 0.85 and share(TREASURE, SKY) + share(TREASURE, MAUVE) == pytest.approx(1)
+    assert (
+        0.5 < share(TNT, RED) < 0.75
+        and share(TNT, (255, 255, 255)) > 0.1
+        and share(TNT, (0, 0, 0)) > 0.05
+    )
+    assert 0.55 < share(TREASURE, SKY) < 0.85 and share(TREASURE, SKY) + share(
+        TREASURE, MAUVE
+    ) == pytest.approx(1)
     for kind, colour, least in ((FREE, MAUVE, 0.4), (TNT, RED, 0.25), (TREASURE, SKY, 0.15)):
         assert 0.28 < share(KINDS + kind, YELLOW) < 0.55 and share(KINDS + kind, colour) > least
     for tile in tiles:
         yellow = (tile == YELLOW).all(-1)
-        assert np.array_equal(yellow, yellow[::-1]) and np.array_equal(yellow, yellow.T), "a square in the middle"
+        assert np.array_equal(yellow, yellow[::-1]) and np.array_equal(yellow, yellow.T), (
+            "a square in the middle"
+        )
     for tile in tiles[:KINDS]:
         red, sky = (tile == RED).all(-1), (tile == SKY).all(-1)
-        assert np.array_equal(red, red[::-1]) and np.array_equal(sky, sky[::-1]) and np.array_equal(sky, sky[:, ::-1])
+        assert (
+            np.array_equal(red, red[::-1])
+            and np.array_equal(sky, sky[::-1])
+            and np.array_equal(sky, sky[:, ::-1])
+        )
 
 
 def test_path_lengths_equal_breadth_first_search():
@@ -308,9 +356,13 @@ def test_few_maps_are_walled_off(id):
     assert length.min() == 1
 
 
-@pytest.mark.parametrize(("id", "rules"), [("NavigatorEasy", "default"), ("NavigatorHard", "reference")])
+@pytest.mark.parametrize(
+    ("id", "rules"), [("NavigatorEasy", "default"), ("NavigatorHard", "reference")]
+)
 def test_oracles_walk_the_shortest_path_with_and_without_the_map(id, rules):
-    """The return is 1 - 0.5 d / cells; memory of the first frame is worth as much as the whole state."""
+    """The return is 1 - 0.5 d / cells; memory of the first frame is worth as much as the whole
+    state.
+    """
     game = make(id, rules=rules)
     knowing, first = make_oracle(game, "state"), []
 

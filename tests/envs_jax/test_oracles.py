@@ -13,7 +13,9 @@ from arcade_torch.envs_jax.oracles import (
 )
 
 IDS = [
-    f"{name}{level}" for name in ("CartPole", "NoisyCartPole", "MineSweeper") for level in ("Easy", "Medium", "Hard")
+    f"{name}{level}"
+    for name in ("CartPole", "NoisyCartPole", "MineSweeper")
+    for level in ("Easy", "Medium", "Hard")
 ]
 
 
@@ -35,7 +37,9 @@ def test_the_state_oracle_reaches_the_maximum_in_every_episode(id, rules):
     ],
 )
 def test_the_frames_oracle_recovers_most_of_it(id, least):
-    """Not all: arrows are coarse or noisy in CartPole, and the first sweeps of a minefield are guesses."""
+    """Not all: arrows are coarse or noisy in CartPole, and the first sweeps of a minefield are
+    guesses.
+    """
     returns = oracle_return(make(id), "frames", episodes=128)
     assert returns.mean() > least
 
@@ -62,7 +66,9 @@ def test_blocks_do_not_change_what_a_deterministic_player_reaches():
     game = make("MineSweeperEasy")
     whole = play(game, make_oracle(game, "frames"), 96, seed=3, frames=True, block=96)
     parts = play(game, make_oracle(game, "frames"), 96, seed=3, frames=True, block=32)
-    assert np.array_equal(whole.returns, parts.returns) and np.array_equal(whole.lengths, parts.lengths)
+    assert np.array_equal(whole.returns, parts.returns) and np.array_equal(
+        whole.lengths, parts.lengths
+    )
 
 
 def test_bad_questions_are_refused():

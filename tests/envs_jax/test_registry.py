@@ -23,12 +23,20 @@ def test_a_bare_name_means_the_newest_version():
 
 @pytest.mark.parametrize("level", ["Easy", "Medium", "Hard"])
 def test_noisy_pole_is_an_alias(level):
-    assert resolve_id(f"NoisyPole{level}") == resolve_id(f"NoisyPole{level}-v0") == f"NoisyCartPole{level}-v0"
+    assert (
+        resolve_id(f"NoisyPole{level}")
+        == resolve_id(f"NoisyPole{level}-v0")
+        == f"NoisyCartPole{level}-v0"
+    )
 
 
 @pytest.mark.parametrize(
     ("wrong", "near"),
-    [("CartPole", "CartPole"), ("minesweepereasy", "MineSweeperEasy"), ("NoisyPoleEsy", "NoisyPoleEasy")],
+    [
+        ("CartPole", "CartPole"),
+        ("minesweepereasy", "MineSweeperEasy"),
+        ("NoisyPoleEsy", "NoisyPoleEasy"),
+    ],
 )
 def test_an_unknown_id_names_itself_the_nearest_and_the_list(wrong, near):
     with pytest.raises(ValueError) as error:
@@ -64,7 +72,9 @@ def test_wrong_rules_and_options_are_refused():
 
 
 @pytest.mark.parametrize("wrong", ["-0.5", None, [-0.5], False])
-@pytest.mark.parametrize(("id", "option"), [("MineSweeperEasy", "mine_reward"), ("SkittlesEasy", "hit_reward")])
+@pytest.mark.parametrize(
+    ("id", "option"), [("MineSweeperEasy", "mine_reward"), ("SkittlesEasy", "hit_reward")]
+)
 def test_a_penalty_that_is_no_number_is_refused(id, option, wrong):
     with pytest.raises(TypeError) as error:
         make(id, **{option: wrong})
@@ -96,7 +106,9 @@ def test_registering_needs_a_version_and_a_free_name():
 def test_no_name_of_a_game_can_be_given_to_another(monkeypatch, taken):
     forget_games(monkeypatch)
     before, meant = registered_ids(), resolve_id(taken)
-    with pytest.raises(ValueError, match=f"the name '{taken}' belongs to the game '{meant[:-3]}' already"):
+    with pytest.raises(
+        ValueError, match=f"the name '{taken}' belongs to the game '{meant[:-3]}' already"
+    ):
         register("FooEasy-v0", "cartpole:CartPole", ["Foo", taken])
     with pytest.raises(ValueError, match="the name 'NoisyPoleEasy' belongs"):
         register("NoisyPoleEasy-v1", "cartpole:CartPole")

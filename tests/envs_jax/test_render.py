@@ -36,7 +36,10 @@ def ink(picture):
 
 def test_every_digit_and_letter_is_a_five_by_five_pattern_of_its_own():
     patterns = [*DIGITS, *LETTERS.values()]
-    assert all(len(rows) == 5 and all(len(row) == 5 and set(row) <= {"0", "1"} for row in rows) for rows in patterns)
+    assert all(
+        len(rows) == 5 and all(len(row) == 5 and set(row) <= {"0", "1"} for row in rows)
+        for rows in patterns
+    )
     assert len(set(DIGITS)) == 10 and len(set(LETTERS.values())) == 26
 
 
@@ -50,11 +53,14 @@ def test_a_rectangle_is_exclusive_at_its_far_edges():
 
 
 def test_shapes_have_the_area_they_ought_to_have():
-    assert ink(disc(blank(100, 100, BLACK), 50, 50, 30, WHITE)).sum() == pytest.approx(np.pi * 900, rel=0.01)
+    assert ink(disc(blank(100, 100, BLACK), 50, 50, 30, WHITE)).sum() == pytest.approx(
+        np.pi * 900, rel=0.01
+    )
     square = [(20, 20), (80, 20), (80, 80), (20, 80)]
     assert ink(polygon(blank(100, 100, BLACK), square, WHITE)).sum() == 3600
     assert np.array_equal(
-        polygon(blank(100, 100, BLACK), square[::-1], WHITE), polygon(blank(100, 100, BLACK), square, WHITE)
+        polygon(blank(100, 100, BLACK), square[::-1], WHITE),
+        polygon(blank(100, 100, BLACK), square, WHITE),
     )
     quarter = ink(arc(blank(100, 100, BLACK), 50, 50, 20, 40, 0, np.pi / 2, WHITE))
     assert quarter.sum() == pytest.approx(np.pi * (1600 - 400) / 4, rel=0.02)
@@ -78,7 +84,10 @@ def test_the_longest_name_fits_and_is_centred(size):
 def test_numbers_are_centred_distinct_and_inside_their_field(size):
     pictures = number_pictures(size, 601, BLACK, WHITE)
     layout = TEXT[size]
-    assert pictures.shape[1:3] == (layout.field_y[1] - layout.field_y[0], layout.field_x[1] - layout.field_x[0])
+    assert pictures.shape[1:3] == (
+        layout.field_y[1] - layout.field_y[0],
+        layout.field_x[1] - layout.field_x[0],
+    )
     assert len(np.unique(pictures.reshape(602, -1), axis=0)) == 602
     columns = np.flatnonzero(ink(pictures[600]).any(0))
     width = 3 * {128: 10, 256: 15}[size] + 2 * 2
@@ -129,7 +138,9 @@ def test_boards_stand_where_the_published_ones_do(size, cells, side, tile, offse
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), places=st.integers(0, 5))
 def test_layers_draw_what_one_place_after_the_other_draws(seed, places):
-    """Places may overlap, and reach over the same lines; a grid and a slot may have the same pictures."""
+    """Places may overlap, and reach over the same lines; a grid and a slot may have the same
+    pictures.
+    """
     rng, size = np.random.default_rng(seed), 24
     background = rng.integers(0, 256, (size, size, 3), np.uint8)
     made, codes = [], []
@@ -149,15 +160,28 @@ def test_layers_draw_what_one_place_after_the_other_draws(seed, places):
             height, width = pictures.shape[1:3]
             for row, column in np.ndindex(*np.atleast_2d(code[env]).shape):
                 y, x = place.y + height * row, place.x + width * column
-                expected[y : y + height, x : x + width] = pictures[np.atleast_2d(code[env])[row, column]]
+                expected[y : y + height, x : x + width] = pictures[
+                    np.atleast_2d(code[env])[row, column]
+                ]
         assert np.array_equal(frame, expected)
 
 
 def test_mixed_places_change_what_lies_below_them():
     below = Slot(np.stack([blank(2, 4, BLACK), blank(2, 4, WHITE)]), 1, 1)
-    mixed = TileGrid(np.array([0, 255, 15], np.uint8).reshape(3, 1, 1, 1).repeat(3, -1), 2, 1, mixed=True)
+    mixed = TileGrid(
+        np.array([0, 255, 15], np.uint8).reshape(3, 1, 1, 1).repeat(3, -1), 2, 1, mixed=True
+    )
     layers = Layers(blank(8, 8, BLACK), below, mixed)
-    assert layers.draw(1, jnp.array([[0, 1, 2]]))[1, :, 0].tolist() == [0, 255, 255, 0, 240, 0, 0, 0]
+    assert layers.draw(1, jnp.array([[0, 1, 2]]))[1, :, 0].tolist() == [
+        0,
+        255,
+        255,
+        0,
+        240,
+        0,
+        0,
+        0,
+    ]
     assert layers.draw(0, jnp.array([[1, 2, 0]]))[1, :, 0].tolist() == [0, 0, 255, 15, 0, 0, 0, 0]
 
 

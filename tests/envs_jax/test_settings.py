@@ -1,4 +1,6 @@
-"""The games give the same bits whatever the settings of JAX are, and refuse keys of another kind in one line."""
+"""The games give the same bits whatever the settings of JAX are, and refuse keys of another kind in
+one line.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +38,9 @@ def test_all_configurations_have_the_same_bits_in_a_shell_with_other_settings():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flags", ["--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_enable_fast_math=false"])
+@pytest.mark.parametrize(
+    "flags", ["--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_enable_fast_math=false"]
+)
 def test_the_games_have_the_same_bits_with_other_flags_of_xla(flags, cache, expected):
     assert digests.in_process({"XLA_FLAGS": flags}, IDS, cache, sizes=[128]) == expected
 
@@ -56,7 +60,9 @@ OTHERS = {
 
 @pytest.fixture(params=OTHERS)
 def other_setting(request):
-    """Change one setting of this process for a test; gives what takes the settings that all others have."""
+    """Change one setting of this process for a test; gives what takes the settings that all others
+    have.
+    """
     before = getattr(jax.config, request.param)
 
     def change(to_other=True):
@@ -128,7 +134,9 @@ def test_the_adapter_gives_the_same_under_x64():
     def play():
         obs, state = env.reset(env_keys(0, 1)[0], params)
         stepped = env.step(env_keys(1, 1)[0], state, jnp.asarray(3), params)
-        return jax.tree.map(np.asarray, (obs, state, stepped, env.action_space().sample(env_keys(2, 1)[0])))
+        return jax.tree.map(
+            np.asarray, (obs, state, stepped, env.action_space().sample(env_keys(2, 1)[0]))
+        )
 
     before = play()
     with jax.enable_x64(True):
@@ -139,15 +147,22 @@ def test_keys_of_both_styles_give_the_same_episode():
     game = make("MineSweeperEasy")
     env, params = gymnax.make("MineSweeperEasy")
     old, new = jax.random.PRNGKey(4), jax.random.key(4)
-    assert_equal(jax.tree.map(np.asarray, game.reset(old)), jax.tree.map(np.asarray, game.reset(new)))
+    assert_equal(
+        jax.tree.map(np.asarray, game.reset(old)), jax.tree.map(np.asarray, game.reset(new))
+    )
     one, two = (jax.tree.map(np.asarray, env.reset(key, params)) for key in (old, new))
     assert_equal(one, two)
     batched = BatchedGame(game)
     old, new = env_keys(0, 3), jax.random.wrap_key_data(env_keys(0, 3), impl="threefry2x32")
-    one, two = (jax.tree.map(np.asarray, batched.init(keys, jnp.zeros(3, bool))) for keys in (old, new))
+    one, two = (
+        jax.tree.map(np.asarray, batched.init(keys, jnp.zeros(3, bool))) for keys in (old, new)
+    )
     assert_equal(one, two)
     states = jax.jit(jax.vmap(game.reset))(new)
-    assert_equal(jax.tree.map(np.asarray, states), jax.tree.map(np.asarray, jax.jit(jax.vmap(game.reset))(old)))
+    assert_equal(
+        jax.tree.map(np.asarray, states),
+        jax.tree.map(np.asarray, jax.jit(jax.vmap(game.reset))(old)),
+    )
 
 
 @pytest.mark.parametrize(

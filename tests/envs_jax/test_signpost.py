@@ -19,10 +19,12 @@ LEVELS = pytest.mark.parametrize("id", LENGTHS)
 
 
 def best_without_memory(corridor):
-    """Highest expected return of a player that sees the sign at first and from then on place and last action alone.
+    """Highest expected return of a player that sees the sign at first and from then on place and
+    last action alone.
 
-    What it did with each of the four signs is a tuple of four last actions; a later step maps equal last actions to
-    equal actions, and at the gate each class of equal last actions can be right about one sign.
+    What it did with each of the four signs is a tuple of four last actions; a later step maps equal
+    last actions to equal actions, and at the gate each class of equal last actions can be right
+    about one sign.
     """
     tuples = list(itertools.product(range(5), repeat=4))
     cost = {actions: sum(a != RIGHT for a in actions) / 4 / corridor for actions in tuples}
@@ -90,7 +92,9 @@ def test_the_pomdp_shows_the_sign_in_the_first_frame_alone(id, size):
             assert game.screen.sign.read(full)[0] == sign
             assert game.screen.sign.read(partial)[0] == (sign if x == 0 else BLANK)
             cells = game.screen.corridor.read(full, 1, game.level.cells)[0, 0]
-            np.testing.assert_array_equal(cells, game.screen.corridor.read(partial, 1, game.level.cells)[0, 0])
+            np.testing.assert_array_equal(
+                cells, game.screen.corridor.read(partial, 1, game.level.cells)[0, 0]
+            )
             assert cells.tolist().index(max(cells)) == x and (cells % KINDS)[-1] == GATE
 
 

@@ -1,4 +1,6 @@
-"""Skittles, checked against a plain simulation of its grid, and its flicker against what the paper says of it."""
+"""Skittles, checked against a plain simulation of its grid, and its flicker against what the paper
+says of it.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,12 @@ def step_many(game, state, action, count, seed=0):
 def step(game, state, action):
     """One step with some key: state, reward, terminated, truncated."""
     new, reward, terminated, truncated = step_many(game, state, action, 2)
-    return jax.tree.map(lambda leaf: leaf[0], new), float(reward[0]), bool(terminated[0]), bool(truncated[0])
+    return (
+        jax.tree.map(lambda leaf: leaf[0], new),
+        float(reward[0]),
+        bool(terminated[0]),
+        bool(truncated[0]),
+    )
 
 
 def falling(game, blocks, **changes):
@@ -47,7 +54,9 @@ def falling(game, blocks, **changes):
 @pytest.mark.parametrize("id", LANES)
 def test_episodes_start_with_an_empty_grid_and_the_agent_anywhere_in_its_lane(id):
     lane = list(LANES[id])
-    fresh = jax.tree.map(np.asarray, batched(id).init(env_keys(0, 4096), jnp.zeros(4096, bool)).state)
+    fresh = jax.tree.map(
+        np.asarray, batched(id).init(env_keys(0, 4096), jnp.zeros(4096, bool)).state
+    )
     assert (fresh.column == NO_BLOCK).all() and (fresh.colour == 0).all() and fresh.safe.all()
     count = np.bincount(fresh.x, minlength=10)
     assert count.sum() == count[lane].sum()
@@ -58,7 +67,9 @@ def test_episodes_start_with_an_empty_grid_and_the_agent_anywhere_in_its_lane(id
 
 @settings(max_examples=8, deadline=None)
 @given(
-    game=st.sampled_from([("SkittlesEasy", "default"), ("SkittlesMedium", "default"), (HARD, "reference")]),
+    game=st.sampled_from(
+        [("SkittlesEasy", "default"), ("SkittlesMedium", "default"), (HARD, "reference")]
+    ),
     seed=st.integers(0, 2**31),
     actions=hnp.arrays(np.int32, (20, 16), elements=st.integers(0, 4)),
 )
@@ -139,7 +150,9 @@ def test_nobody_is_hit_before_step_ten_and_an_idle_agent_lives_as_long_as_chance
 
 
 def survivors(columns, lane):
-    """Where somebody who starts anywhere in the lane can be after each row, by plain sets; columns: int [T]."""
+    """Where somebody who starts anywhere in the lane can be after each row, by plain sets; columns:
+    int [T].
+    """
     alive, before, history = set(lane), None, []
     for block in columns:
         alive = {c for c in lane if {c - 1, c, c + 1} & alive} - {before, int(block)}
@@ -168,7 +181,9 @@ def test_in_the_reference_some_episodes_have_no_way_through():
 
 @pytest.mark.parametrize("rules", ["default", "reference"])
 def test_a_block_that_would_close_the_last_way_is_not_drawn(rules):
-    """Survivors are at the left edge, the newest block beside them: only a block on the edge would close the way."""
+    """Survivors are at the left edge, the newest block beside them: only a block on the edge would
+    close the way.
+    """
     game = make(HARD, rules=rules)
     state = falling(game, {0: 3}, safe=np.arange(6) == 0)
     count = np.bincount(step_many(game, state, 0, 2048)[0].column[:, 0], minlength=10)
@@ -180,7 +195,9 @@ def test_a_block_that_would_close_the_last_way_is_not_drawn(rules):
 
 
 def masks(rules, envs=512, steps=30):
-    """Which blocks the POMDP shows in many episodes: bool [steps, envs, row], and the columns [steps, envs, row]."""
+    """Which blocks the POMDP shows in many episodes: bool [steps, envs, row], and the columns
+    [steps, envs, row].
+    """
     states = Walk(make(HARD, rules=rules), random_actions(steps, envs, seed=6), seed=6).states
     visible = np.asarray(jax.jit(jax.vmap(jax.vmap(shown)))(states))
     return visible[1:], states.column[1:]
@@ -195,7 +212,9 @@ def test_half_of_all_blocks_are_shown_and_every_episode_flickers_in_its_own_way(
     assert np.abs(each_row - 0.5).max() < 0.03
     later, earlier = visible[1:][block[1:]], visible[:-1][block[1:]]
     assert abs((later == earlier).mean() - 0.5) < 0.02, "times ought to be independent"
-    assert abs((visible[:, 0] == visible[:, 1]).mean() - 0.5) < 0.2, "episodes ought to be independent"
+    assert abs((visible[:, 0] == visible[:, 1]).mean() - 0.5) < 0.2, (
+        "episodes ought to be independent"
+    )
 
 
 def test_in_the_reference_a_cell_is_hidden_at_the_same_times_in_every_episode():
@@ -214,7 +233,9 @@ def test_blocks_colours_and_agent_can_be_read_back_from_both_twins(size):
     for t, action in enumerate(random_actions(24, 16, seed=8)):
         if t in (0, 6, 23):
             state = jax.tree.map(np.asarray, batch.state)
-            expected = np.where(state.column[..., None] == np.arange(10), 1 + state.colour[..., None], 0)
+            expected = np.where(
+                state.column[..., None] == np.arange(10), 1 + state.colour[..., None], 0
+            )
             visible = np.asarray(jax.vmap(shown)(batch.state))[..., None]
             for partial, codes in ((False, expected), (True, expected * visible)):
                 codes = codes.copy()
@@ -238,7 +259,12 @@ def test_every_visible_variable_changes_the_mdp_picture():
     game = make(HARD)
     base = falling(game, {4: 3}, x=4, time=7)
     frame = draw(game, base, False)
-    for changes in ({"column": base.column.at[4].set(5)}, {"colour": base.colour.at[4].set(3)}, {"x": 5}, {"time": 8}):
+    for changes in (
+        {"column": base.column.at[4].set(5)},
+        {"colour": base.colour.at[4].set(3)},
+        {"x": 5},
+        {"time": 8},
+    ):
         assert not np.array_equal(frame, draw(game, base._replace(**changes), False)), changes
     assert np.array_equal(frame, draw(game, base._replace(flicker_key=base.flicker_key + 1), False))
 
@@ -248,7 +274,9 @@ def test_the_outlook_of_a_set_is_the_chance_of_a_way_through():
     worth = outlook(6, rounds=1)
     assert worth.shape == (64, 7)
     assert worth[0].max() == 0 and worth[-1].min() == 1
-    assert worth[0b000001, 1] == pytest.approx(5 / 6), "only the edge is left, one block of six closes it"
+    assert worth[0b000001, 1] == pytest.approx(5 / 6), (
+        "only the edge is left, one block of six closes it"
+    )
     assert worth[0b000001, 6] == 1
 
 
@@ -265,9 +293,13 @@ def test_the_planner_steps_out_of_the_way():
     assert list(planner.plan(np.full(4, 5), column)[1:3]) == [3, 2]
 
 
-@pytest.mark.parametrize(("id", "state", "frames"), [("SkittlesEasy", 0.999, 0.95), (HARD, 0.985, 0.92)])
+@pytest.mark.parametrize(
+    ("id", "state", "frames"), [("SkittlesEasy", 0.999, 0.95), (HARD, 0.985, 0.92)]
+)
 def test_oracles_survive_nearly_always(id, state, frames):
-    """With all blocks known only what is beyond sight can trap it; of the frames' blocks one in 512 is never seen."""
+    """With all blocks known only what is beyond sight can trap it; of the frames' blocks one in 512
+    is never seen.
+    """
     assert oracle_return(make(id), "state", episodes=128).mean() >= state
     assert oracle_return(make(id), "frames", episodes=128).mean() >= frames
 

@@ -1,4 +1,6 @@
-"""Tetris, checked against a plain simulation of single cells and against what its pictures ought to tell."""
+"""Tetris, checked against a plain simulation of single cells and against what its pictures ought to
+tell.
+"""
 
 import re
 from dataclasses import astuple
@@ -62,21 +64,27 @@ ALMOST = "####.#####"
 
 
 def messy(batch, seed=0):
-    """The batch with piles that have gaps and complete rows, as if a piece had just locked in each."""
+    """The batch with piles that have gaps and complete rows, as if a piece had just locked in
+    each.
+    """
     random = np.random.default_rng(seed)
     piles = random.integers(1, 8, (ENVS, 20, 10)) * (random.random((ENVS, 20, 10)) < 0.8)
     piles[np.arange(ENVS)[:, None], np.arange(20), random.integers(0, 10, (ENVS, 20))] = 0
     piles *= np.arange(20)[:, None] >= random.integers(5, 18, ENVS)[:, None, None]
     for pile, count in zip(piles, random.integers(0, 5, ENVS), strict=True):
         pile[random.choice(np.arange(10, 20), count, replace=False)] = 1 + count
-    state = batch.state._replace(board=jnp.asarray(piles, jnp.int8), just_locked=jnp.ones(ENVS, bool))
+    state = batch.state._replace(
+        board=jnp.asarray(piles, jnp.int8), just_locked=jnp.ones(ENVS, bool)
+    )
     return batch._replace(state=state)
 
 
 def simulate(state, action, level, solid):
     """The law once more, cell by cell, for one env; returns what is to be compared."""
     grid, lines, reward = state.board.copy(), int(state.lines), 0.0
-    piece, rot, px, py, age = (int(v) for v in (state.piece, state.rot, state.px, state.py, state.frames_since_spawn))
+    piece, rot, px, py, age = (
+        int(v) for v in (state.piece, state.rot, state.px, state.py, state.frames_since_spawn)
+    )
     over = False
 
     def free(rot, px, py):
@@ -92,7 +100,9 @@ def simulate(state, action, level, solid):
         piece, rot, px, py, age = int(state.next[0]), 0, 3, 0, 0
         over = not free(rot, px, py)
 
-    target = {TURN: ((rot + 1) % 4, px), LEFT: (rot, px - 1), RIGHT: (rot, px + 1)}.get(action, (rot, px))
+    target = {TURN: ((rot + 1) % 4, px), LEFT: (rot, px - 1), RIGHT: (rot, px + 1)}.get(
+        action, (rot, px)
+    )
     if free(*target, py):
         rot, px = target
     length = level.fall if action != DROP else (level.drop if age else 1)
@@ -109,7 +119,11 @@ def simulate(state, action, level, solid):
     if over and lines < 10 and (solid or time < 3000):
         reward -= 1
     flags = (over or lines >= 10, time >= 3000)
-    return (grid.tolist(), piece, rot, px, py, lines, locks, min(age + 1, 10), time, over), reward, flags
+    return (
+        (grid.tolist(), piece, rot, px, py, lines, locks, min(age + 1, 10), time, over),
+        reward,
+        flags,
+    )
 
 
 @pytest.mark.parametrize("rules", BOTH_RULES)
@@ -124,10 +138,19 @@ def test_every_step_equals_a_plain_simulation(id, rules):
         batch, outcome = game.step(batch, action)
         after, outcome = jax.tree.map(np.asarray, (batch.state, outcome))
         for env in np.flatnonzero(running):
-            old, new = (jax.tree.map(lambda leaf, env=env: leaf[env], states) for states in (before, after))
-            expected, reward, flags = simulate(old, int(action[env]), LEVELS[id], rules == "default")
-            got = (new.board.tolist(), *(v.item() for v in (new.piece, new.rot, new.px, new.py, new.lines)))
-            got += tuple(v.item() for v in (new.just_locked, new.frames_since_spawn, new.time, new.terminal))
+            old, new = (
+                jax.tree.map(lambda leaf, env=env: leaf[env], states) for states in (before, after)
+            )
+            expected, reward, flags = simulate(
+                old, int(action[env]), LEVELS[id], rules == "default"
+            )
+            got = (
+                new.board.tolist(),
+                *(v.item() for v in (new.piece, new.rot, new.px, new.py, new.lines)),
+            )
+            got += tuple(
+                v.item() for v in (new.just_locked, new.frames_since_spawn, new.time, new.terminal)
+            )
             assert got == expected
             assert abs(outcome.reward[env] - reward) < 1e-6
             assert (outcome.terminated[env], outcome.truncated[env]) == flags
@@ -149,7 +172,9 @@ def test_each_rotation_turns_the_piece_clockwise():
 
 
 def dealt(id, rules, envs=256, count=40):
-    """The pieces that come if each locks at once, and the previews beside them: [count, envs], [count, envs, P]."""
+    """The pieces that come if each locks at once, and the previews beside them: [count, envs],
+    [count, envs, P].
+    """
     level = LEVELS[id]
 
     def run(keys):
@@ -198,7 +223,9 @@ def test_every_order_of_the_bag_is_equally_likely():
     assert (np.sort(bags) == np.arange(7)).all()
     for place in range(7):
         observed = np.bincount(bags[:, place], minlength=7)
-        assert ((observed - 8192 / 7) ** 2 / (8192 / 7)).sum() < 27.9, "chi-square, 6 degrees, p = 0.0001"
+        assert ((observed - 8192 / 7) ** 2 / (8192 / 7)).sum() < 27.9, (
+            "chi-square, 6 degrees, p = 0.0001"
+        )
     pairs = np.bincount(bags[:, 0] * 7 + bags[:, 1], minlength=49)[~np.eye(7, dtype=bool).ravel()]
     assert ((pairs - 8192 / 42) ** 2 / (8192 / 42)).sum() < 85, "chi-square, 41 degrees"
 
@@ -233,7 +260,9 @@ def test_a_soft_drop_is_one_cell_at_the_step_of_the_spawn_and_replaces_gravity()
 def test_the_levels_are_those_of_the_page():
     page = (Path(__file__).parents[2] / "docs/games/tetris.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (?:previews|cells .*) \| (\d) \| (\d) \| (\d) \|$", page, re.MULTILINE)
-    assert [tuple(map(int, level)) for level in zip(*rows, strict=True)] == list(map(astuple, LEVELS.values()))
+    assert [tuple(map(int, level)) for level in zip(*rows, strict=True)] == list(
+        map(astuple, LEVELS.values())
+    )
 
 
 @pytest.mark.parametrize(("action", "edge"), [(LEFT, -1), (RIGHT, 8)])
@@ -256,8 +285,12 @@ def test_a_row_shows_for_one_frame_and_pays_at_the_next_step():
     assert (lock.board[18:] > 0).all() and lock.lines == 0 and lock.piece == I
     new, reward, terminated, truncated = step(game, lock, LEFT)
     assert reward == pytest.approx(0.2) and not (terminated or truncated) and new.lines == 2
-    assert (new.piece, new.px, new.py, new.rot) == (T, 2, 1, 0), "the new piece obeys, and falls, at once"
-    assert np.array_equal(new.board[19], [3, 0, 0, 0, 1, 0, 0, 0, 0, 0]) and (new.board > 0).sum() == 3
+    assert (new.piece, new.px, new.py, new.rot) == (T, 2, 1, 0), (
+        "the new piece obeys, and falls, at once"
+    )
+    assert (
+        np.array_equal(new.board[19], [3, 0, 0, 0, 1, 0, 0, 0, 0, 0]) and (new.board > 0).sum() == 3
+    )
 
 
 @pytest.mark.parametrize(("rules", "paid"), [("default", 0.1), ("reference", 0.4)])
@@ -285,7 +318,11 @@ def test_a_new_piece_without_room_ends_the_game(rules):
 @pytest.mark.parametrize(("rules", "reward"), [("default", -1.0), ("reference", 0.0)])
 def test_topping_out_at_the_limit_costs_one_except_in_the_reference(rules, reward):
     game = make("TetrisEasy", rules=rules)
-    assert step(game, one(game, board=TOPPED, just_locked=True, time=2999), WAIT)[1:] == (reward, True, True)
+    assert step(game, one(game, board=TOPPED, just_locked=True, time=2999), WAIT)[1:] == (
+        reward,
+        True,
+        True,
+    )
 
 
 @pytest.mark.parametrize("rules", BOTH_RULES)
@@ -293,8 +330,12 @@ def test_ten_lines_win_even_if_the_next_piece_has_no_room(rules):
     game = make("TetrisEasy", rules=rules)
     pile = TOPPED.copy()
     pile[0], pile[19] = pile[1], 1
-    new, reward, terminated, truncated = step(game, one(game, board=pile, lines=9, just_locked=True), WAIT)
-    assert new.terminal and reward == pytest.approx(0.1) and (terminated, truncated) == (True, False)
+    new, reward, terminated, truncated = step(
+        game, one(game, board=pile, lines=9, just_locked=True), WAIT
+    )
+    assert (
+        new.terminal and reward == pytest.approx(0.1) and (terminated, truncated) == (True, False)
+    )
 
 
 @pytest.mark.parametrize("rules", BOTH_RULES)
@@ -306,18 +347,25 @@ def test_the_time_limit_truncates_but_does_not_terminate(id, rules):
     assert step(game, one(game, time=2999), WAIT)[1:] == (0, False, True)
     row = one(game, board=board(ALMOST), piece=I, rot=1, px=2, py=15, time=2999)
     new, reward, terminated, truncated = step(game, row, WAIT)
-    assert (new.board[19] > 0).all() and (reward, terminated, truncated) == (0, False, True), "its reward is lost"
+    assert (new.board[19] > 0).all() and (reward, terminated, truncated) == (0, False, True), (
+        "its reward is lost"
+    )
 
 
 @settings(max_examples=6)
-@given(actions=hnp.arrays(np.int32, (60, ENVS), elements=st.integers(0, 4)), seed=st.integers(0, 2**32 - 1))
+@given(
+    actions=hnp.arrays(np.int32, (60, ENVS), elements=st.integers(0, 4)),
+    seed=st.integers(0, 2**32 - 1),
+)
 def test_blocks_are_neither_lost_nor_made(actions, seed):
     """Four cells a locked piece, minus ten a line; the falling piece never stands in the pile."""
     states = Walk(make("TetrisHard"), actions, seed=seed).states
     over = np.logical_or.accumulate(states.terminal)
     locked = np.cumsum(states.just_locked, 0)
     cleared = 10 * states.lines
-    assert np.array_equal(((states.board > 0).sum((2, 3)) - 4 * locked + cleared)[~over], np.zeros((~over).sum()))
+    assert np.array_equal(
+        ((states.board > 0).sum((2, 3)) - 4 * locked + cleared)[~over], np.zeros((~over).sum())
+    )
     for t, env in zip(*np.nonzero(~over & ~states.just_locked), strict=True):
         cells = np.argwhere(SHAPES[states.piece[t, env], states.rot[t, env]])
         rows, columns = cells[:, 0] + states.py[t, env], cells[:, 1] + states.px[t, env]
@@ -335,17 +383,24 @@ def expected_codes(state, partial):
 
 @pytest.mark.parametrize("size", [128, 256])
 def test_both_pictures_can_be_read_back(size):
-    """Pile, piece, bands and previews from the MDP picture; the same without the pile from the POMDP picture."""
+    """Pile, piece, bands and previews from the MDP picture; the same without the pile from the
+    POMDP picture.
+    """
     game, walk = make("TetrisEasy", obs_size=size), compiled("TetrisEasy")
     render = jax.jit(jax.vmap(game.render))
     batch = messy(walk.init(env_keys(4, ENVS), jnp.arange(ENVS) % 2 == 0), seed=3)
     running, bands = np.ones(ENVS, bool), 0
     for number, action in enumerate(random_actions(41, ENVS, seed=8)):
         if number % 4 == 0:
-            frames, states = np.asarray(render(batch.state, batch.partial)), jax.tree.map(np.asarray, batch.state)
+            frames, states = (
+                np.asarray(render(batch.state, batch.partial)),
+                jax.tree.map(np.asarray, batch.state),
+            )
             codes = read_board(frames, game.screen)
             for which in range(3):
-                assert np.array_equal(read_preview(frames, game.screen, which), states.next[:, which])
+                assert np.array_equal(
+                    read_preview(frames, game.screen, which), states.next[:, which]
+                )
             for env in np.flatnonzero(running):
                 state = jax.tree.map(lambda leaf, env=env: leaf[env], states)
                 assert np.array_equal(codes[env], expected_codes(state, env % 2 == 0))
@@ -359,7 +414,9 @@ def test_the_pomdp_hides_the_pile_and_nothing_else():
     game = make("TetrisEasy")
     state = one(game, board=board("##.##.####", FULL, "#.#.#.#.##", tile=5), lines=4)
     full, partial = draw(game, state, False), draw(game, state, True)
-    assert np.array_equal(draw(game, state._replace(board=jnp.zeros_like(state.board)), False)[:90], partial[:90])
+    assert np.array_equal(
+        draw(game, state._replace(board=jnp.zeros_like(state.board)), False)[:90], partial[:90]
+    )
     bottom = 14 + 100
     changed = (full != partial).any(-1)
     assert changed.any() and not changed[: bottom - 15].any() and not changed[bottom:].any()
@@ -384,10 +441,19 @@ def test_every_visible_variable_changes_the_mdp_picture():
     base = one(game, board=board("#.#......."), piece=T, py=4, rot=0, next=[S, Z], lines=2)
     frame = draw(game, base, False)
     recoloured = board("#.#.......", tile=4)
-    changes = [{"board": recoloured}, {"board": board("##........")}, {"piece": J}, {"px": 4}, {"py": 5}, {"rot": 1}]
+    changes = [
+        {"board": recoloured},
+        {"board": board("##........")},
+        {"piece": J},
+        {"px": 4},
+        {"py": 5},
+        {"rot": 1},
+    ]
     changes += [{"next": [Z, Z]}, {"next": [S, L]}, {"lines": 13}]
     for change in changes:
-        changed = base._replace(**{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in change.items()})
+        changed = base._replace(
+            **{k: jnp.asarray(v, getattr(base, k).dtype) for k, v in change.items()}
+        )
         assert not np.array_equal(frame, draw(game, changed, False)), change
 
 
@@ -407,7 +473,9 @@ def test_the_well_and_the_previews_stand_where_the_geometry_says(id, size):
     assert len(np.unique(screen.board.atlas[:, cell // 2, cell // 2], axis=0)) == BAND + 1
     score = screen.score.pictures[13, : corner - screen.score.y]
     ink = (screen.score.pictures[13] == np.array([255, 48, 71])).all(-1).sum()
-    assert (score == np.array([255, 48, 71])).all(-1).sum() == ink, "the well does not cover the score"
+    assert (score == np.array([255, 48, 71])).all(-1).sum() == ink, (
+        "the well does not cover the score"
+    )
 
 
 def test_a_plan_ends_where_the_game_takes_it():

@@ -1,4 +1,6 @@
-"""The flag against XLA's wrong sums: set where it is known, needed, and in time; else one line, or nothing."""
+"""The flag against XLA's wrong sums: set where it is known, needed, and in time; else one line, or
+nothing.
+"""
 
 import json
 import os
@@ -23,7 +25,9 @@ sums = jax.jit(jax.vmap(lambda row: ((jnp.eye(3) @ row) ** 2).sum()))(x)
 said = [str(one.message) for one in caught if "issue 39103" in str(one.message)]
 print(json.dumps([os.environ.get("XLA_FLAGS"), said, float(sums[-1])]))
 """
-is_affected = pytest.mark.skipif(xla_flags._jaxlib() not in AFFECTED, reason="this jaxlib computes sums rightly")
+is_affected = pytest.mark.skipif(
+    xla_flags._jaxlib() not in AFFECTED, reason="this jaxlib computes sums rightly"
+)
 
 
 def run(before="", **flags):
@@ -31,7 +35,9 @@ def run(before="", **flags):
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     environment = {**clean, **flags, "JAX_PLATFORMS": "cpu"}
     program = PROGRAM.format(before=before)
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -1,4 +1,6 @@
-"""The table of the campaign: commands, and what is done to their files, folders, streams and processes."""
+"""The table of the campaign: commands, and what is done to their files, folders, streams and
+processes.
+"""
 
 import json
 import os
@@ -47,7 +49,12 @@ READERS = {
     "run/lock": ("train",),
     "run/checkpoints/latest": ("train", "evaluate"),
     "run/checkpoints/frames-000000000192/meta.json": ("train", "evaluate", "record"),
-    "run/checkpoints/frames-000000000192/weights.safetensors": ("train", "evaluate", "record", "analyze"),
+    "run/checkpoints/frames-000000000192/weights.safetensors": (
+        "train",
+        "evaluate",
+        "record",
+        "analyze",
+    ),
     "run/checkpoints/frames-000000000192/trainer.pt": ("train",),
     "replay/replay/window-000000001.safetensors": ("train-replay",),
     "study/study.json": ("report",),
@@ -106,7 +113,9 @@ def cases(seed: int, moments: int) -> Iterator[Case]:
 
 
 def of_files(seed: int) -> Iterator[Case]:
-    """A fault in the place of a file, met by one of the commands that read it; another seed takes other pairs."""
+    """A fault in the place of a file, met by one of the commands that read it; another seed takes
+    other pairs.
+    """
     rng = random.Random(seed)
     for file, readers in READERS.items():
         for fault, spoil in FAULTS.items():
@@ -146,7 +155,10 @@ def _sparse(path: Path, rng: random.Random) -> None:
 
 def _bomb(path: Path, rng: random.Random) -> None:
     """A zip file of many zeros, which is what an npz and a trainer's state are."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("data.pkl", "w") as stream:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("data.pkl", "w") as stream,
+    ):
         for _ in range(256):
             stream.write(bytes(2**20))
 
@@ -174,9 +186,13 @@ FAULTS: dict[str, Callable[[Path, random.Random], None]] = {
     "folder": lambda path, rng: _replaced(path, Path.mkdir),
     "dangling": lambda path, rng: _replaced(path, lambda at: at.symlink_to("nowhere")),
     "loop": lambda path, rng: _replaced(path, lambda at: at.symlink_to(at.name)),
-    "outside": lambda path, rng: _replaced(path, lambda at: at.symlink_to(_outside(at) / "victim.txt")),
+    "outside": lambda path, rng: _replaced(
+        path, lambda at: at.symlink_to(_outside(at) / "victim.txt")
+    ),
     "empty": lambda path, rng: path.write_bytes(b"") and None,
-    "half": lambda path, rng: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]) and None,
+    "half": lambda path, rng: (
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]) and None
+    ),
     "flip": _flipped,
     "values": _values,
     "values-2": _values,
@@ -202,16 +218,39 @@ def of_forgeries() -> Iterator[Case]:
         "window-1.safetensors\n",
         "lock",
     ):
-        yield Case(f"forged/replay/{name!r}", COMMANDS["train-replay"], partial(_forge_window, name=name))
-    for value in ("../../../outside", "{outside}", "frames-000000000192/../frames-000000000192", "", "\n", "/etc"):
         yield Case(
-            f"forged/latest/{value!r}", COMMANDS["train"], partial(_write, file="run/checkpoints/latest", text=value)
+            f"forged/replay/{name!r}", COMMANDS["train-replay"], partial(_forge_window, name=name)
         )
-    for field, size in (("hidden_size", 10**9), ("layers", 10**6), ("hidden_size", -1), ("layers", 1.5)):
+    for value in (
+        "../../../outside",
+        "{outside}",
+        "frames-000000000192/../frames-000000000192",
+        "",
+        "\n",
+        "/etc",
+    ):
+        yield Case(
+            f"forged/latest/{value!r}",
+            COMMANDS["train"],
+            partial(_write, file="run/checkpoints/latest", text=value),
+        )
+    for field, size in (
+        ("hidden_size", 10**9),
+        ("layers", 10**6),
+        ("hidden_size", -1),
+        ("layers", 1.5),
+    ):
         do = partial(_resize, field=field, size=size)
         yield Case(f"forged/size/{field}={size}", COMMANDS["evaluate"], do)
-    for file in ("run/.notes.123", "run/.metrics.csv.123", "run/.config.json.99-abcdef01", "run/thesis.tex"):
-        yield Case(f"users-file/{file}", COMMANDS["train"], partial(_write, file=file, text="precious"))
+    for file in (
+        "run/.notes.123",
+        "run/.metrics.csv.123",
+        "run/.config.json.99-abcdef01",
+        "run/thesis.tex",
+    ):
+        yield Case(
+            f"users-file/{file}", COMMANDS["train"], partial(_write, file=file, text="precious")
+        )
         yield Case(f"users-folder/{file}", COMMANDS["train"], partial(_make_folder, file=file))
 
 
@@ -232,7 +271,9 @@ def _forge_window(work: Path, name: str) -> None:
 
 
 def _write(work: Path, file: str, text: str) -> None:
-    (work / file).write_text(text.format(outside=work.with_name("outside")) if "{outside}" in text else text)
+    (work / file).write_text(
+        text.format(outside=work.with_name("outside")) if "{outside}" in text else text
+    )
 
 
 def _make_folder(work: Path, file: str) -> None:
@@ -247,7 +288,17 @@ def _resize(work: Path, field: str, size: Any) -> None:
         file.write_text(json.dumps(values))
 
 
-WRITERS = ("train", "evaluate", "record", "analyze", "gap-bias", "figure", "list", "report", "study")
+WRITERS = (
+    "train",
+    "evaluate",
+    "record",
+    "analyze",
+    "gap-bias",
+    "figure",
+    "list",
+    "report",
+    "study",
+)
 
 
 def of_folders() -> Iterator[Case]:
@@ -256,12 +307,19 @@ def of_folders() -> Iterator[Case]:
     for command in WRITERS:
         for disk, options in disks.items():
             yield Case(
-                f"folder/{disk}/{command}", COMMANDS[command], partial(_mount, options=options, name=_target(command))
+                f"folder/{disk}/{command}",
+                COMMANDS[command],
+                partial(_mount, options=options, name=_target(command)),
             )
         if command != "train":
-            yield Case(f"folder/file/{command}", COMMANDS[command], partial(_write, file="out", text=""))
+            yield Case(
+                f"folder/file/{command}", COMMANDS[command], partial(_write, file="out", text="")
+            )
         yield Case(
-            f"folder/gone/{command}", COMMANDS[command], moment=0.8, happens=partial(_remove, name=_target(command))
+            f"folder/gone/{command}",
+            COMMANDS[command],
+            moment=0.8,
+            happens=partial(_remove, name=_target(command)),
         )
 
 
@@ -281,13 +339,18 @@ def _mount(work: Path, options: str, name: str) -> None:
     if "size=64k" in fits:
         fits = f"size={size + 131_072}"
     if "nr_inodes" in fits:
-        fits = f"size={size + 2**26},nr_inodes={3 + sum(1 for _ in kept.rglob('*')) if kept.exists() else 2}"
-    subprocess.run(["mount", "-t", "tmpfs", "-o", fits, "tmpfs", str(folder)], check=True, capture_output=True)
+        inodes = 3 + sum(1 for _ in kept.rglob("*")) if kept.exists() else 2
+        fits = f"size={size + 2**26},nr_inodes={inodes}"
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", fits, "tmpfs", str(folder)], check=True, capture_output=True
+    )
     if kept.exists():
         shutil.copytree(kept, folder, dirs_exist_ok=True)
         shutil.rmtree(kept)
         if options.endswith(",ro"):
-            subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True, capture_output=True)
+            subprocess.run(
+                ["mount", "-o", "remount,ro", str(folder)], check=True, capture_output=True
+            )
 
 
 def _remove(process: "subprocess.Popen[bytes]", work: Path, name: str) -> None:
@@ -306,7 +369,11 @@ def of_names() -> Iterator[Case]:
                 partial(do, of="study"),
             )
         for command in ("report", "figure"):
-            yield Case(f"name/agent/{name!r}/{command}", COMMANDS[command], partial(_rename_agent, name=name))
+            yield Case(
+                f"name/agent/{name!r}/{command}",
+                COMMANDS[command],
+                partial(_rename_agent, name=name),
+            )
 
 
 def _rename(work: Path, name: str, of: str = "run") -> None:
@@ -326,7 +393,9 @@ ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
 def of_streams() -> Iterator[Case]:
-    """Streams that are closed, full or abandoned; locales; settings of Python, JAX and matplotlib; odd options."""
+    """Streams that are closed, full or abandoned; locales; settings of Python, JAX and matplotlib;
+    odd options.
+    """
     streams = {
         "no-out": ">&-",
         "no-err": "2>&-",
@@ -342,11 +411,24 @@ def of_streams() -> Iterator[Case]:
         yield Case(f"python/-OO/{command}", COMMANDS[command], flags=("-OO",))
         notebook = {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
         yield Case(f"environment/notebook/{command}", COMMANDS[command], environment=notebook)
-        yield Case(f"environment/dumb/{command}", COMMANDS[command], environment={"TERM": "dumb", "COLUMNS": "20"})
+        yield Case(
+            f"environment/dumb/{command}",
+            COMMANDS[command],
+            environment={"TERM": "dumb", "COLUMNS": "20"},
+        )
     for command in ("evaluate", "record", "list", "train"):
         for platform in ("cuda", "nonsense"):
-            yield Case(f"environment/{platform}/{command}", COMMANDS[command], environment={"JAX_PLATFORMS": platform})
-    for words in ("lost", "train --seed 1e400", "evaluate run --episodes=-1", "evaluate run --episodes 1048576"):
+            yield Case(
+                f"environment/{platform}/{command}",
+                COMMANDS[command],
+                environment={"JAX_PLATFORMS": platform},
+            )
+    for words in (
+        "lost",
+        "train --seed 1e400",
+        "evaluate run --episodes=-1",
+        "evaluate run --episodes 1048576",
+    ):
         yield Case(f"options/{words}", words)
 
 
@@ -359,7 +441,11 @@ def of_moments(seed: int, moments: int) -> Iterator[Case]:
     for command in SIGNALLED:
         for number in range(moments):
             which = rng.choice((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
-            case = Case(f"signal/{which.name}/{command}/{number}", COMMANDS[command], moment=rng.uniform(0.0, 1.0))
+            case = Case(
+                f"signal/{which.name}/{command}/{number}",
+                COMMANDS[command],
+                moment=rng.uniform(0.0, 1.0),
+            )
             yield case._replace(happens=partial(_send, number=which))
     for command in ("evaluate", "study"):
         yield Case(f"signal/twice/{command}", COMMANDS[command], moment=0.6, happens=_send_twice)

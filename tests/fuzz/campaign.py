@@ -1,10 +1,13 @@
-"""The campaign: every case of `tests.fuzz.attacks` in a process of its own, within limits, and what became of it.
+"""The campaign: every case of `tests.fuzz.attacks` in a process of its own, within limits, and what
+became of it.
 
-    python -m tests.fuzz.campaign                        everything, about twenty minutes of one core
-    python -m tests.fuzz.campaign --only file/fifo       the cases whose names begin so, such as one that failed
+    python -m tests.fuzz.campaign                        everything, about twenty minutes of one
+    core python -m tests.fuzz.campaign --only file/fifo       the cases whose names begin so, such
+    as one that failed
 
-Every case works in a fresh copy of a trained run, a study and their files. Beside it lies a folder that nobody may
-touch. A case is fine if it worked, if it was refused in one line, or if it was stopped with one.
+Every case works in a fresh copy of a trained run, a study and their files. Beside it lies a folder
+that nobody may touch. A case is fine if it worked, if it was refused in one line, or if it was
+stopped with one.
 """
 
 import argparse
@@ -62,7 +65,12 @@ def make_base(folder: Path) -> Path:
     (folder / "outside" / "victim.txt").write_text("precious")
     (folder / "outside" / "deep" / "window-000000001.safetensors").write_text("precious")
     for name, algorithm in (("run", "pqn"), ("replay", "dqn")):
-        settings = {"env": "CartPoleEasy-v0", "algorithm": algorithm, "total_frames": 256, "checkpoint_every": 64}
+        settings = {
+            "env": "CartPoleEasy-v0",
+            "algorithm": algorithm,
+            "total_frames": 256,
+            "checkpoint_every": 64,
+        }
         train(preset("smoke", **settings), work / name)
         (work / name / "eval.json").unlink()  # so that there is something to go on with
         shutil.rmtree(work / name / "checkpoints" / "frames-000000000256")
@@ -76,13 +84,18 @@ def make_base(folder: Path) -> Path:
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
     """Mode and content of every file of a folder."""
     paths = sorted(folder.rglob("*"))
-    return {str(path): (path.stat().st_mode, b"" if path.is_dir() else path.read_bytes()) for path in paths}
+    return {
+        str(path): (path.stat().st_mode, b"" if path.is_dir() else path.read_bytes())
+        for path in paths
+    }
 
 
 def precious(work: Path) -> set[str]:
     """Files of the user in a working folder: those that hold this one word."""
     files = [path for path in work.rglob("*") if path.is_file() and not path.is_symlink()]
-    return {str(path) for path in files if path.stat().st_size == 8 and path.read_bytes() == b"precious"}
+    return {
+        str(path) for path in files if path.stat().st_size == 8 and path.read_bytes() == b"precious"
+    }
 
 
 def carry_out(case: Case, base: Path, usual_s: float) -> Result:
@@ -159,7 +172,11 @@ def judge(case: Case, code: int | None, out: str, err: str) -> str:
     """The outcome of a case."""
     if code is None:
         return "hang"
-    if "Traceback (most recent" in err or "fault of arcade-torch" in err or "Exception ignored" in err:
+    if (
+        "Traceback (most recent" in err
+        or "fault of arcade-torch" in err
+        or "Exception ignored" in err
+    ):
         return "traceback"
     if code < 0 or code > 130:
         return "crash"
@@ -183,7 +200,9 @@ def unmount(work: Path) -> None:
 
 
 def usual_times(base: Path, wanted: Iterable[Case]) -> dict[str, float]:
-    """Seconds that each command takes when nothing happens; the second time, as the first one compiles."""
+    """Seconds that each command takes when nothing happens; the second time, as the first one
+    compiles.
+    """
     times = {}
     needed = {case.words for case in wanted if case.moment is not None}
     for name, words in COMMANDS.items():
@@ -192,7 +211,9 @@ def usual_times(base: Path, wanted: Iterable[Case]) -> dict[str, float]:
         for _ in range(2):
             result = carry_out(Case(f"nothing/{name}", words), base, 0.0)
             if result.outcome != "worked":
-                raise SystemExit(f"{words} fails without any attack, exit code {result.code}:\n{result.err}")
+                raise SystemExit(
+                    f"{words} fails without any attack, exit code {result.code}:\n{result.err}"
+                )
         times[words] = result.seconds
     return times
 
@@ -201,26 +222,41 @@ def table(results: Iterable[Result]) -> str:
     """Counts of outcomes by kind of case, as Markdown."""
     counts: dict[str, Counter[str]] = {}
     for result in results:
-        kind = "/".join(result.case.name.split("/")[:2]) if not result.case.name.startswith("options") else "options"
+        kind = (
+            "/".join(result.case.name.split("/")[:2])
+            if not result.case.name.startswith("options")
+            else "options"
+        )
         counts.setdefault(kind, Counter())[result.outcome] += 1
     counts["all"] = sum(counts.values(), Counter())
-    rows = [[kind, f"{sum(row.values())}", *(f"{row[name]}" for name in OUTCOMES)] for kind, row in counts.items()]
+    rows = [
+        [kind, f"{sum(row.values())}", *(f"{row[name]}" for name in OUTCOMES)]
+        for kind, row in counts.items()
+    ]
     return markdown_table(["kind", "cases", *OUTCOMES], rows, left=1)
 
 
 def main() -> int:
     """Run the campaign; exit code 1 if a case is not fine."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--moments", type=int, default=6, help="signals to each command")
     parser.add_argument("--only", default="", help="beginning of the names of cases")
     parser.add_argument("--every", type=int, default=1, help="of the cases only each such one")
-    parser.add_argument("--page", type=Path, help="Markdown file that gets the table between its marks")
+    parser.add_argument(
+        "--page", type=Path, help="Markdown file that gets the table between its marks"
+    )
     options = parser.parse_args()
     if options.page is not None and BEGIN not in options.page.read_text():
         parser.error(f"{options.page} has no line {BEGIN}")
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background of a shell it is ignored
-    chosen = [case for case in cases(options.seed, options.moments) if case.name.startswith(options.only)]
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # in the background of a shell it is ignored
+    chosen = [
+        case for case in cases(options.seed, options.moments) if case.name.startswith(options.only)
+    ]
     chosen = chosen[:: options.every]
     results = []
     with tempfile.TemporaryDirectory(prefix="campaign-base-") as name:
@@ -237,15 +273,29 @@ def main() -> int:
     text = table(results)
     print(text)
     if options.page is not None:
-        when = f"{time.strftime('%Y-%m-%d')}, seed {options.seed}, {sum(one.seconds for one in results):.0f} s:"
+        when = (
+            f"{time.strftime('%Y-%m-%d')}, seed {options.seed}, "
+            f"{sum(one.seconds for one in results):.0f} s:"
+        )
         write_between(options.page, BEGIN, END, f"{when}\n\n{text}")
     return int(any(result.outcome not in FINE for result in results))
 
 
 def tell(result: Result, options: argparse.Namespace) -> None:
     """Print what went wrong, and how to see it again."""
-    again = ["python", "-m", "tests.fuzz.campaign", "--seed", str(options.seed), "--moments", str(options.moments)]
-    print(f"{result.outcome}, exit code {result.code}, {result.seconds:.1f} s: {printable(result.case.name)}")
+    again = [
+        "python",
+        "-m",
+        "tests.fuzz.campaign",
+        "--seed",
+        str(options.seed),
+        "--moments",
+        str(options.moments),
+    ]
+    print(
+        f"{result.outcome}, exit code {result.code}, {result.seconds:.1f} s: "
+        f"{printable(result.case.name)}"
+    )
     print(f"  again: {printable(shlex.join([*again, '--only', result.case.name]))}")
     for line in result.err.splitlines()[-3:]:
         print(f"  | {printable(line)[:300]}", flush=True)

@@ -21,7 +21,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let files that are slow as a whole run with few inputs; a test that is slow by itself stays so."""
+    """Let files that are slow as a whole run with few inputs; a test that is slow by itself stays
+    so.
+    """
     if not contract.few:
         return
     folder = Path(__file__).parent

@@ -1,8 +1,10 @@
-"""What every entry point keeps, whatever arrives: it works, or refuses in one line that we wrote; and the counts.
+"""What every entry point keeps, whatever arrives: it works, or refuses in one line that we wrote;
+and the counts.
 
-Refused properly means: an error type of the package (or ``ValueError``, ``TypeError`` or one about files), raised by a
-``raise`` statement in our own source, with one non-empty line. An ``AttributeError`` out of a dictionary, an error of
-torch, JAX or the standard library that passes through, a hang: all of them fail the test.
+Refused properly means: an error type of the package (or ``ValueError``, ``TypeError`` or one about
+files), raised by a ``raise`` statement in our own source, with one non-empty line. An
+``AttributeError`` out of a dictionary, an error of torch, JAX or the standard library that passes
+through, a hang: all of them fail the test.
 """
 
 import ast
@@ -21,7 +23,9 @@ from hypothesis import HealthCheck, Phase, settings
 from arcade_torch.tools.errors import FILES
 
 ROOT = Path(__file__).resolve().parents[2]
-OURS = tuple(str(ROOT / name) + os.sep for name in ("arcade_torch", "envs_jax", "models", "agents", "tools"))
+OURS = tuple(
+    str(ROOT / name) + os.sep for name in ("arcade_torch", "envs_jax", "models", "agents", "tools")
+)
 LIMIT_S = 60.0
 """No input may take longer; generous, since machines are shared."""
 LONGEST_LINE = 15_000
@@ -45,7 +49,9 @@ class Hang(BaseException):
 
 
 def fuzz(inputs: int) -> settings:
-    """Settings of hypothesis for so many generated inputs, times `SCALE`; with the fast tests for a few."""
+    """Settings of hypothesis for so many generated inputs, times `SCALE`; with the fast tests for a
+    few.
+    """
     examples = (5 if inputs >= 1_000 else 1) if few else max(1, round(inputs * SCALE))
     return settings(
         max_examples=examples,
@@ -80,7 +86,9 @@ def attempt(entry: str, call: Callable[[], object]) -> bool:
         raise AssertionError(f"{entry}: longer than {LIMIT_S:g} s") from None
     except Exception as error:
         if (why := improper(error)) is not None:
-            raise AssertionError(f"{entry}: {why}: {type(error).__name__}: {str(error)[:300]}") from error
+            raise AssertionError(
+                f"{entry}: {why}: {type(error).__name__}: {str(error)[:300]}"
+            ) from error
         row["refused"] += 1
         return False
     row["worked"] += 1
@@ -92,7 +100,9 @@ def improper(error: BaseException) -> str | None:
     if isinstance(error, Refused):
         return None
     kind, text = type(error), str(error)
-    if not isinstance(error, (ValueError, TypeError, *FILES)) and not kind.__module__.startswith("arcade_torch."):
+    if not isinstance(error, (ValueError, TypeError, *FILES)) and not kind.__module__.startswith(
+        "arcade_torch."
+    ):
         return "not an error type of ours"
     if not text.strip() or "\n" in text:
         return "not one line"
@@ -112,7 +122,11 @@ def improper(error: BaseException) -> str | None:
 def _raises(filename: str) -> list[range]:
     """Lines of the statements of a file that raise."""
     nodes = ast.walk(ast.parse(Path(filename).read_text(encoding="utf-8")))
-    return [range(node.lineno, (node.end_lineno or node.lineno) + 1) for node in nodes if isinstance(node, ast.Raise)]
+    return [
+        range(node.lineno, (node.end_lineno or node.lineno) + 1)
+        for node in nodes
+        if isinstance(node, ast.Raise)
+    ]
 
 
 @contextmanager
@@ -136,12 +150,18 @@ def unchanged(folder: Path) -> Iterator[None]:
     """Inside, no file of a folder may change, come or go."""
     before = content(folder)
     yield
-    assert content(folder) == before, f"files of {folder} were changed by something that only reads them"
+    assert content(folder) == before, (
+        f"files of {folder} were changed by something that only reads them"
+    )
 
 
 def content(folder: Path) -> dict[str, bytes]:
     """All files of a folder, by relative path."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def table() -> str:
@@ -150,6 +170,10 @@ def table() -> str:
     for name in sorted(counts):
         row = counts[name]
         lines.append(f"| {name} | {row['inputs']:,} | {row['worked']:,} | {row['refused']:,} |")
-    total = {key: sum(row[key] for row in counts.values()) for key in ("inputs", "worked", "refused")}
-    lines.append(f"| **all** | **{total['inputs']:,}** | {total['worked']:,} | {total['refused']:,} |")
+    total = {
+        key: sum(row[key] for row in counts.values()) for key in ("inputs", "worked", "refused")
+    }
+    lines.append(
+        f"| **all** | **{total['inputs']:,}** | {total['worked']:,} | {total['refused']:,} |"
+    )
     return "\n".join(lines)

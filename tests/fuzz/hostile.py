@@ -1,4 +1,6 @@
-"""Hostile and random inputs: values of any type, names, and mutations of bytes, text and JSON that were fine."""
+"""Hostile and random inputs: values of any type, names, and mutations of bytes, text and JSON that
+were fine.
+"""
 
 import json
 import random
@@ -59,7 +61,9 @@ FLOATS = (0.0, -0.0, 0.5, 1.0, 1.5, -1.0, 1e-320, 1e308, float("inf"), float("-i
 names = st.sampled_from(NAMES) | st.text(max_size=12)
 numbers = st.sampled_from(NUMBERS) | st.sampled_from(FLOATS) | st.integers() | st.floats()
 scalars = st.none() | st.booleans() | numbers | names
-plain = st.recursive(scalars, lambda x: st.lists(x, max_size=3) | st.dictionaries(names, x, max_size=3), max_leaves=6)
+plain = st.recursive(
+    scalars, lambda x: st.lists(x, max_size=3) | st.dictionaries(names, x, max_size=3), max_leaves=6
+)
 """What JSON and TOML can hold, and NaN."""
 
 
@@ -127,7 +131,9 @@ JUNK = (
 
 
 def mutated(data: bytes, seed: int) -> bytes:
-    """Bytes with one to four accidents: flipped bits, cuts, insertions, repeats, swaps, or nothing but junk."""
+    """Bytes with one to four accidents: flipped bits, cuts, insertions, repeats, swaps, or nothing
+    but junk.
+    """
     rng = random.Random(seed)
     out = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
@@ -187,7 +193,9 @@ def nested(depth: int, lists: bool = True) -> Any:
 
 
 def mutated_value(value: Any, seed: int) -> Any:
-    """A nested plain value with one to three leaves, keys or branches replaced, dropped, renamed or added."""
+    """A nested plain value with one to three leaves, keys or branches replaced, dropped, renamed or
+    added.
+    """
     rng = random.Random(seed)
     out = json.loads(json.dumps(value))
     for _ in range(rng.choice((1, 1, 2, 3))):

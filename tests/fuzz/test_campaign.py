@@ -1,6 +1,8 @@
-"""The short form of the campaign: some cases of each kind that need no process of their own, in this one.
+"""The short form of the campaign: some cases of each kind that need no process of their own, in
+this one.
 
-The long one is ``python -m tests.fuzz.campaign``; a few of its cases run here too, to see that its script works.
+The long one is ``python -m tests.fuzz.campaign``; a few of its cases run here too, to see that its
+script works.
 """
 
 import contextlib
@@ -27,7 +29,11 @@ KINDS = ("file/", "name/", "folder/file/")
 def quick_cases() -> list[Case]:
     """Cases that only need files, of commands that take less than a second."""
     words = {COMMANDS[name] for name in QUICK}
-    return [case for case in cases(0, 0) if case.words in words and case.name.startswith(KINDS) and not case.happens]
+    return [
+        case
+        for case in cases(0, 0)
+        if case.words in words and case.name.startswith(KINDS) and not case.happens
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +89,8 @@ def test_a_case_works_or_is_refused_in_one_line(case: Case, base: Path, tmp_path
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(
-    "name", ["stream/no-out/gap-bias", "name/report", "folder/read-only/gap-bias", "signal/SIGINT/figure"]
+    "name",
+    ["stream/no-out/gap-bias", "name/report", "folder/read-only/gap-bias", "signal/SIGINT/figure"],
 )
 def test_cases_in_processes_of_their_own(name: str, base: Path) -> None:
     case = next(case for case in cases(0, 10) if case.name.startswith(name))

@@ -1,4 +1,6 @@
-"""The command line: words of any kind end in help, in a parsed command, or in exit code 2 and one line."""
+"""The command line: words of any kind end in help, in a parsed command, or in exit code 2 and one
+line.
+"""
 
 import contextlib
 import dataclasses
@@ -19,7 +21,16 @@ pytestmark = pytest.mark.slow
 
 # Nobody's arguments can hold a zero byte, and lone surrogates stand for bytes that are no text.
 WORDS = tuple(name for name in NAMES if "\x00" not in name)
-CHEAP = ("list", "report", "evaluate", "analyze gap-bias", "figure returns", "play", "record", "study")
+CHEAP = (
+    "list",
+    "report",
+    "evaluate",
+    "analyze gap-bias",
+    "figure returns",
+    "play",
+    "record",
+    "study",
+)
 COSTLY = tuple(name for name in cli.COMMANDS if name not in CHEAP)
 
 
@@ -48,8 +59,21 @@ def main(words: list[str]) -> None:
 
 
 def _words(rng: random.Random, name: str) -> list[str]:
-    flags = [f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(cli.command_class(name))]
-    flags += ["--help", "--pqn.gamma", "--env", "--total-frames", "--no-report", "-h", "--", "-x", "--debug=1", "--im"]
+    flags = [
+        f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(cli.command_class(name))
+    ]
+    flags += [
+        "--help",
+        "--pqn.gamma",
+        "--env",
+        "--total-frames",
+        "--no-report",
+        "-h",
+        "--",
+        "-x",
+        "--debug=1",
+        "--im",
+    ]
     words = name.split()
     for _ in range(rng.randrange(5)):
         kind = rng.randrange(6)
@@ -57,7 +81,17 @@ def _words(rng: random.Random, name: str) -> list[str]:
             words.append(rng.choice(flags))
         if kind < 5:
             words.append(
-                str(rng.choice((rng.choice(WORDS), rng.choice(NUMBERS[:9]), rng.choice(FLOATS), "full", "lru")))
+                str(
+                    rng.choice(
+                        (
+                            rng.choice(WORDS),
+                            rng.choice(NUMBERS[:9]),
+                            rng.choice(FLOATS),
+                            "full",
+                            "lru",
+                        )
+                    )
+                )
             )
         else:
             words.append(f"{rng.choice(flags)}={rng.choice(WORDS)}")
@@ -69,7 +103,9 @@ def _words(rng: random.Random, name: str) -> list[str]:
 def test_any_words_are_a_command_or_refused(seed: int) -> None:
     rng = random.Random(seed)
     known = sorted({part for name in cli.COMMANDS for part in name.split()})
-    words = [str(rng.choice((rng.choice(WORDS), rng.choice(known)))) for _ in range(rng.randrange(4))]
+    words = [
+        str(rng.choice((rng.choice(WORDS), rng.choice(known)))) for _ in range(rng.randrange(4))
+    ]
     if " ".join(words[:2]) in cli.COMMANDS or " ".join(words[:1]) in cli.COMMANDS:
         words[0] += "x"
     attempt("command line: which command", lambda: main(words))

@@ -1,4 +1,6 @@
-"""Environments: ``make`` with arguments of any type, ``reset`` and ``step`` with any tensordict, ``set_state``."""
+"""Environments: ``make`` with arguments of any type, ``reset`` and ``step`` with any tensordict,
+``set_state``.
+"""
 
 import functools
 import random
@@ -37,7 +39,9 @@ FINE: dict[str, tuple[Any, ...]] = {
 
 
 def _value(rng: random.Random) -> Any:
-    pool = rng.choice((OBJECTS, NAMES, NUMBERS, FLOATS, ([], {}, [1], ["CartPoleEasy", 1], None, True, False)))
+    pool = rng.choice(
+        (OBJECTS, NAMES, NUMBERS, FLOATS, ([], {}, [1], ["CartPoleEasy", 1], None, True, False))
+    )
     return rng.choice(pool)
 
 
@@ -50,7 +54,11 @@ def env(**options: bool) -> arcade_torch.ArcadeEnv:
 @given(seeds)
 def test_make_works_or_says_in_one_line_what_is_wrong(seed: int) -> None:
     rng = random.Random(seed)
-    words = {name: rng.choice(values) for name, values in FINE.items() if rng.random() < 0.5 or name == "num_envs"}
+    words = {
+        name: rng.choice(values)
+        for name, values in FINE.items()
+        if rng.random() < 0.5 or name == "num_envs"
+    }
     words["id"] = rng.choice(FINE["id"])
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         name = rng.choice((*FINE, "gravity", "level", "id", "num_envs"))
@@ -70,7 +78,11 @@ def test_a_penalty_is_taken_or_refused(option: tuple[str, str], value: Any) -> N
 
 
 @fuzz(6_000)
-@given(names | st.sampled_from(registered_ids()) | st.builds("{}-v{}".format, names, st.integers(-1, 10**6)))
+@given(
+    names
+    | st.sampled_from(registered_ids())
+    | st.builds("{}-v{}".format, names, st.integers(-1, 10**6))
+)
 def test_an_id_is_known_or_refused_with_a_hint(name: str) -> None:
     attempt("resolve_id", lambda: resolve_id(name))
 
@@ -90,16 +102,30 @@ def _tensor(rng: random.Random) -> Any:
     if kind == 5:
         return torch.rand(shape) * rng.choice((1.0, 5.0, 1e30, float("nan"), float("inf")))
     if kind == 6:
-        dtypes = (torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.float16, torch.bfloat16)
-        return torch.zeros(shape).to(rng.choice((*dtypes, torch.complex64, torch.float64, torch.uint16, torch.uint32)))
+        dtypes = (
+            torch.bool,
+            torch.uint8,
+            torch.int8,
+            torch.int16,
+            torch.int32,
+            torch.float16,
+            torch.bfloat16,
+        )
+        return torch.zeros(shape).to(
+            rng.choice((*dtypes, torch.complex64, torch.float64, torch.uint16, torch.uint32))
+        )
     if kind == 7:
         return np.zeros(shape, rng.choice((np.int64, np.float32, np.bool_, "U3")))
     if kind == 8:
         return TensorDict({"x": torch.zeros(2)}, [2])
     if kind == 9:
-        return rng.choice(("text", None, 3, -1, 2.5, [1, 2], [1, 2, 3], [[1], [2]], {"a": torch.zeros(2)}))
+        return rng.choice(
+            ("text", None, 3, -1, 2.5, [1, 2], [1, 2, 3], [[1], [2]], {"a": torch.zeros(2)})
+        )
     if kind == 10:
-        return torch.zeros(shape).to_sparse() if rng.random() < 0.5 else torch.zeros(*shape, 2)[..., 0]
+        return (
+            torch.zeros(shape).to_sparse() if rng.random() < 0.5 else torch.zeros(*shape, 2)[..., 0]
+        )
     return torch.nn.functional.one_hot(torch.randint(0, 5, (2,)), 5).to(
         rng.choice((torch.int64, torch.bool, torch.float32))
     )
@@ -170,7 +196,9 @@ def test_a_state_is_taken_whole_or_refused_and_the_env_stays_as_it_was(seed: int
         if kind == 0 and keys:
             state = state.exclude(rng.choice(keys))
         elif kind == 1:
-            state = rng.choice((None, {}, state.to_dict() if keys else 3, "x", TensorDict({}, [2]), torch.zeros(2)))
+            state = rng.choice(
+                (None, {}, state.to_dict() if keys else 3, "x", TensorDict({}, [2]), torch.zeros(2))
+            )
         elif kind == 2 and keys:
             state = state[:1] if rng.random() < 0.5 else torch.cat([state, state])
         elif keys:
@@ -179,7 +207,13 @@ def test_a_state_is_taken_whole_or_refused_and_the_env_stays_as_it_was(seed: int
             new = _tensor(rng)
             if kind > 4 and isinstance(old, torch.Tensor):
                 new = rng.choice(
-                    (old.to(torch.float64), old.unsqueeze(-1), old.new_full(old.shape, -1), old.bool(), old * 0)
+                    (
+                        old.to(torch.float64),
+                        old.unsqueeze(-1),
+                        old.new_full(old.shape, -1),
+                        old.bool(),
+                        old * 0,
+                    )
                 )
             try:
                 state.set(key, new)

@@ -1,4 +1,6 @@
-"""Pages and figures: whatever a study is called and holds, the HTML has no element that a name brought in."""
+"""Pages and figures: whatever a study is called and holds, the HTML has no element that a name
+brought in.
+"""
 
 import json
 import random
@@ -56,7 +58,9 @@ class Reader(HTMLParser):
         self.tags[tag] += 1
         for name, value in attrs:
             assert not name.startswith("on"), (tag, name, value)
-            assert name != "srcdoc" and not (value or "").strip().lower().startswith("javascript:"), (tag, name, value)
+            assert name != "srcdoc" and not (value or "").strip().lower().startswith(
+                "javascript:"
+            ), (tag, name, value)
         self.raw = tag
 
     def handle_data(self, data: str) -> None:
@@ -87,7 +91,13 @@ def _poison(study: StudyFolder, rng: random.Random) -> None:
     values["study"]["question"] = rng.choice(EVIL)
     for key in rng.sample(("command", "versions", "also", "runs"), 2):
         evil = rng.choice(EVIL)
-        values[key] = evil if key == "command" else [{evil: evil}] if key == "also" else {evil: rng.choice(EVIL)}
+        values[key] = (
+            evil
+            if key == "command"
+            else [{evil: evil}]
+            if key == "also"
+            else {evil: rng.choice(EVIL)}
+        )
     file.write_text(json.dumps(values))
     for run in small_study().runs():
         config = study.run(run).path / "config.json"
@@ -117,18 +127,28 @@ def test_no_word_of_a_study_becomes_an_element_of_its_report(study: StudyFolder,
         _repair(study.root, before)
 
 
-@pytest.mark.parametrize("evil", [*EVIL[:4], *(pytest.param(word, marks=pytest.mark.slow) for word in EVIL[4:])])
+@pytest.mark.parametrize(
+    "evil", [*EVIL[:4], *(pytest.param(word, marks=pytest.mark.slow) for word in EVIL[4:])]
+)
 def test_a_hostile_word_in_every_place_stays_a_word(tmp_path: Path, evil: str) -> None:
-    """Path, TOML, config, versions, command, reasons for failing and cells of metrics, all at once."""
+    """Path, TOML, config, versions, command, reasons for failing and cells of metrics, all at
+    once.
+    """
     root = tmp_path / evil.replace("/", "\u2215")
     toml = tmp_path / "study.toml"
     toml.write_text(
-        f"games = ['MineSweeperEasy']\nmemories = ['mingru', 'mlp']\nseeds = 2\nquestion = {json.dumps(evil)}"
+        "games = ['MineSweeperEasy']\nmemories = ['mingru', 'mlp']\nseeds = 2\nquestion = "
+        f"{json.dumps(evil)}"
     )
     grid = Study.load(toml)
     study = write_study(root, small_study(question=grid.question))
     record = json.loads((root / "study.json").read_text())
-    record |= {"command": evil, "versions": {evil: evil}, "also": [{evil: evil}], "runs": {evil: evil}}
+    record |= {
+        "command": evil,
+        "versions": {evil: evil},
+        "also": [{evil: evil}],
+        "runs": {evil: evil},
+    }
     record["runs"] |= {run.name: evil for run in small_study().runs()}
     (root / "study.json").write_text(json.dumps(record))
     for run in small_study().runs():
@@ -142,7 +162,9 @@ def test_a_hostile_word_in_every_place_stays_a_word(tmp_path: Path, evil: str) -
         metrics = config.with_name("metrics.csv")
         head, *lines = metrics.read_text().splitlines()
         quoted = '"' + evil.replace('"', '""') + '"'
-        metrics.write_text("\n".join([f"{head},{quoted}", *(f"{line},{quoted}" for line in lines)]) + "\n")
+        metrics.write_text(
+            "\n".join([f"{head},{quoted}", *(f"{line},{quoted}" for line in lines)]) + "\n"
+        )
     last = small_study().runs()[-1]
     (study.run(last).path / "eval.json").unlink()
     study.note_failure(last, evil)
@@ -196,7 +218,9 @@ def test_hostile_names_are_drawn_as_they_are(
     rng = random.Random(seed)
     before = content(study.root)
     try:
-        evil = rng.choice((*EVIL, *(name for name in NAMES if len(name) < 50 and "\ud800" not in name)))
+        evil = rng.choice(
+            (*EVIL, *(name for name in NAMES if len(name) < 50 and "\ud800" not in name))
+        )
         for run in small_study().runs():
             config = study.run(run).path / "config.json"
             values = json.loads(config.read_text())
@@ -204,18 +228,25 @@ def test_hostile_names_are_drawn_as_they_are(
                 values["config"]["memory"] = evil
             config.write_text(json.dumps(values))
         out = tmp_path_factory.mktemp("drawn")
-        attempt("figure: hostile names", lambda: make_figure("gap-bias", ScoreOptions((study.root,), out)))
+        attempt(
+            "figure: hostile names",
+            lambda: make_figure("gap-bias", ScoreOptions((study.root,), out)),
+        )
     finally:
         _repair(study.root, before)
 
 
 @fuzz(6_000)
 @given(seed=seeds)
-def test_benchmark_files_are_compared_or_refused(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_benchmark_files_are_compared_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     rng = random.Random(seed)
     file = tmp_path_factory.getbasetemp() / "bench.json"
     file.write_bytes(
-        json_bytes(mutated_value(RESULTS, seed)) if rng.random() < 0.8 else mutated(json_bytes(RESULTS), seed)
+        json_bytes(mutated_value(RESULTS, seed))
+        if rng.random() < 0.8
+        else mutated(json_bytes(RESULTS), seed)
     )
 
     def look() -> None:

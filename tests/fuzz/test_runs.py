@@ -1,4 +1,6 @@
-"""Run folders that accidents and strangers have been at: ``agents.load``, resuming, the small files, configs."""
+"""Run folders that accidents and strangers have been at: ``agents.load``, resuming, the small
+files, configs.
+"""
 
 import json
 import random
@@ -22,7 +24,9 @@ from tests.fuzz.hostile import NAMES, anything, json_bytes, mutated, mutated_val
 
 pytestmark = pytest.mark.slow
 
-CONFIG = preset("smoke", env="CartPoleEasy-v0", memory="mingru", total_frames=256, checkpoint_every=128)
+CONFIG = preset(
+    "smoke", env="CartPoleEasy-v0", memory="mingru", total_frames=256, checkpoint_every=128
+)
 SAME = ("meta.json", "weights.safetensors", "trainer.pt")
 
 
@@ -51,7 +55,9 @@ def _damage(folder: Path, rng: random.Random) -> None:
             file.unlink()
             file.mkdir()
         elif kind == 7 and not (folder / "checkpoints" / "latest").is_dir():
-            (folder / "checkpoints" / "latest").write_bytes(rng.choice(NAMES).encode("utf-8", "replace"))
+            (folder / "checkpoints" / "latest").write_bytes(
+                rng.choice(NAMES).encode("utf-8", "replace")
+            )
         elif file.suffix == ".json":
             _rewrite_json(file, rng)
         if not any(path.is_file() for path in folder.rglob("*")):
@@ -98,9 +104,29 @@ def _changed(state: Any, rng: random.Random) -> Any:
         return [*state[:at], _changed(state[at], rng), *state[at + 1 :]]
     if isinstance(state, torch.Tensor) and rng.random() < 0.6:
         return rng.choice(
-            (state.double(), state.unsqueeze(0), state.flatten()[:0], state.bool(), torch.full_like(state, -1))
+            (
+                state.double(),
+                state.unsqueeze(0),
+                state.flatten()[:0],
+                state.bool(),
+                torch.full_like(state, -1),
+            )
         )
-    return rng.choice((None, "x", -1, 10**30, [], {}, 0.5, float("nan"), torch.zeros(3), {"__tensordict__": 5}, b"x"))
+    return rng.choice(
+        (
+            None,
+            "x",
+            -1,
+            10**30,
+            [],
+            {},
+            0.5,
+            float("nan"),
+            torch.zeros(3),
+            {"__tensordict__": 5},
+            b"x",
+        )
+    )
 
 
 def _repair(folder: Path, before: dict[str, bytes]) -> None:
@@ -144,7 +170,9 @@ def trainer() -> Iterator[Trainer]:
 
 @fuzz(800)
 @given(seed=seeds)
-def test_a_forged_trainers_state_is_taken_or_refused(run: Path, trainer: Trainer, seed: int) -> None:
+def test_a_forged_trainers_state_is_taken_or_refused(
+    run: Path, trainer: Trainer, seed: int
+) -> None:
     rng = random.Random(seed)
     before = content(run)
     try:
@@ -161,7 +189,9 @@ def test_a_forged_trainers_state_is_taken_or_refused(run: Path, trainer: Trainer
 
 @fuzz(1_000)
 @given(seed=seeds)
-def test_a_damaged_folder_is_resumed_or_refused_before_anything_is_written(run: Path, seed: int) -> None:
+def test_a_damaged_folder_is_resumed_or_refused_before_anything_is_written(
+    run: Path, seed: int
+) -> None:
     rng = random.Random(seed)
     before = content(run)
     try:
@@ -201,7 +231,9 @@ def test_logs_are_cut_back_whatever_stands_in_them(run: Path, seed: int) -> None
     before = file.read_bytes()
     try:
         file.write_bytes(mutated(before, seed))
-        attempt("resume: metrics.csv", lambda: CsvLog(file, METRIC_COLUMNS, keep_frames=128).close())
+        attempt(
+            "resume: metrics.csv", lambda: CsvLog(file, METRIC_COLUMNS, keep_frames=128).close()
+        )
     finally:
         file.write_bytes(before)
 

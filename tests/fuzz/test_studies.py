@@ -59,7 +59,10 @@ VALUES: dict[str, Any] = {
 
 def _use(study: Study) -> None:
     """What a dry run does with a study."""
-    assert Study.from_dict(json.loads(json.dumps(study.to_dict()))).fixed().keys() == study.fixed().keys()
+    assert (
+        Study.from_dict(json.loads(json.dumps(study.to_dict()))).fixed().keys()
+        == study.fixed().keys()
+    )
     for run in study.runs()[:4]:
         assert os.sep not in run.name and run.name not in ("", ".", "..")
         StudyFolder(Path("out")).job(run)
@@ -71,13 +74,17 @@ def test_a_study_of_any_fields_is_made_or_refused(seed: int) -> None:
     rng = random.Random(seed)
     values = mutated_value(VALUES, seed)
     if isinstance(values, dict) and rng.random() < 0.4:
-        values[rng.choice(tuple(VALUES))] = rng.choice((rng.choice(NAMES), rng.choice(NUMBERS), [rng.choice(NAMES)]))
+        values[rng.choice(tuple(VALUES))] = rng.choice(
+            (rng.choice(NAMES), rng.choice(NUMBERS), [rng.choice(NAMES)])
+        )
     attempt("Study.from_dict", lambda: _use(Study.from_dict(values)))
 
 
 @fuzz(9_000)
 @given(seed=seeds)
-def test_a_study_file_of_any_bytes_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_a_study_file_of_any_bytes_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     file = tmp_path_factory.getbasetemp() / "study.toml"
     data = mutated(TOML, seed)
     file.write_bytes(data)
@@ -113,4 +120,6 @@ def test_a_damaged_studys_folder_gives_results_or_refuses(study: StudyFolder, se
 def test_the_names_of_runs_cannot_leave_the_folder() -> None:
     for name in NAMES:
         for spec in (RunSpec(name, "full", "lru", "pqn", 0), RunSpec("G", "full", name, "pqn", 0)):
-            assert StudyFolder(Path("s")).run(spec).path.parent == Path("s/runs") or "/" in spec.name
+            assert (
+                StudyFolder(Path("s")).run(spec).path.parent == Path("s/runs") or "/" in spec.name
+            )

@@ -1,4 +1,6 @@
-"""Tables that people hand over: scores for gap and bias, benchmarks, human scores, delayed recall, NAME=VALUE."""
+"""Tables that people hand over: scores for gap and bias, benchmarks, human scores, delayed recall,
+NAME=VALUE.
+"""
 
 import functools
 import random
@@ -14,7 +16,13 @@ from arcade_torch.tools.figures import logs
 from arcade_torch.tools.figures.logs import mean_series, series
 from arcade_torch.tools.files import read_rows, write_between, write_csv
 from arcade_torch.tools.options import name_and_value, take_imports
-from arcade_torch.tools.play.scores import COLUMNS, append_score, next_seed, read_scores_file, replay
+from arcade_torch.tools.play.scores import (
+    COLUMNS,
+    append_score,
+    next_seed,
+    read_scores_file,
+    replay,
+)
 from arcade_torch.tools.runs import METRICS, read_scores
 from tests.fuzz.contract import attempt, fuzz
 from tests.fuzz.hostile import FLOATS, NAMES, NUMBERS, mutated, names, seeds
@@ -129,7 +137,9 @@ def _row() -> dict[str, str]:
 def test_human_scores_are_read_or_refused_and_never_lost(files: Path, seed: int) -> None:
     data = _cells(HUMAN, random.Random(seed))
     file = _written(files / "human.csv", data)
-    attempt("play: reading scores", lambda: next_seed(read_scores_file(file), "CartPoleEasy-v0", "me"))
+    attempt(
+        "play: reading scores", lambda: next_seed(read_scores_file(file), "CartPoleEasy-v0", "me")
+    )
     if not attempt("play: adding a score", lambda: append_score(file, _row())):
         assert file.read_bytes() == data
     else:
@@ -151,7 +161,9 @@ def test_an_episode_is_replayed_or_refused(seed: int) -> None:
 @fuzz(6_000)
 @given(seed=seeds)
 def test_any_file_is_json_or_refused_by_name(files: Path, seed: int) -> None:
-    file = _written(files / "x.json", mutated(b'{"a": [1, 2.5, null, true, "text"], "b": {"c": -1e5}}', seed))
+    file = _written(
+        files / "x.json", mutated(b'{"a": [1, 2.5, null, true, "text"], "b": {"c": -1e5}}', seed)
+    )
     attempt("read_json", lambda: read_json(file))
 
 

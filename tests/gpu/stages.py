@@ -1,14 +1,17 @@
-"""Everything that needs a GPU, in stages: tests marked gpu, benchmarks, trainings; CSV files, and a page made of them.
+"""Everything that needs a GPU, in stages: tests marked gpu, benchmarks, trainings; CSV files, and a
+page made of them.
 
 ::
 
-    python -m tests.gpu.stages FOLDER                  all stages on the GPU, as many as eight minutes hold
-    python -m tests.gpu.stages FOLDER                  again: goes on with what is not finished
-    python -m tests.gpu.stages FOLDER --device cpu     a rehearsal: every stage on the CPU, in a tiny form
+    python -m tests.gpu.stages FOLDER                  all stages on the GPU, as many as eight
+    minutes hold python -m tests.gpu.stages FOLDER                  again: goes on with what is not
+    finished python -m tests.gpu.stages FOLDER --device cpu     a rehearsal: every stage on the CPU,
+    in a tiny form
 
-A stage is a process; its output is FOLDER/NAME.log. FOLDER/NAME.done says that it never runs again. What
-failed does not stop the others, and is tried again by the next call, after them. Where the time ran out, a study goes
-on; any other stage begins anew. Exit code: 0 all is done, 1 something failed, 2 there is more to do.
+A stage is a process; its output is FOLDER/NAME.log. FOLDER/NAME.done says that it never runs again.
+What failed does not stop the others, and is tried again by the next call, after them. Where the
+time ran out, a study goes on; any other stage begins anew. Exit code: 0 all is done, 1 something
+failed, 2 there is more to do.
 """
 
 import argparse
@@ -67,7 +70,18 @@ def stages(folder: Path, device: str) -> list[Stage]:
     games = [id.removesuffix("-v0") for id in registered_ids() if "Easy" in id]
     found = [Stage("machine", ("-c", MACHINE, str(folder / "machine.csv")))]
     for name, paths in TESTS.items():
-        words = ("-m", "pytest", "-q", "-m", "gpu", "-p", "no:cacheprovider", "--device", device, *paths)
+        words = (
+            "-m",
+            "pytest",
+            "-q",
+            "-m",
+            "gpu",
+            "-p",
+            "no:cacheprovider",
+            "--device",
+            device,
+            *paths,
+        )
         found.append(Stage(f"tests-{name}", (*words, f"--junitxml={folder / f'tests-{name}.xml'}")))
 
     def bench(name: str, *words: str) -> None:
@@ -75,44 +89,93 @@ def stages(folder: Path, device: str) -> list[Stage]:
         found.append(Stage(name, (*command, "--out", str(folder / f"{name}.csv"))))
 
     sizes = ("2",) if tiny else ("128", "512", "2048", "8192", "16384")
-    turns = ("--seconds", "0.01", "--repeats", "1") if tiny else ("--seconds", "0.3", "--repeats", "3")
+    turns = (
+        ("--seconds", "0.01", "--repeats", "1") if tiny else ("--seconds", "0.3", "--repeats", "3")
+    )
     games.sort(key=("MineSweeperEasy", "CartPoleEasy").__contains__, reverse=True)
     for game in games[:1] if tiny else games[:2]:
         bench(f"envs-{game}", "--games", game, "--batches", *sizes, *turns)
     short = ("--memories", "mlp", "--grad-steps", "1", "--repeats", "1") if tiny else ()
     for network in ("small",) if tiny else ("small", "paper"):
         for form in FORMS[:1] if tiny else FORMS:
-            bench(f"train-{network}-{form}", "--networks", network, "--forms", form, "--device", device, *short)
-    memory = ("gru", "--steps", "8", "--layers", "1", "--size", "8", "--batch", "2", "--frames", "4", *turns)
+            bench(
+                f"train-{network}-{form}",
+                "--networks",
+                network,
+                "--forms",
+                form,
+                "--device",
+                device,
+                *short,
+            )
+    memory = (
+        "gru",
+        "--steps",
+        "8",
+        "--layers",
+        "1",
+        "--size",
+        "8",
+        "--batch",
+        "2",
+        "--frames",
+        "4",
+        *turns,
+    )
     bench("memory", *(memory if tiny else ("--layers", "1")), "--device", device)
     for game in () if tiny else games[2:]:
         bench(f"envs-{game}", "--games", game, "--batches", *sizes, *turns)
     for name, plan in studies(games, device).items():
-        toml = write_atomic(folder / f"study-{name}.toml", "".join(f"{key} = {value}\n" for key, value in plan.items()))
-        words = ("-m", "arcade_torch.tools", "study", str(toml), "--out", str(folder / f"study-{name}"), "--no-report")
+        toml = write_atomic(
+            folder / f"study-{name}.toml",
+            "".join(f"{key} = {value}\n" for key, value in plan.items()),
+        )
+        words = (
+            "-m",
+            "arcade_torch.tools",
+            "study",
+            str(toml),
+            "--out",
+            str(folder / f"study-{name}"),
+            "--no-report",
+        )
         words += ("--engine", "inline") if tiny else ("--engine", "processes", "--workers", "4")
         found.append(Stage(f"study-{name}", words, resumes=True))
     return found
 
 
 def studies(games: Sequence[str], device: str) -> dict[str, dict[str, str]]:
-    """Trainings as TOML: the Easy games and their twins with the small preset, and the paper's CartPoleEasy."""
+    """Trainings as TOML: the Easy games and their twins with the small preset, and the paper's
+    CartPoleEasy.
+    """
     common = {"memories": '["lru"]', "seeds": "1", "settings": f'{{ device = "{device}" }}'}
     if device == "cpu":
-        return {"tiny": {"games": '["CartPoleEasy"]', "preset": '"smoke"', "total_frames": "128", **common}}
+        return {
+            "tiny": {
+                "games": '["CartPoleEasy"]',
+                "preset": '"smoke"',
+                "total_frames": "128",
+                **common,
+            }
+        }
     listed = ", ".join(f'"{game}"' for game in games)
     paper = {"games": '["CartPoleEasy"]', "preset": '"paper"', **common}
     small = {"games": f"[{listed}]", "preset": '"small"', "algorithms": '["ppo"]', **common}
     return {"small": small, "paper": paper}
 
 
-# -- running ----------------------------------------------------------------------------------------------------------
+# -- running ---------------------------------------------------------------------------------------
 
 
 def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]:
-    """Run what is not finished until the time is over; returns name -> done, failed, unfinished or waiting."""
+    """Run what is not finished until the time is over; returns name -> done, failed, unfinished or
+    waiting.
+    """
     end, first = time.monotonic() + seconds, True
-    state = {stage.name: "done" if (folder / f"{stage.name}.done").exists() else "waiting" for stage in chosen}
+    state = {
+        stage.name: "done" if (folder / f"{stage.name}.done").exists() else "waiting"
+        for stage in chosen
+    }
     todo = [stage for stage in chosen if state[stage.name] == "waiting"]
     for stage in sorted(todo, key=lambda stage: (folder / f"{stage.name}.failed").exists()):
         left = end - time.monotonic()
@@ -123,7 +186,9 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
         code = launch(stage, folder / f"{stage.name}.log", left)
         collect(stage, folder)
         took = time.monotonic() - began
-        goes_on = code is None and (stage.resumes or not first)  # no more may be missing than the time others took
+        goes_on = code is None and (
+            stage.resumes or not first
+        )  # no more may be missing than the time others took
         found, first = "unfinished" if goes_on else "failed" if code != 0 else "done", False
         state[stage.name] = found
         (folder / f"{stage.name}.failed").unlink(missing_ok=True)
@@ -138,12 +203,19 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
 def launch(stage: Stage, log: Path, seconds: float) -> int | None:
     """Run one stage with its output in a file; returns its exit code, None if the time ran out."""
     environment = dict(os.environ)
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    environment["PYTHONPATH"] = os.pathsep.join(
+        filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))
+    )
     environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(log.parent.resolve() / "cache"))
     command = [sys.executable, *stage.argv]
     with log.open("w") as file:
         process = subprocess.Popen(
-            command, stdout=file, stderr=subprocess.STDOUT, cwd=ROOT, env=environment, start_new_session=True
+            command,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            cwd=ROOT,
+            env=environment,
+            start_new_session=True,
         )
         try:
             return process.wait(seconds)
@@ -171,7 +243,9 @@ def collect(stage: Stage, folder: Path) -> None:
         report.unlink()
     if (study / "results.csv").exists():
         seconds = {row["run"]: row["seconds"] for row in read_csv(study / "timings.csv")}
-        rows = [row | {"seconds": seconds.get(row["run"])} for row in read_csv(study / "results.csv")]
+        rows = [
+            row | {"seconds": seconds.get(row["run"])} for row in read_csv(study / "results.csv")
+        ]
         write_csv(folder / f"{stage.name}.csv", rows, list(rows[0]))
 
 
@@ -187,27 +261,50 @@ def outcomes(report: Path) -> list[dict[str, Any]]:
     return rows
 
 
-# -- the page ---------------------------------------------------------------------------------------------------------
+# -- the page --------------------------------------------------------------------------------------
 
 
 def page(folder: Path, state: Mapping[str, str], command: str) -> str:
     """What the CSV files of a folder say, as Markdown."""
     machine = read_csv(folder / "machine.csv")[0] if (folder / "machine.csv").exists() else {}
     made = ", ".join(f"{name} {value}" for name, value in machine.items() if value)
-    lines = ["# On a GPU", "", f"`{command}`. {made or 'The machine is not known yet'}.", "", "## Stages", ""]
-    failed = {name: tail(folder / f"{name}.log")[-1:] for name, found in state.items() if found == "failed"}
-    rows = [{"stage": name, "state": found, "said": "".join(failed.get(name, []))} for name, found in state.items()]
+    lines = [
+        "# On a GPU",
+        "",
+        f"`{command}`. {made or 'The machine is not known yet'}.",
+        "",
+        "## Stages",
+        "",
+    ]
+    failed = {
+        name: tail(folder / f"{name}.log")[-1:]
+        for name, found in state.items()
+        if found == "failed"
+    }
+    rows = [
+        {"stage": name, "state": found, "said": "".join(failed.get(name, []))}
+        for name, found in state.items()
+    ]
     lines += table(rows, ("stage", "state", "said"))
     tests = {path.stem: read_csv(path) for path in sorted(folder.glob("tests-*.csv"))}
-    counts = [{"stage": name} | Counter(row["outcome"] for row in found) for name, found in tests.items()]
+    counts = [
+        {"stage": name} | Counter(row["outcome"] for row in found) for name, found in tests.items()
+    ]
     lines += ["## Tests", "", *table(counts, ("stage", "passed", "failure", "error", "skipped"))]
-    lines += table([row for found in tests.values() for row in found if row["outcome"] != "passed"], TEST_COLUMNS)
+    lines += table(
+        [row for found in tests.values() for row in found if row["outcome"] != "passed"],
+        TEST_COLUMNS,
+    )
     for name, kind in TABLES.items():
         paths = sorted([*folder.glob(f"{name}-*.csv"), *folder.glob(f"memory_{name}.csv")])
         found = table([row for path in paths for row in read_csv(path)], (*kind.key, *kind.numbers))
         lines += [f"## {kind.title}", "", *found] if found else []
     for path in sorted(folder.glob("study-*.csv")):
-        lines += [f"## Trainings: {path.stem.removeprefix('study-')}", "", *table(read_csv(path), STUDY_COLUMNS)]
+        lines += [
+            f"## Trainings: {path.stem.removeprefix('study-')}",
+            "",
+            *table(read_csv(path), STUDY_COLUMNS),
+        ]
     return "\n".join(lines)
 
 
@@ -216,24 +313,40 @@ def table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> list[str
     if not rows:
         return []
     cells = [[str(row.get(name) or "").replace("|", "\\|") for name in columns] for row in rows]
-    return [*("| " + " | ".join(line) + " |" for line in (columns, ["---"] * len(columns), *cells)), ""]
+    return [
+        *("| " + " | ".join(line) + " |" for line in (columns, ["---"] * len(columns), *cells)),
+        "",
+    ]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run stages, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="where CSV files, logs and marks go; kept between calls")
-    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda", help="cpu: a tiny rehearsal")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "folder", type=Path, help="where CSV files, logs and marks go; kept between calls"
+    )
+    parser.add_argument(
+        "--device", choices=("cuda", "cpu"), default="cuda", help="cpu: a tiny rehearsal"
+    )
     parser.add_argument("--minutes", type=float, default=8.0, help="of one call")
-    parser.add_argument("--only", nargs="+", default=["*"], help="names of stages, with * for any letters")
+    parser.add_argument(
+        "--only", nargs="+", default=["*"], help="names of stages, with * for any letters"
+    )
     parser.add_argument("--page", type=Path, help="Markdown page; FOLDER/gpu.md by default")
     options = parser.parse_args(argv)
     folder: Path = options.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     found = stages(folder, options.device)
-    chosen = [stage for stage in found if any(fnmatch(stage.name, pattern) for pattern in options.only)]
+    chosen = [
+        stage for stage in found if any(fnmatch(stage.name, pattern) for pattern in options.only)
+    ]
     if not chosen:
-        parser.error(f"no stage is called {' or '.join(options.only)}; there are {', '.join(s.name for s in found)}")
+        parser.error(
+            f"no stage is called {' or '.join(options.only)}; there are "
+            f"{', '.join(s.name for s in found)}"
+        )
     state = run(chosen, folder, 60 * options.minutes)
     command = f"make gpu DEVICE={options.device}"
     print(write_atomic(options.page or folder / "gpu.md", page(folder, state, command)))

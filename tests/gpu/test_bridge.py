@@ -1,4 +1,6 @@
-"""Frames between JAX and torch on one GPU: memory that is shared, who waits for whom, and what may be drawn over."""
+"""Frames between JAX and torch on one GPU: memory that is shared, who waits for whom, and what may
+be drawn over.
+"""
 
 import os
 import subprocess
@@ -35,7 +37,9 @@ def jax_device(device: str) -> jax.Device:
 
 
 def keep_torch_busy(device: str) -> None:
-    """A quarter of a second of work on torch's stream; the host goes on. On the CPU torch has no queue."""
+    """A quarter of a second of work on torch's stream; the host goes on. On the CPU torch has no
+    queue.
+    """
     if device == "cuda":
         torch.cuda._sleep(400_000_000)
 
@@ -48,14 +52,18 @@ def slowly(x: jax.Array) -> jax.Array:
 
 def numbers(device: jax.Device) -> jax.Array:
     size = 128 if device.platform == "cpu" else 4096
-    return jax.device_put(np.random.default_rng(0).integers(0, 99, (size, size)).astype(np.float32), device)
+    return jax.device_put(
+        np.random.default_rng(0).integers(0, 99, (size, size)).astype(np.float32), device
+    )
 
 
-# -- the same memory --------------------------------------------------------------------------------------------------
+# -- the same memory -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [jnp.bool_, jnp.uint8, jnp.int32, jnp.float32])
-def test_an_array_becomes_a_tensor_over_the_same_memory(dtype: Any, device: str, jax_device: jax.Device) -> None:
+def test_an_array_becomes_a_tensor_over_the_same_memory(
+    dtype: Any, device: str, jax_device: jax.Device
+) -> None:
     array = jax.device_put(np.ones((4, 3), dtype), jax_device)
     tensor = to_torch(array)
     assert tensor.device.type == device and tensor.data_ptr() == array.unsafe_buffer_pointer()
@@ -63,7 +71,9 @@ def test_an_array_becomes_a_tensor_over_the_same_memory(dtype: Any, device: str,
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.float32])
-def test_a_tensor_becomes_an_array_over_the_same_memory(dtype: Any, device: str, jax_device: jax.Device) -> None:
+def test_a_tensor_becomes_an_array_over_the_same_memory(
+    dtype: Any, device: str, jax_device: jax.Device
+) -> None:
     tensor = torch.arange(64, device=device).to(dtype)
     array = to_jax(tensor)
     assert array.devices() == {jax_device} and array.unsafe_buffer_pointer() == tensor.data_ptr()
@@ -86,16 +96,21 @@ def test_a_tensor_that_begins_where_jax_cannot_compute_is_refused(device: str) -
 def test_the_frames_of_a_step_are_the_memory_that_jax_wrote(device: str) -> None:
     env = arcade_torch.make("MineSweeperEasy", num_envs=N, device=device)
     raw = env.step_raw(torch.zeros(N, dtype=torch.int64, device=device))
-    assert raw.pixels.device == env.device and raw.pixels.data_ptr() == raw.step.pixels.unsafe_buffer_pointer()
+    assert (
+        raw.pixels.device == env.device
+        and raw.pixels.data_ptr() == raw.step.pixels.unsafe_buffer_pointer()
+    )
     assert raw.numbers.data_ptr() == raw.step.numbers.unsafe_buffer_pointer()
 
 
-# -- the order of the streams -----------------------------------------------------------------------------------------
+# -- the order of the streams ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("move", ["step_raw", "reset", "observe"])
 def test_a_slow_reader_sees_the_frame_it_was_given(move: str, device: str) -> None:
-    """The reader lets go of its frame while it waits in the queue, so JAX may draw the next ones over it."""
+    """The reader lets go of its frame while it waits in the queue, so JAX may draw the next ones
+    over it.
+    """
     env = arcade_torch.make("MineSweeperEasy", num_envs=256, device=device)
     action = torch.ones(256, dtype=torch.int64, device=device)
     moves = {"step_raw": lambda: env.step_raw(action), "reset": env.reset, "observe": env.observe}
@@ -128,7 +143,9 @@ def test_jax_waits_for_what_torch_still_computes(device: str, jax_device: jax.De
     assert (np.asarray(array + 1) == 8).all()
 
 
-def test_memory_that_torch_let_go_of_is_not_written_before_jax_has_read_it(device: str, jax_device: jax.Device) -> None:
+def test_memory_that_torch_let_go_of_is_not_written_before_jax_has_read_it(
+    device: str, jax_device: jax.Device
+) -> None:
     x = numbers(jax_device)
     slowly(x).block_until_ready()
     given = to_torch(x).clone()
@@ -150,14 +167,17 @@ def test_frames_that_are_held_stay_as_they_were(device: str) -> None:
     assert all(torch.equal(frames.cpu(), copy) for frames, copy in zip(held, copies, strict=True))
 
 
-# -- the same numbers as on the CPU -----------------------------------------------------------------------------------
+# -- the same numbers as on the CPU ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["all", "truncated", "none"])
 @pytest.mark.parametrize("game", [GAME, MIXED], ids=["one game", "several"])
-def test_a_collector_on_a_card_gives_the_windows_of_one_on_the_cpu(game: Any, mode: Any, device: str) -> None:
+def test_a_collector_on_a_card_gives_the_windows_of_one_on_the_cpu(
+    game: Any, mode: Any, device: str
+) -> None:
     pairs = [
-        ArcadeCollector(ArcadeEnv(game, N, device=d), scripted, N * 24, final_frames=mode) for d in (device, "cpu")
+        ArcadeCollector(ArcadeEnv(game, N, device=d), scripted, N * 24, final_frames=mode)
+        for d in (device, "cpu")
     ]
     for _ in range(4):
         one, two = (collector.collect().cpu() for collector in pairs)
@@ -171,7 +191,11 @@ def test_a_collector_on_a_card_gives_the_windows_of_one_on_the_cpu(game: Any, mo
 def test_the_paths_of_torchrl_give_the_frames_of_the_cpu(path: str, device: str) -> None:
     def rollout(device: str) -> Any:
         env = ArcadeEnv(GAME, N, device=device, state_in_td=path == "stock")
-        return env.rollout(40, scripted, break_when_any_done=False).exclude("state", ("next", "state")).cpu()
+        return (
+            env.rollout(40, scripted, break_when_any_done=False)
+            .exclude("state", ("next", "state"))
+            .cpu()
+        )
 
     assert_same(rollout(device), rollout("cpu"))
 
@@ -179,7 +203,10 @@ def test_the_paths_of_torchrl_give_the_frames_of_the_cpu(path: str, device: str)
 @pytest.mark.parametrize("game", EASY)
 def test_a_card_draws_the_frames_of_the_cpu(game: str, device: str) -> None:
     """From equal states. Where states are fractions of a pixel, a card may round another way."""
-    here, there = (arcade_torch.make(game, num_envs=8, observability="partial", device=d) for d in ("cpu", device))
+    here, there = (
+        arcade_torch.make(game, num_envs=8, observability="partial", device=d)
+        for d in ("cpu", device)
+    )
     here.reset()
     actions = torch.randint(5, (48, 8), generator=torch.Generator().manual_seed(0))
     for step, action in enumerate(actions):
@@ -187,7 +214,9 @@ def test_a_card_draws_the_frames_of_the_cpu(game: str, device: str) -> None:
         if step % 6 == 5:
             state = here.get_state()
             seen = there.set_state(state.to(device))["pixels"].cpu()
-            fractions = any(value.is_floating_point() for value in state["state"].values(True, True))
+            fractions = any(
+                value.is_floating_point() for value in state["state"].values(True, True)
+            )
             assert (seen != frames).float().mean() <= (0.005 if fractions else 0)
 
 
@@ -207,7 +236,9 @@ def test_where_jax_has_the_cpu_alone_frames_are_copied_and_somebody_says_so(devi
     def run(device: str) -> tuple[str, str]:
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
         command = [sys.executable, "-c", FALLBACK, device]
-        result = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
+        result = subprocess.run(
+            command, capture_output=True, text=True, env=environment, timeout=300, check=False
+        )
         assert result.returncode == 0, result.stderr
         return result.stdout, result.stderr
 
@@ -216,20 +247,26 @@ def test_where_jax_has_the_cpu_alone_frames_are_copied_and_somebody_says_so(devi
     assert ("every frame is copied to the GPU" in said) == (device == "cuda")
 
 
-# -- waits of the host ------------------------------------------------------------------------------------------------
+# -- waits of the host -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["truncated", "all"])
 def test_the_host_waits_once_a_window(mode: Any, cuda: str) -> None:
     """By torch's own count; ``tests/arcade_torch/test_devices.py`` counts without a GPU."""
-    count_waits(ArcadeCollector(ArcadeEnv(GAME, N, device=cuda), Recurrent(), N * 128, final_frames=mode))
+    count_waits(
+        ArcadeCollector(ArcadeEnv(GAME, N, device=cuda), Recurrent(), N * 128, final_frames=mode)
+    )
 
 
 @pytest.mark.parametrize("memory", memory_names())
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
-def test_the_host_waits_once_a_window_of_a_training_too(algorithm: str, memory: str, cuda: str) -> None:
+def test_the_host_waits_once_a_window_of_a_training_too(
+    algorithm: str, memory: str, cuda: str
+) -> None:
     learner = {algorithm: {"time_limit": "bootstrap"}}
-    config = preset("smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, device=cuda, **learner)
+    config = preset(
+        "smoke", env="SignpostEasy", algorithm=algorithm, memory=memory, device=cuda, **learner
+    )
     trainer = Trainer(config)
     count_waits(trainer.collector)
     trainer.close()
@@ -238,12 +275,19 @@ def test_the_host_waits_once_a_window_of_a_training_too(algorithm: str, memory: 
 def count_waits(collector: ArcadeCollector) -> None:
     for _ in range(2):  # the first call compiles
         collector.collect()
-    with warnings.catch_warnings(record=True) as caught, jax.transfer_guard_device_to_host("disallow"):
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        jax.transfer_guard_device_to_host("disallow"),
+    ):
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         try:
             collector.collect()
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    waits = [str(warning.message) for warning in caught if "called a synchronizing" in str(warning.message)]
+    waits = [
+        str(warning.message)
+        for warning in caught
+        if "called a synchronizing" in str(warning.message)
+    ]
     assert len(waits) == 1, waits

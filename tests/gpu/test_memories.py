@@ -1,4 +1,6 @@
-"""Memory models on a GPU: the numbers of the CPU, values and gradients, over sequences and step by step."""
+"""Memory models on a GPU: the numbers of the CPU, values and gradients, over sequences and step by
+step.
+"""
 
 import copy
 from typing import Any
@@ -26,7 +28,9 @@ def run(memory: Any, x: Tensor, is_init: Tensor) -> list[Tensor]:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", memory_names())
-def test_a_memory_computes_on_a_card_what_it_computes_on_the_cpu(name: str, dtype: torch.dtype, device: str) -> None:
+def test_a_memory_computes_on_a_card_what_it_computes_on_the_cpu(
+    name: str, dtype: torch.dtype, device: str
+) -> None:
     here = make_memory(name, 12, 16).to(dtype)
     there = copy.deepcopy(here).to(device)
     x, is_init = torch.randn(3, 70, 12, dtype=dtype), torch.rand(3, 70) < 0.05
@@ -39,7 +43,9 @@ def test_a_memory_computes_on_a_card_what_it_computes_on_the_cpu(name: str, dtyp
 
 
 @pytest.mark.parametrize("name", memory_names())
-def test_acting_step_by_step_on_a_card_gives_what_the_sequence_gives(name: str, device: str) -> None:
+def test_acting_step_by_step_on_a_card_gives_what_the_sequence_gives(
+    name: str, device: str
+) -> None:
     memory: Any = make_memory(name, 12, 16).to(device)
     x, is_init = torch.randn(3, 40, 12, device=device), (torch.rand(3, 40) < 0.05).to(device)
     with torch.no_grad():

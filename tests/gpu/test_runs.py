@@ -1,4 +1,6 @@
-"""Training runs on a GPU: the faster ways to the same agent, and going on after an end that nobody announced."""
+"""Training runs on a GPU: the faster ways to the same agent, and going on after an end that nobody
+announced.
+"""
 
 import dataclasses
 import random
@@ -39,17 +41,25 @@ def test_a_faster_way_gives_the_agent_of_the_plain_one_up_to_rounding(
 
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
 def test_an_interrupted_run_goes_on_to_the_bit(algorithm: str, device: str, tmp_path: Path) -> None:
-    config = preset("smoke", algorithm=algorithm, env="SignpostEasy", device=device, total_frames=256)
-    assert_goes_on_to_the_bit(dataclasses.replace(config, env="SignpostEasy-v0", checkpoint_every=64), tmp_path)
+    config = preset(
+        "smoke", algorithm=algorithm, env="SignpostEasy", device=device, total_frames=256
+    )
+    assert_goes_on_to_the_bit(
+        dataclasses.replace(config, env="SignpostEasy-v0", checkpoint_every=64), tmp_path
+    )
 
 
 def test_an_interrupted_run_with_graphs_goes_on_to_the_bit(cuda: str, tmp_path: Path) -> None:
-    config = preset("smoke", env="SignpostEasy-v0", device=cuda, total_frames=512, checkpoint_every=64)
+    config = preset(
+        "smoke", env="SignpostEasy-v0", device=cuda, total_frames=512, checkpoint_every=64
+    )
     assert_goes_on_to_the_bit(dataclasses.replace(config, cuda_graphs=True), tmp_path)
 
 
 def test_a_killed_run_goes_on_to_the_bit(device: str, tmp_path: Path) -> None:
-    config = preset("smoke", env="CartPoleEasy-v0", device=device, total_frames=640, checkpoint_every=128)
+    config = preset(
+        "smoke", env="CartPoleEasy-v0", device=device, total_frames=640, checkpoint_every=128
+    )
     train(config, tmp_path / "whole")
     kill_and_resume(tmp_path / "killed", random.Random(0), config)
     assert_same_run(tmp_path / "killed", tmp_path / "whole")

@@ -1,4 +1,6 @@
-"""``make gpu`` rehearsed on the CPU: every stage in a tiny form, what a second call does, and the page."""
+"""``make gpu`` rehearsed on the CPU: every stage in a tiny form, what a second call does, and the
+page.
+"""
 
 import re
 import subprocess
@@ -26,26 +28,44 @@ def in_this_process(stage: Stage, log: Path, seconds: float) -> int | None:
     log.write_text("")
     if "pytest" in stage.argv:
         report = Path(stage.argv[-1].removeprefix("--junitxml="))
-        report.write_text('<testsuite><testcase classname="a.b" name="test_c" time="0.1"/></testsuite>')
+        report.write_text(
+            '<testsuite><testcase classname="a.b" name="test_c" time="0.1"/></testsuite>'
+        )
         return 0
     if stage.argv[0] == "-c":
         return subprocess.run([sys.executable, *stage.argv], cwd=ROOT, check=False).returncode
     return cli.main(list(stage.argv[2:]))
 
 
-def test_a_rehearsal_runs_every_stage_and_writes_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rehearsal_runs_every_stage_and_writes_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(stages, "launch", in_this_process)
     assert stages.main([str(tmp_path), "--device", "cpu"]) == 0
     names = [stage.name for stage in stages.stages(tmp_path, "cpu")]
-    assert {name.split("-")[0] for name in names} == {"machine", "tests", "envs", "train", "memory", "study"}
+    assert {name.split("-")[0] for name in names} == {
+        "machine",
+        "tests",
+        "envs",
+        "train",
+        "memory",
+        "study",
+    }
     page = (tmp_path / "gpu.md").read_text()
     for name in ("envs", "train", "models", "scans", "saliency"):
         assert f"## {TABLES[name].title}\n" in page
     rows = read_csv(tmp_path / "study-tiny.csv")
     assert [row["observability"] for row in rows] == ["full", "partial"]
-    assert all(row["status"] == "finished" and float(row["seconds"]) > 0 and row["run"] in page for row in rows)
+    assert all(
+        row["status"] == "finished" and float(row["seconds"]) > 0 and row["run"] in page
+        for row in rows
+    )
     machine = read_csv(tmp_path / "machine.csv")[0]
-    assert machine["torch"] in page and machine["jax_device"] in page and "| tests-bridge | 1 |" in page
+    assert (
+        machine["torch"] in page
+        and machine["jax_device"] in page
+        and "| tests-bridge | 1 |" in page
+    )
     monkeypatch.setattr(stages, "launch", None)
     assert stages.main([str(tmp_path), "--device", "cpu"]) == 0  # all is done: nothing runs again
 
@@ -65,7 +85,11 @@ def test_every_command_for_a_card_is_one_that_the_parser_takes(tmp_path: Path) -
 
 def test_tests_marked_gpu_stand_where_a_stage_finds_them() -> None:
     marked = re.compile(r"^(?:@|pytestmark = )pytest\.mark\.gpu$", re.MULTILINE)
-    found = [path.relative_to(ROOT) for path in (ROOT / "tests").rglob("test_*.py") if marked.search(path.read_text())]
+    found = [
+        path.relative_to(ROOT)
+        for path in (ROOT / "tests").rglob("test_*.py")
+        if marked.search(path.read_text())
+    ]
     known = [Path(path) for paths in stages.TESTS.values() for path in paths]
     assert len(found) >= 5 and all((ROOT / path).exists() for path in known)
     assert not [path for path in found if not any(path.is_relative_to(place) for place in known)]
@@ -76,19 +100,32 @@ def test_a_stage_that_fails_stops_no_other_and_is_tried_again_after_them(
 ) -> None:
     chosen = [script("bad", FAILS), script("good", "print('two')"), script("more", FAILS)]
     assert run(chosen, tmp_path, 60) == {"bad": "failed", "good": "done", "more": "failed"}
-    assert "no card at hand" in capsys.readouterr().out and (tmp_path / "bad.log").read_text().startswith("one")
+    assert "no card at hand" in capsys.readouterr().out and (
+        tmp_path / "bad.log"
+    ).read_text().startswith("one")
     (tmp_path / "more.failed").unlink()
     (tmp_path / "good.log").unlink()
-    assert run([script("bad", ""), *chosen[1:]], tmp_path, 60) == {"bad": "done", "good": "done", "more": "failed"}
+    assert run([script("bad", ""), *chosen[1:]], tmp_path, 60) == {
+        "bad": "done",
+        "good": "done",
+        "more": "failed",
+    }
     told = capsys.readouterr().out
     assert told.index("more ...") < told.index("bad ...") and not (tmp_path / "good.log").exists()
-    assert "exit code 0" in (tmp_path / "bad.done").read_text() and not (tmp_path / "bad.failed").exists()
+    assert (
+        "exit code 0" in (tmp_path / "bad.done").read_text()
+        and not (tmp_path / "bad.failed").exists()
+    )
 
 
 def test_what_the_time_does_not_suffice_for_goes_on_with_the_next_call(tmp_path: Path) -> None:
     sleeps = "import time; time.sleep(60)"
     saves = f"import pathlib, signal, sys; signal.signal(15, lambda *_: sys.exit(130)); {sleeps}"
-    study, bench, last = script("study", saves, resumes=True), script("bench", sleeps), script("last", "")
+    study, bench, last = (
+        script("study", saves, resumes=True),
+        script("bench", sleeps),
+        script("last", ""),
+    )
     assert run([study, bench], tmp_path, 1) == {"study": "unfinished", "bench": "waiting"}
     assert not list(tmp_path.glob("*.done")) and not list(tmp_path.glob("*.failed"))
     assert run([last, bench], tmp_path, 2) == {"last": "done", "bench": "unfinished"}
@@ -110,7 +147,9 @@ def test_a_page_names_what_failed_and_what_is_left(tmp_path: Path) -> None:
     assert "| tests-bridge |  | 1 |  |  |" in page and "`make gpu DEVICE=cuda`" in page
 
 
-def test_an_unknown_stage_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_stage_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         stages.main([str(tmp_path), "--only", "trian-*"])
     assert "no stage is called trian-*; there are machine, tests-bridge" in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""Actor and critic, the feed-forward network, heads: published sizes, one tower or two, what an output means."""
+"""Actor and critic, the feed-forward network, heads: published sizes, one tower or two, what an
+output means.
+"""
 
 import pytest
 import torch
@@ -42,7 +44,13 @@ def test_the_feed_forward_network_looks_at_each_frame_alone():
     pixels, last_action, is_init = inputs(2, 4)
     out, _ = run(network, pixels, last_action, is_init, network.initial_state(2))
     alone = [
-        run(network, pixels[:, t : t + 1], last_action[:, :1], is_init[:, :1], network.initial_state(2))[0]
+        run(
+            network,
+            pixels[:, t : t + 1],
+            last_action[:, :1],
+            is_init[:, :1],
+            network.initial_state(2),
+        )[0]
         for t in (3, 1)
     ]
     torch.testing.assert_close(torch.cat(alone, 1), out[:, [3, 1]])
@@ -95,7 +103,9 @@ def test_one_tower_gives_both_and_the_critic_reads_what_the_actor_left(memory):
     with torch.no_grad():
         out, _ = run(network, pixels, last_action, is_init, state)
         flags = is_init[:, :1].clone()
-        step = TensorDict({"pixels": pixels[:, 0], "last_action": last_action[:, 0], "is_init": flags}, [3])
+        step = TensorDict(
+            {"pixels": pixels[:, 0], "last_action": last_action[:, 0], "is_init": flags}, [3]
+        )
         whole = network(step.copy())
         acted = network.actor(step.copy())
         alone = network.estimator(step.copy())
@@ -110,21 +120,29 @@ def test_one_tower_gives_both_and_the_critic_reads_what_the_actor_left(memory):
 def test_an_output_is_read_by_name():
     network = make_actor_critic("small", "mlp")
     out = torch.randn(2, 3, 6)
-    assert network.select(out, "logits").shape == (2, 3, 5) and network.select(out, "value").shape == (2, 3, 1)
+    assert network.select(out, "logits").shape == (2, 3, 5) and network.select(
+        out, "value"
+    ).shape == (2, 3, 1)
     torch.testing.assert_close(network.select(out, "probs").sum(-1), torch.ones(2, 3))
     with pytest.raises(ValueError, match="offers logits, probs, value, not 'q'"):
         network.select(out, "q")
 
 
 def test_its_head_goes_by_both_names():
-    one, other = make_actor_critic("paper", "gru", head="linear"), make_actor_critic(actor_critic_head="linear")
+    one, other = (
+        make_actor_critic("paper", "gru", head="linear"),
+        make_actor_critic(actor_critic_head="linear"),
+    )
     assert type(one.actor.head) is type(other.actor.head) is nn.Linear
 
 
 def test_calibration_reaches_both_towers():
     network = make_actor_critic("small", "mlp", towers=2)
     network.calibrate(inputs(4, 3, 128)[0])
-    assert torch.equal(network.actor.encoder.mean, network.critic.encoder.mean) and network.actor.encoder.mean.any()
+    assert (
+        torch.equal(network.actor.encoder.mean, network.critic.encoder.mean)
+        and network.actor.encoder.mean.any()
+    )
 
 
 def test_wrong_names_get_one_clear_line():

@@ -5,7 +5,17 @@ import sys
 
 import pytest
 
-MISSING = ("jax", "jaxlib", "torchrl", "gymnasium", "matplotlib", "tyro", "rich", "safetensors", "filelock")
+MISSING = (
+    "jax",
+    "jaxlib",
+    "torchrl",
+    "gymnasium",
+    "matplotlib",
+    "tyro",
+    "rich",
+    "safetensors",
+    "filelock",
+)
 
 PROGRAM = """
 import sys

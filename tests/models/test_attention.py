@@ -1,4 +1,6 @@
-"""Sliding-window attention: blocks equal the plain loop and the textbook; the window, the cache and positions."""
+"""Sliding-window attention: blocks equal the plain loop and the textbook; the window, the cache and
+positions.
+"""
 
 import pytest
 import torch
@@ -30,8 +32,12 @@ def flags(batch, length, *starts):
 def test_every_block_size_equals_the_loop_values_and_gradients(length, window, block, width, seed):
     torch.manual_seed(seed)
     query = torch.randn(2, length, width, dtype=F64, requires_grad=True)
-    key, value = (torch.randn(2, window - 1 + length, width, dtype=F64, requires_grad=True) for _ in "kv")
-    episode = torch.cat([torch.randint(-1, 1, (2, window - 1)), (torch.rand(2, length) < 0.2).cumsum(1)], 1)
+    key, value = (
+        torch.randn(2, window - 1 + length, width, dtype=F64, requires_grad=True) for _ in "kv"
+    )
+    episode = torch.cat(
+        [torch.randint(-1, 1, (2, window - 1)), (torch.rand(2, length) < 0.2).cumsum(1)], 1
+    )
     y = window_attention(query, key, value, episode, window, block=block)
     loop = window_attention_loop(query, key, value, episode, window)
     torch.testing.assert_close(y, loop, rtol=1e-12, atol=1e-12)
@@ -48,8 +54,12 @@ def test_every_block_size_equals_the_loop_values_and_gradients(length, window, b
 @pytest.mark.parametrize("length", [1, 2, 3, 7, 128, 132, 1000])
 def test_odd_and_long_sequences_equal_the_loop(dtype, tolerance, length):
     query, key, value = (torch.randn(2, length + 127 * past, 16, dtype=dtype) for past in (0, 1, 1))
-    episode = torch.cat([torch.zeros(2, 127, dtype=torch.int64), (torch.rand(2, length) < 0.01).cumsum(1)], 1)
-    y, loop = (form(query, key, value, episode, 128) for form in (window_attention, window_attention_loop))
+    episode = torch.cat(
+        [torch.zeros(2, 127, dtype=torch.int64), (torch.rand(2, length) < 0.01).cumsum(1)], 1
+    )
+    y, loop = (
+        form(query, key, value, episode, 128) for form in (window_attention, window_attention_loop)
+    )
     torch.testing.assert_close(y, loop, rtol=0, atol=tolerance * float(loop.abs().max()))
 
 
@@ -98,7 +108,12 @@ def test_only_the_distance_of_two_steps_matters():
 def test_pairs_are_turned_in_place_whatever_their_memory_looks_like(width, dtype):
     cosine, sine = angles(torch.arange(5), width, dtype)
     wide = torch.randn(3, 5, 2 * width + 2, dtype=dtype)
-    views = [torch.randn(3, 5, width, dtype=dtype), wide[..., 1 : width + 1], wide[..., 2 : width + 2], wide[..., ::2]]
+    views = [
+        torch.randn(3, 5, width, dtype=dtype),
+        wide[..., 1 : width + 1],
+        wide[..., 2 : width + 2],
+        wide[..., ::2],
+    ]
     for x in (view[..., :width].requires_grad_() for view in views):
         turned, apart = rotate_pairs(x, cosine, sine), rotate(x, cosine, sine)
         even = width // 2 * 2
@@ -115,7 +130,10 @@ def test_acting_under_vmap_with_flags_that_differ_equals_one_batch():
     x, is_init = torch.randn(6, 1, 3), torch.arange(6).reshape(6, 1) % 2 == 0
 
     def act(x, is_init, *leaves):
-        rows = TensorDict({n: leaf.unsqueeze(0) for n, leaf in zip(state.keys(), leaves, strict=True)}, batch_size=[1])
+        rows = TensorDict(
+            {n: leaf.unsqueeze(0) for n, leaf in zip(state.keys(), leaves, strict=True)},
+            batch_size=[1],
+        )
         y, after = memory(x.unsqueeze(0), rows, is_init.unsqueeze(0))
         return y[0], after["key"][0]
 
@@ -128,11 +146,17 @@ def test_acting_under_vmap_with_flags_that_differ_equals_one_batch():
 @pytest.mark.parametrize("lengths", [(8,), (1,) * 8, (3, 5), (6, 1, 1)])
 def test_the_state_is_a_ring_of_rotated_keys_and_unused_slots_hold_zeros(lengths):
     memory = make_memory("attention", 3, 4, window=5)
-    for start, steps in ((5, 3), (0, 8)):  # with three steps of an episode in it, and with more than fit
+    # With three steps of an episode in it, and with more than fit.
+    for start, steps in (
+        (5, 3),
+        (0, 8),
+    ):
         x, state, begin = torch.randn(1, 8, 3), memory.initial_state(1), 0
         is_init = flags(1, 8, start)
         for length in lengths:
-            _, state = memory(x[:, begin : begin + length], state, is_init[:, begin : begin + length])
+            _, state = memory(
+                x[:, begin : begin + length], state, is_init[:, begin : begin + length]
+            )
             begin += length
         assert state["step"].tolist() == [steps]
         for slot in range(5):
@@ -142,7 +166,10 @@ def test_the_state_is_a_ring_of_rotated_keys_and_unused_slots_hold_zeros(lengths
                 if name == "key" and held:
                     row = rotate_pairs(row, *angles(torch.tensor(held), 4, row.dtype))
                 torch.testing.assert_close(state[name][:, slot], row)
-    assert {key: tuple(leaf.shape) for key, leaf in make_memory("attention", 512, 512).initial_state(1).items()} == {
+    assert {
+        key: tuple(leaf.shape)
+        for key, leaf in make_memory("attention", 512, 512).initial_state(1).items()
+    } == {
         "key": (1, 128, 512),
         "value": (1, 128, 512),
         "step": (1,),
@@ -176,7 +203,9 @@ def test_an_empty_window_for_every_chunk_is_an_option_and_breaks_the_law_of_seve
 def test_mask_and_weights_stay_small_for_long_sequences():
     memory = make_memory("attention", 4, 4, window=32)
     sizes = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: (sizes.append(x.numel()), x)[1], lambda x: x):
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda x: (sizes.append(x.numel()), x)[1], lambda x: x
+    ):
         memory(torch.randn(1, 1000, 4), memory.initial_state(1), flags(1, 1000))
     assert max(sizes) <= 1024 * (32 + 128)
 

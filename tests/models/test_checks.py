@@ -65,7 +65,9 @@ class LeakyAverage(nn.Module):
             return y
         if flaw == "wider":
             self.hidden_size = 3
-        return (y.transpose(0, 1) if flaw == "time first" else y), TensorDict({"h": h}, batch_size=[len(x)])
+        return (y.transpose(0, 1) if flaw == "time first" else y), TensorDict(
+            {"h": h}, batch_size=[len(x)]
+        )
 
 
 def test_a_third_partys_lawful_module_passes():
@@ -81,8 +83,16 @@ def test_a_third_partys_lawful_module_passes():
         ("time first", "shapes are fixed", "exchanged"),
         ("float32", "shapes are fixed", "float32"),
         ("wider", "shapes are fixed", "hidden_size is not the width of y"),
-        ("no state", "shapes are fixed", "initial_state and forward gave TensorDict, Tensor.* return .y, state."),
-        ("dictionary", "shapes are fixed", "gave dict, Tensor, TensorDict. Likely cause: a state is no TensorDict"),
+        (
+            "no state",
+            "shapes are fixed",
+            "initial_state and forward gave TensorDict, Tensor.* return .y, state.",
+        ),
+        (
+            "dictionary",
+            "shapes are fixed",
+            "gave dict, Tensor, TensorDict. Likely cause: a state is no TensorDict",
+        ),
         ("ignores state", "scan equals step by step", "differ"),
         ("looks ahead", "scan equals step by step", "future"),
         ("late flag", "scan equals step by step", "late"),
@@ -115,12 +125,19 @@ def test_the_size_of_the_discrepancy_is_reported():
 
 
 class TreeMinGRU(MinGRU):
-    """Combines (state, gate) pairs as a tree, as if the operator were associative; one step at a time it is right."""
+    """Combines (state, gate) pairs as a tree, as if the operator were associative; one step at a
+    time it is right.
+    """
 
     def run(self, x, h0, is_init):
         gate, candidate = self.gate_and_candidate(x).chunk(2, dim=-1)
         pairs = [(h0, torch.zeros_like(h0), torch.zeros_like(is_init[:, :1]))]
-        pairs += zip(candidate.tanh().unbind(1), gate.sigmoid().unbind(1), is_init.unsqueeze(-1).unbind(1), strict=True)
+        pairs += zip(
+            candidate.tanh().unbind(1),
+            gate.sigmoid().unbind(1),
+            is_init.unsqueeze(-1).unbind(1),
+            strict=True,
+        )
         states = [self.combined(pairs[: t + 2])[0] for t in range(x.shape[1])]
         y = torch.stack(states, 1)
         return y, y
@@ -158,7 +175,9 @@ def test_a_state_lost_at_the_border_of_a_chunk_is_caught():
 
 
 class LateReset(nn.Module):
-    """Resets one step late, and does so alike in every split, because the flag is part of the state."""
+    """Resets one step late, and does so alike in every split, because the flag is part of the
+    state.
+    """
 
     input_size = 3
 
@@ -168,7 +187,10 @@ class LateReset(nn.Module):
 
     def initial_state(self, batch_size):
         like = self.linear.weight
-        return TensorDict({"h": like.new_zeros(batch_size, 4), "flag": like.new_zeros(batch_size, 1)}, [batch_size])
+        return TensorDict(
+            {"h": like.new_zeros(batch_size, 4), "flag": like.new_zeros(batch_size, 1)},
+            [batch_size],
+        )
 
     def forward(self, x, state, is_init):
         h, late, outputs = state["h"], state["flag"].bool(), []
@@ -189,12 +211,17 @@ def test_a_reset_that_is_consistently_one_step_late_is_caught():
 def test_a_linear_transformer_without_a_running_normaliser_is_caught():
     with pytest.raises(MemoryLawError, match="normaliser that is not accumulated") as caught:
         check_memory(make_memory("linear_transformer", 3, 4, legacy_normaliser=True))
-    assert caught.value.law == "an average of equal values is that value" and caught.value.discrepancy > 0.1
+    assert (
+        caught.value.law == "an average of equal values is that value"
+        and caught.value.discrepancy > 0.1
+    )
 
 
 def test_a_model_that_does_not_claim_to_average_is_not_held_to_it():
     assert "an average of equal values is that value" not in check_memory(make_memory("gdn", 3, 4))
-    assert "an average of equal values is that value" in check_memory(make_memory("attention", 3, 4))
+    assert "an average of equal values is that value" in check_memory(
+        make_memory("attention", 3, 4)
+    )
 
 
 class ForgetfulReplay(MinGRU):
@@ -226,7 +253,9 @@ def test_the_module_itself_is_left_alone():
     state = torch.random.get_rng_state()
     check_memory(memory)
     assert memory.training and memory.linear.weight.dtype == torch.float32
-    assert torch.equal(memory.linear.weight, weights) and torch.equal(torch.random.get_rng_state(), state)
+    assert torch.equal(memory.linear.weight, weights) and torch.equal(
+        torch.random.get_rng_state(), state
+    )
 
 
 def test_the_input_size_is_asked_for_when_it_cannot_be_known():

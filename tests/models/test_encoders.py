@@ -57,10 +57,16 @@ def test_small_pooling_is_the_floor_of_the_block_mean(side, block, lead, high, s
     block *= 64 // side  # up to 256 pixels
     size = side * block
     generator = torch.Generator().manual_seed(seed)
-    pixels = torch.randint(256 - high, 256, (*lead, size, size, 3), dtype=torch.uint8, generator=generator)
+    pixels = torch.randint(
+        256 - high, 256, (*lead, size, size, 3), dtype=torch.uint8, generator=generator
+    )
     pooled = SmallEncoder(size, side).compress(pixels)
     sums = pixels.long().reshape(*lead, side, block, side, block, 3).sum((-4, -2))
-    assert pooled.dtype == torch.uint8 and pooled.shape == (*lead, side, side, 3) and pooled.is_contiguous()
+    assert (
+        pooled.dtype == torch.uint8
+        and pooled.shape == (*lead, side, side, 3)
+        and pooled.is_contiguous()
+    )
     assert torch.equal(pooled, (sums // block**2).to(torch.uint8))
 
 
@@ -75,12 +81,17 @@ def test_pooling_does_not_write_to_the_frames():
 def test_pooling_many_frames_at_once_equals_pooling_each():
     pixels = frames(33, 2)
     encoder = SmallEncoder()
-    assert torch.equal(encoder.compress(pixels), torch.stack([encoder.compress(row) for row in pixels]))
+    assert torch.equal(
+        encoder.compress(pixels), torch.stack([encoder.compress(row) for row in pixels])
+    )
 
 
 def test_pooling_reads_frames_that_are_not_contiguous():
     pixels = frames(4, 6)
-    assert torch.equal(SmallEncoder().compress(pixels[:, ::2]), SmallEncoder().compress(pixels[:, ::2].contiguous()))
+    assert torch.equal(
+        SmallEncoder().compress(pixels[:, ::2]),
+        SmallEncoder().compress(pixels[:, ::2].contiguous()),
+    )
 
 
 @pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
@@ -99,7 +110,9 @@ def test_full_and_compressed_frames_give_the_same_features():
 
 
 @pytest.mark.parametrize(("size", "seen", "stored"), [(128, 119, 120), (256, 217, 218)])
-def test_the_papers_encoder_depends_on_the_upper_left_part_which_is_all_it_stores(size, seen, stored):
+def test_the_papers_encoder_depends_on_the_upper_left_part_which_is_all_it_stores(
+    size, seen, stored
+):
     encoder, pixels = PaperEncoder(size).eval(), frames(2, size=size)
     assert encoder.stored_size == stored
     assert encoder.compress(pixels).shape == (2, stored, stored, 3)
@@ -119,14 +132,18 @@ def test_the_papers_encoder_depends_on_the_upper_left_part_which_is_all_it_store
 @pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
 def test_float_frames_equal_uint8_frames_and_have_gradients(make):
     encoder = make().double()
-    blocky = frames(2, size=32).repeat_interleave(4, 1).repeat_interleave(4, 2)  # block means without a remainder
+    blocky = (
+        frames(2, size=32).repeat_interleave(4, 1).repeat_interleave(4, 2)
+    )  # block means without a remainder
     smooth = blocky.double().requires_grad_()
     torch.testing.assert_close(encoder(smooth), encoder(blocky))
     encoder(smooth)[:, :7].square().sum().backward()
     assert (smooth.grad != 0).double().mean() > 0.2
     direction = torch.randn_like(smooth)
     with torch.no_grad():
-        slope = (encoder(smooth + 1e-5 * direction) - encoder(smooth - 1e-5 * direction))[:, :7] / 2e-5
+        slope = (encoder(smooth + 1e-5 * direction) - encoder(smooth - 1e-5 * direction))[
+            :, :7
+        ] / 2e-5
         expected = (2 * encoder(smooth)[:, :7] * slope).sum()
     torch.testing.assert_close((smooth.grad * direction).sum(), expected, rtol=1e-4, atol=1e-8)
 
@@ -140,7 +157,9 @@ def test_compressed_float_frames_are_read_too():
 @pytest.mark.parametrize("compressed", [False, True])
 def test_calibration_centres_each_pixel_and_scales_all_to_rms_one(compressed):
     encoder = SmallEncoder()
-    pixels = (frames(300, 2) // 3 + torch.arange(128, dtype=torch.uint8).view(128, 1, 1)).to(torch.uint8)
+    pixels = (frames(300, 2) // 3 + torch.arange(128, dtype=torch.uint8).view(128, 1, 1)).to(
+        torch.uint8
+    )
     pooled = encoder.compress(pixels)
     encoder.calibrate(pooled if compressed else pixels)
     x = (pooled.permute(0, 1, 4, 2, 3) - encoder.mean) * encoder.inverse_rms
@@ -157,7 +176,8 @@ def test_calibration_on_frames_that_never_change_stays_finite():
 
 def test_wrong_sizes_get_one_clear_line():
     with pytest.raises(
-        ValueError, match=r"\[\.\.\., 128, 128, 3\].*compressed \[\.\.\., 32, 32, 3\], got \[2, 3, 128, 128\]"
+        ValueError,
+        match=r"\[\.\.\., 128, 128, 3\].*compressed \[\.\.\., 32, 32, 3\], got \[2, 3, 128, 128\]",
     ):
         SmallEncoder()(torch.zeros(2, 3, 128, 128))
     with pytest.raises(ValueError, match="128 and 256, got 64"):
@@ -172,13 +192,19 @@ def test_wrong_sizes_get_one_clear_line():
 
 @pytest.mark.parametrize("side", [32, 64])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
-def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_on_scaled_frames(dtype, tolerance, side):
+def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_on_scaled_frames(
+    dtype, tolerance, side
+):
     encoder, pixels = SmallEncoder(128, side, side), frames(40) // 2
     encoder.calibrate(pixels)
     encoder.to(dtype)
     weights = [encoder.conv1, encoder.conv2, encoder.linear]
-    x = (encoder.compress(pixels).permute(0, 3, 1, 2).to(dtype) - encoder.mean) * encoder.inverse_rms
-    x = F.leaky_relu(F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=side // 8))
+    x = (
+        encoder.compress(pixels).permute(0, 3, 1, 2).to(dtype) - encoder.mean
+    ) * encoder.inverse_rms
+    x = F.leaky_relu(
+        F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=side // 8)
+    )
     x = F.leaky_relu(F.conv2d(x, encoder.conv2.weight, encoder.conv2.bias))
     x = F.linear(x.flatten(1), encoder.linear.weight.flatten(1), encoder.linear.bias)
     plain, found = F.leaky_relu(F.layer_norm(x, (128,))), encoder(pixels)
@@ -186,8 +212,12 @@ def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_o
     assert len(parameters) == len(list(encoder.parameters()))
     cotangent = torch.randn_like(plain)
     wanted = [plain, *torch.autograd.grad(plain, parameters, cotangent)]
-    for one, other in zip([found, *torch.autograd.grad(found, parameters, cotangent)], wanted, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=tolerance * float(other.detach().abs().max()))
+    for one, other in zip(
+        [found, *torch.autograd.grad(found, parameters, cotangent)], wanted, strict=True
+    ):
+        torch.testing.assert_close(
+            one, other, rtol=0, atol=tolerance * float(other.detach().abs().max())
+        )
 
 
 @pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
@@ -197,7 +227,10 @@ def test_frames_that_were_divided_by_255_already_are_refused(make):
     frames = torch.randint(0, 256, (2, 128, 128, 3), dtype=torch.uint8)
     torch.testing.assert_close(encoder(frames.float()), encoder(frames), atol=0.05, rtol=0.1)
     assert encoder(torch.zeros(2, 128, 128, 3)).isfinite().all()
-    with pytest.raises(ValueError, match=r"floats go up to 1, expected uint8, or floats from 0 to 255 \(not 0 to 1\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"floats go up to 1, expected uint8, or floats from 0 to 255 \(not 0 to 1\)",
+    ):
         encoder(frames / 255)
     vectorised = torch.func.vmap(encoder)(frames.float()[:, None])
     torch.testing.assert_close(vectorised.squeeze(1), encoder(frames.float()), atol=1e-4, rtol=1e-4)

@@ -1,4 +1,6 @@
-"""Networks run with parameters that a loss holds: targets, buffers in their place, and stacks under vmap."""
+"""Networks run with parameters that a loss holds: targets, buffers in their place, and stacks under
+vmap.
+"""
 
 import pytest
 import torch
@@ -18,7 +20,9 @@ N, T = 3, 6
 
 
 def batch(network, steps=T):
-    """Random data [N, T] as a collector gives it, with a termination, a truncation, and starts behind them."""
+    """Random data [N, T] as a collector gives it, with a termination, a truncation, and starts
+    behind them.
+    """
     done = torch.zeros(N, steps, 1, dtype=torch.bool)
     done[0, 2] = done[1, 3] = True
     is_init = torch.cat([torch.zeros_like(done[:, :1]), done[:, :-1]], 1)
@@ -28,9 +32,19 @@ def batch(network, steps=T):
         return torch.randint(0, 256, (N, steps, 32, 32, 3), dtype=torch.uint8)
 
     action = torch.randint(0, 5, (N, steps))
-    root = {"pixels": frames(), "last_action": action.roll(1, 1), "is_init": is_init, "action": action}
+    root = {
+        "pixels": frames(),
+        "last_action": action.roll(1, 1),
+        "is_init": is_init,
+        "action": action,
+    }
     data = TensorDict(root, [N, steps])
-    following = {"pixels": frames(), "last_action": action, "is_init": torch.zeros_like(is_init), "done": done}
+    following = {
+        "pixels": frames(),
+        "last_action": action,
+        "is_init": torch.zeros_like(is_init),
+        "done": done,
+    }
     first = (torch.arange(N) == 0)[:, None, None]
     ends = {"terminated": done & first, "truncated": done & ~first}
     data["next"] = TensorDict(following | ends | {"reward": torch.randn(N, steps, 1)}, [N, steps])
@@ -55,7 +69,9 @@ def test_a_stock_loss_with_targets_trains_the_memory_and_moves_its_targets(name,
     loss.make_value_estimator(gamma=0.9)
     updater = SoftUpdate(loss, eps=0.5)
     loss(batch(network))["loss"].backward()
-    assert gradient(network.encoder) > 0 and gradient(network.block) > 0 and gradient(network.head) > 0
+    assert (
+        gradient(network.encoder) > 0 and gradient(network.block) > 0 and gradient(network.head) > 0
+    )
     before = loss.target_value_network_params.clone()
     with torch.no_grad():
         for parameter in network.parameters():
@@ -71,7 +87,10 @@ def test_a_stock_loss_with_targets_trains_the_memory_and_moves_its_targets(name,
 def test_two_stacked_networks_equal_the_two_apart_values_and_gradients(name, what):
     options = {"memory_options": {"window": 4}} if name == "attention" else {}
     store = "step" if what == "stored states" else "sequence"
-    networks = [make_network("small", name, store=store, hidden_size=8, **options).double() for _ in range(2)]
+    networks = [
+        make_network("small", name, store=store, hidden_size=8, **options).double()
+        for _ in range(2)
+    ]
     data = batch(networks[0])
     data = data[:, 1] if what == "one step" else data
     data = data.apply(lambda x: x.double() if x.is_floating_point() else x)
@@ -99,7 +118,10 @@ def test_plain_tensors_a_step_and_a_sequence_give_the_same_and_the_primer_has_th
     data = batch(network).exclude(*network.state_keys)
     with torch.no_grad():
         out, last = network.remember(
-            network.encode(data["pixels"]), data["last_action"], data["is_init"].squeeze(-1), network.initial_state(N)
+            network.encode(data["pixels"]),
+            data["last_action"],
+            data["is_init"].squeeze(-1),
+            network.initial_state(N),
         )
         with set_recurrent_mode(True):
             torch.testing.assert_close(network(data.copy())["action_value"], out)
@@ -112,7 +134,9 @@ def test_plain_tensors_a_step_and_a_sequence_give_the_same_and_the_primer_has_th
     for key in network.state_keys:
         torch.testing.assert_close(state[key[1:]], last[key[1:]], rtol=0, atol=1e-5)
     primer = get_primers_from_module(network, warn=False)
-    assert set(network.state_keys) == (set(primer.primers.keys(True, True)) if network.state_keys else set())
+    assert set(network.state_keys) == (
+        set(primer.primers.keys(True, True)) if network.state_keys else set()
+    )
     assert bool(network.state_keys) == (name not in ("mlp", "feedforward"))
     assert network.out_keys == ["action_value", *(("next", *key) for key in network.state_keys)]
     assert {key.split(".")[0] for key in network.state_dict()} == {"encoder", "block", "head"}
@@ -127,17 +151,28 @@ def test_actor_and_critic_write_their_outputs_and_states_and_the_critic_works_al
     assert set(network.out_keys) <= set(step.keys(True, True))
     keys = set(get_primers_from_module(network, warn=False).transforms[0].primers.keys(True, True))
     keys |= set(get_primers_from_module(network, warn=False).transforms[1].primers.keys(True, True))
-    assert keys == {("memory", "actor", "layer0", "h"), ("memory", "critic", "layer0", "h")} <= set(network.in_keys)
+    assert (
+        keys
+        == {("memory", "actor", "layer0", "h"), ("memory", "critic", "layer0", "h")}
+        <= set(network.in_keys)
+    )
     with set_recurrent_mode(True):
         whole = network(data.copy())
         out, _ = network.remember(
-            network.encode(data["pixels"]), data["last_action"], data["is_init"].squeeze(-1), network.initial_state(N)
+            network.encode(data["pixels"]),
+            data["last_action"],
+            data["is_init"].squeeze(-1),
+            network.initial_state(N),
         )
         torch.testing.assert_close(torch.cat([whole["logits"], whole["state_value"]], -1), out)
         torch.testing.assert_close(network.critic(data.copy())["state_value"], whole["state_value"])
     critic = make_actor_critic("small", "gru", store="step", towers=2).critic
     with set_recurrent_mode(True):
-        assert GAE(gamma=0.9, lmbda=0.8, value_network=critic)(batch(critic))["advantage"].isfinite().all()
+        assert (
+            GAE(gamma=0.9, lmbda=0.8, value_network=critic)(batch(critic))["advantage"]
+            .isfinite()
+            .all()
+        )
 
 
 @pytest.mark.parametrize("memory", ["gru", "attention", "mlp"])
@@ -151,7 +186,9 @@ def test_tensors_can_be_passed_by_name(memory):
 
 def test_a_missing_entry_is_named():
     with pytest.raises(KeyError, match="pixels"):
-        make_network("small", "gru")(TensorDict({"is_init": torch.ones(2, 1, dtype=torch.bool)}, [2]))
+        make_network("small", "gru")(
+            TensorDict({"is_init": torch.ones(2, 1, dtype=torch.bool)}, [2])
+        )
 
 
 def compilations(function, inputs):
@@ -163,7 +200,9 @@ def compilations(function, inputs):
         count.append(len(graph.graph.nodes))
         return graph.forward
 
-    compiled = torch.compile(function, backend=backend, fullgraph=True)  # fullgraph: no way back to eager
+    compiled = torch.compile(
+        function, backend=backend, fullgraph=True
+    )  # fullgraph: no way back to eager
     for arguments in inputs:
         compiled(*arguments)
     return len(count)
@@ -197,7 +236,11 @@ def test_loss_and_gradients_of_one_shape_compile_once(name):
     torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
-    weights = [p for p in [*network.block.parameters(), *network.head.parameters()] if isinstance(p, nn.Parameter)]
+    weights = [
+        p
+        for p in [*network.block.parameters(), *network.head.parameters()]
+        if isinstance(p, nn.Parameter)
+    ]
     for _ in range(20):
         features = torch.randn_like(features)
         ours = torch.autograd.grad(compiled(features), weights)

@@ -13,7 +13,9 @@ F64 = torch.float64
 def problem(batch=2, steps=5, size=3, resets=0.3):
     """Random arguments of the scan, with a start at index 0."""
     shapes = ((batch, steps, 3 * size), (2 * size, size), (size, size), (batch, steps, size))
-    gates, *weights, stored = (torch.randn(shape, dtype=F64, requires_grad=True) for shape in shapes)
+    gates, *weights, stored = (
+        torch.randn(shape, dtype=F64, requires_grad=True) for shape in shapes
+    )
     start = torch.rand(batch, steps) < resets
     start[:, 0] = True
     return gates, *weights, start, stored
@@ -45,7 +47,10 @@ def test_the_operator_equals_the_loop_values_and_gradients(batch, steps, size, r
 def test_vmap_over_any_of_the_arguments_equals_one_after_the_other(mapped):
     problems = [problem() for _ in range(3)]
     dims = tuple(0 if i in mapped else None for i in range(5))
-    stacked = [torch.stack([p[i] for p in problems]) if d == 0 else problems[0][i] for i, d in enumerate(dims)]
+    stacked = [
+        torch.stack([p[i] for p in problems]) if d == 0 else problems[0][i]
+        for i, d in enumerate(dims)
+    ]
     rows = [[p[i] if d == 0 else problems[0][i] for i, d in enumerate(dims)] for p in problems]
     y = torch.vmap(lambda *a: gru_scan(*a)[0], in_dims=dims)(*stacked)
     alone = torch.stack([gru_loop(*row)[0] for row in rows])
@@ -61,4 +66,6 @@ def test_opcheck_finds_nothing():
     torch.library.opcheck(gru_scan, arguments)
     with torch.no_grad():
         made = gru_scan(*arguments)
-    torch.library.opcheck(gru_scan_backward, (*(x.detach() for x in arguments[1:]), *made, torch.randn_like(made[0])))
+    torch.library.opcheck(
+        gru_scan_backward, (*(x.detach() for x in arguments[1:]), *made, torch.randn_like(made[0]))
+    )

@@ -1,4 +1,6 @@
-"""Linear transformer, gated delta net and TTT-linear are the published equations; options do what they say."""
+"""Linear transformer, gated delta net and TTT-linear are the published equations; options do what
+they say.
+"""
 
 import pytest
 import torch
@@ -11,7 +13,9 @@ STEPS = 9
 
 
 def run(name, **options):
-    """A model in float64, its inputs with a start at index 5, and its outputs from the initial state."""
+    """A model in float64, its inputs with a start at index 5, and its outputs from the initial
+    state.
+    """
     memory = make_memory(name, 3, 9, **options).double()
     x, is_init = torch.randn(1, STEPS, 3, dtype=F64), torch.zeros(1, STEPS, dtype=torch.bool)
     is_init[:, 5] = True
@@ -24,7 +28,9 @@ def projected(memory, x):
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_the_linear_transformer_divides_by_the_running_sum_of_keys_or_as_published_by_the_last(legacy):
+def test_the_linear_transformer_divides_by_the_running_sum_of_keys_or_as_published_by_the_last(
+    legacy,
+):
     memory, x, y, state = run("linear_transformer", legacy_normaliser=legacy)
     queries, keys, values = projected(memory, x)
     for t in range(STEPS):
@@ -74,14 +80,18 @@ def test_the_gated_delta_net_replaces_what_it_stored_under_a_key_and_the_publish
     recalled = {}
     for legacy in (False, True):
         torch.manual_seed(5)
-        memory = make_memory("gdn", 3, 9, gate_alpha=False, beta_range=2.0, legacy_left=legacy).double()
+        memory = make_memory(
+            "gdn", 3, 9, gate_alpha=False, beta_range=2.0, legacy_left=legacy
+        ).double()
         with torch.no_grad():
             for layer in (memory.gates, memory.query_key_value):
                 layer.weight[:1].zero_()
             memory.gates.weight.zero_()
             memory.gates.bias.zero_()  # beta = 1: a full write
             memory.query_key_value.weight[:6] = 0.0
-            memory.query_key_value.weight[:6, 0] = torch.tensor([1.0, 2.0, 3.0] * 2)  # equal queries and keys
+            memory.query_key_value.weight[:6, 0] = torch.tensor(
+                [1.0, 2.0, 3.0] * 2
+            )  # equal queries and keys
             x[..., 0] = 1.0
         y, _ = memory(x, memory.initial_state(1), torch.zeros(1, 2, dtype=torch.bool))
         written = memory.output(memory.query_key_value(x).chunk(3, -1)[2])

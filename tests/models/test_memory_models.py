@@ -68,7 +68,9 @@ def test_dtype_follows_the_parameters(name, dtype):
     state = memory.initial_state(2)
     y, after = memory(torch.randn(2, 5, 3, dtype=dtype), state, torch.zeros(2, 5, dtype=torch.bool))
     assert y.dtype == dtype
-    assert all(v.dtype == dtype for td in (state, after) for v in td.values() if v.is_floating_point())
+    assert all(
+        v.dtype == dtype for td in (state, after) for v in td.values() if v.is_floating_point()
+    )
 
 
 def problem(name, batch, steps, dtype, resets=0.03):
@@ -76,7 +78,9 @@ def problem(name, batch, steps, dtype, resets=0.03):
     memory = make_memory(name, 6, 6).to(dtype)
     x, flags = torch.randn(batch, steps + 5, 6, dtype=dtype), torch.rand(batch, steps) < resets
     with torch.no_grad():
-        _, state = memory(x[:, steps:], memory.initial_state(batch), torch.zeros(batch, 5, dtype=torch.bool))
+        _, state = memory(
+            x[:, steps:], memory.initial_state(batch), torch.zeros(batch, 5, dtype=torch.bool)
+        )
     return memory, x[:, :steps], state, flags
 
 
@@ -84,7 +88,9 @@ def assert_near(ours, theirs, dtype):
     """Equal to 1e-5 in float32 and 1e-12 in float64 of the largest number."""
     scale = float(theirs.abs().max().clamp_min(1e-3))
     tolerance = 1e-5 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(ours.double() / scale, theirs.double() / scale, rtol=0, atol=tolerance)
+    torch.testing.assert_close(
+        ours.double() / scale, theirs.double() / scale, rtol=0, atol=tolerance
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -117,9 +123,13 @@ def test_what_was_before_a_start_has_exactly_no_influence(name, start):
     gradients = torch.autograd.grad(
         y[:, start:].square().sum(), [x, *leaves], allow_unused=True, materialize_grads=True
     )
-    assert (gradients[0][:, :start] == 0).all() and all((gradient == 0).all() for gradient in gradients[1:])
+    assert (gradients[0][:, :start] == 0).all() and all(
+        (gradient == 0).all() for gradient in gradients[1:]
+    )
     _, other, other_state, _ = problem(name, 2, 132, torch.float32)
-    changed, changed_after = memory(torch.cat([50 * other[:, :start], x[:, start:]], 1), other_state, flags)
+    changed, changed_after = memory(
+        torch.cat([50 * other[:, :start], x[:, start:]], 1), other_state, flags
+    )
     assert torch.equal(changed[:, start:], y[:, start:])
     assert all(torch.equal(changed_after[key], leaf) for key, leaf in after.items())
 
@@ -151,7 +161,9 @@ def test_a_batch_of_parameters_under_vmap_equals_one_model_after_another(name):
     parameters, _ = torch.func.stack_module_state(models)
 
     def outputs(parameters):
-        return torch.func.functional_call(models[0], parameters, (x, models[0].initial_state(2), flags))[0]
+        return torch.func.functional_call(
+            models[0], parameters, (x, models[0].initial_state(2), flags)
+        )[0]
 
     y = torch.vmap(outputs)(parameters)
     gradients = torch.autograd.grad(y.square().sum(), list(parameters.values()))
@@ -159,7 +171,9 @@ def test_a_batch_of_parameters_under_vmap_equals_one_model_after_another(name):
         alone, _ = model(x, model.initial_state(2), flags)
         torch.testing.assert_close(y[i], alone)
         for ours, plain in zip(
-            gradients, torch.autograd.grad(alone.square().sum(), list(model.parameters())), strict=True
+            gradients,
+            torch.autograd.grad(alone.square().sum(), list(model.parameters())),
+            strict=True,
         ):
             torch.testing.assert_close(ours[i], plain)
 
@@ -172,7 +186,10 @@ def compiled_equals_eager(name, backend):
         y, after = memory(x, state, flags)
         return y.square().mean(), after
 
-    results = [function(x, state, flags) for function in (torch.compile(loss, fullgraph=True, backend=backend), loss)]
+    results = [
+        function(x, state, flags)
+        for function in (torch.compile(loss, fullgraph=True, backend=backend), loss)
+    ]
     torch.testing.assert_close(results[0][0], results[1][0])
     for key, leaf in results[1][1].items():
         torch.testing.assert_close(results[0][1][key], leaf)
@@ -217,7 +234,10 @@ def test_states_are_zeros_and_complex_ones_are_real_pairs():
 def test_mingru_is_the_papers_equation():
     memory = make_memory("mingru", 3, 4)
     x, h = torch.randn(2, 6, 3), torch.randn(2, 4)
-    (w1, w2), (b1, b2) = memory.gate_and_candidate.weight.chunk(2), memory.gate_and_candidate.bias.chunk(2)
+    (w1, w2), (b1, b2) = (
+        memory.gate_and_candidate.weight.chunk(2),
+        memory.gate_and_candidate.bias.chunk(2),
+    )
     state = memory.initial_state(2).set("h", h)
     y, _ = memory(x, state, torch.zeros(2, 6, dtype=torch.bool))
     for t in range(6):
@@ -252,7 +272,10 @@ def test_lru_is_the_papers_equation_in_complex_numbers():
     memory = make_memory("lru", 4, 4).double()
     x = torch.randn(2, 6, 4, dtype=torch.float64)
     decay = torch.exp(torch.complex(-memory.nu.exp(), memory.theta.exp()))
-    b, c = torch.complex(memory.input[:, 0], memory.input[:, 1]), torch.view_as_complex(memory.output.data).conj()
+    b, c = (
+        torch.complex(memory.input[:, 0], memory.input[:, 1]),
+        torch.view_as_complex(memory.output.data).conj(),
+    )
     y, state = memory(x, memory.initial_state(2), torch.zeros(2, 6, dtype=torch.bool))
     h = torch.zeros(2, 4, dtype=torch.complex128)
     for t in range(6):
@@ -267,7 +290,9 @@ def test_lru_starts_inside_the_ring_and_normalised():
     assert 0.5 <= radius.min() < 0.52 and 0.88 < radius.max() <= 0.9
     assert 0 < phase.min() < 0.01 and 0.29 < phase.max() <= 0.3
     torch.testing.assert_close(memory.gamma.exp(), torch.sqrt(1 - radius**2))
-    size = memory.input.detach().square().sum((1, 2)).mean()  # with gamma: white noise has states of size 1
+    size = (
+        memory.input.detach().square().sum((1, 2)).mean()
+    )  # with gamma: white noise has states of size 1
     assert float(size) == pytest.approx(1, abs=0.05)
     assert all(torch.isfinite(p).all() for p in make_memory("lru", 8, 1000).parameters())
 
@@ -312,15 +337,21 @@ def test_wrong_inputs_get_one_clear_line(name):
         memory(torch.zeros(2, 5, 3), memory.initial_state(2), None)
     with pytest.raises(ValueError, match=r"is_init must be bool .* got torch.float32 \[2, 5\]"):
         memory(torch.zeros(2, 5, 3), memory.initial_state(2), flags.float())
-    with pytest.raises(ValueError, match=r"x is torch.float64 but the parameters are torch.float32"):
+    with pytest.raises(
+        ValueError, match=r"x is torch.float64 but the parameters are torch.float32"
+    ):
         memory(torch.zeros(2, 5, 3, dtype=torch.float64), memory.initial_state(2), flags)
     with pytest.raises(ValueError, match="at least one step"):
         memory(torch.zeros(2, 0, 3), memory.initial_state(2), flags[:, :0])
     other = make_memory("lru" if name != "lru" else "gru", 3, 4).initial_state(2)
-    with pytest.raises(ValueError, match=r"the state of \w+ must be .* another model or batch size"):
+    with pytest.raises(
+        ValueError, match=r"the state of \w+ must be .* another model or batch size"
+    ):
         memory(torch.zeros(2, 5, 3), other, flags)
     if name != "mlp":
-        with pytest.raises(ValueError, match=r"another model or batch size; begin with initial_state"):
+        with pytest.raises(
+            ValueError, match=r"another model or batch size; begin with initial_state"
+        ):
             memory(torch.zeros(2, 5, 3), memory.initial_state(3), flags)
     for wrong in (None, torch.zeros(2, 4)):
         with pytest.raises(ValueError, match="must be a TensorDict, as from initial_state"):
@@ -332,7 +363,10 @@ def test_wrong_inputs_get_one_clear_line(name):
 
 
 def test_unknown_options_are_refused():
-    with pytest.raises(TypeError, match=r"^memory 'gru' has other options: got an unexpected keyword argument 'foo'$"):
+    with pytest.raises(
+        TypeError,
+        match=r"^memory 'gru' has other options: got an unexpected keyword argument 'foo'$",
+    ):
         make_memory("gru", 3, 4, foo=1)
     with pytest.raises(ValueError, match="tanh"):
         make_memory("mingru", 3, 4, candidate="relu")

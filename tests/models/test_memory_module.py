@@ -1,4 +1,6 @@
-"""MemoryModule keeps TorchRL's recurrent contract: collected, replayed, sliced and bootstrapped like LSTMModule."""
+"""MemoryModule keeps TorchRL's recurrent contract: collected, replayed, sliced and bootstrapped
+like LSTMModule.
+"""
 
 import pytest
 import torch
@@ -6,7 +8,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import Categorical, Composite, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer, Unbounded
+from torchrl.data import (
+    Categorical,
+    Composite,
+    LazyTensorStorage,
+    SliceSampler,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
 from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import QValueModule, set_recurrent_mode
@@ -17,7 +26,9 @@ from arcade_torch.models import MemoryBlock, MemoryModule, make_memory, memory_n
 
 
 class Countdown(EnvBase):
-    """Random observations; env i ends after 3 + i steps, by termination or (odd i) by truncation."""
+    """Random observations; env i ends after 3 + i steps, by termination or (odd i) by
+    truncation.
+    """
 
     def __init__(self, num_envs=4):
         super().__init__(batch_size=[num_envs])
@@ -29,7 +40,9 @@ class Countdown(EnvBase):
         self.action_spec = Categorical(2, shape=[num_envs])
         self.reward_spec = Unbounded((num_envs, 1))
         flag = Categorical(2, shape=[num_envs, 1], dtype=torch.bool)
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=[num_envs])
+        self.full_done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=[num_envs]
+        )
         self.odd = (torch.arange(num_envs) % 2 == 1).unsqueeze(-1)
 
     def _observe(self, left):
@@ -38,25 +51,35 @@ class Countdown(EnvBase):
 
     def _reset(self, tensordict=None, **kwargs):
         n = self.batch_size[0]
-        flags = {name: torch.zeros(n, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        flags = {
+            name: torch.zeros(n, 1, dtype=torch.bool)
+            for name in ("done", "terminated", "truncated")
+        }
         return TensorDict(self._observe(3 + torch.arange(n).unsqueeze(-1)) | flags, self.batch_size)
 
     def _step(self, tensordict):
         left = tensordict["left"] - 1
         done = left == 0
         flags = {"done": done, "terminated": done & ~self.odd, "truncated": done & self.odd}
-        return TensorDict(self._observe(left) | flags | {"reward": torch.ones(len(left), 1)}, self.batch_size)
+        return TensorDict(
+            self._observe(left) | flags | {"reward": torch.ones(len(left), 1)}, self.batch_size
+        )
 
     def _set_seed(self, seed):
         torch.manual_seed(seed)
 
 
 class OnlyTwoMethods(nn.Module):
-    """A third party's memory: no base class, no replay; episodes begin with a constant, or with a learned start."""
+    """A third party's memory: no base class, no replay; episodes begin with a constant, or with a
+    learned start.
+    """
 
     def __init__(self, start=0.0):
         super().__init__()
-        self.cell, self.start = nn.GRUCell(8, 8), nn.Parameter(torch.zeros(8)) if start is None else start
+        self.cell, self.start = (
+            nn.GRUCell(8, 8),
+            nn.Parameter(torch.zeros(8)) if start is None else start,
+        )
 
     def initial_state(self, batch_size):
         start = torch.as_tensor(self.start).expand(batch_size, 8).clone()
@@ -109,7 +132,9 @@ def test_primers_are_found_and_prime_zeros_under_the_state_keys(policy):
     reset = make_env(policy).reset()
     keys = state_keys(policy)
     assert all((reset[key] == 0).all() for key in keys)
-    assert {key for key in reset.keys(True, True) if isinstance(key, tuple) and key[0] == "memory"} == set(keys)
+    assert {
+        key for key in reset.keys(True, True) if isinstance(key, tuple) and key[0] == "memory"
+    } == set(keys)
 
 
 def test_primers_have_the_shape_and_dtype_of_the_models_state():
@@ -142,7 +167,9 @@ def test_one_sequence_without_a_batch_and_extra_batch_dimensions_are_read_alike(
     data = make_env(policy).rollout(8, policy, break_when_any_done=False)
     expected = replayed(policy, data)["action_value"]
     torch.testing.assert_close(replayed(policy, data[1])["action_value"], expected[1])
-    torch.testing.assert_close(replayed(policy, data.reshape(2, 2, 8))["action_value"], expected.reshape(2, 2, 8, 2))
+    torch.testing.assert_close(
+        replayed(policy, data.reshape(2, 2, 8))["action_value"], expected.reshape(2, 2, 8, 2)
+    )
 
 
 def test_slices_cut_by_a_sampler_start_from_the_stored_state(policy):
@@ -156,8 +183,12 @@ def test_slices_cut_by_a_sampler_start_from_the_stored_state(policy):
     cut = 0
     for _ in range(5):
         sample = buffer.sample()
-        torch.testing.assert_close(replayed(policy, sample)["action_value"], sample["action_value"], rtol=0, atol=1e-6)
-        cut += sum(int((sample[key][sample["is_init"].flatten()] != 0).any()) for key in state_keys(policy))
+        torch.testing.assert_close(
+            replayed(policy, sample)["action_value"], sample["action_value"], rtol=0, atol=1e-6
+        )
+        cut += sum(
+            int((sample[key][sample["is_init"].flatten()] != 0).any()) for key in state_keys(policy)
+        )
     assert cut > 0 or not state_keys(policy)
 
 
@@ -168,14 +199,21 @@ def test_a_start_in_the_middle_loads_the_stored_state_and_nothing_from_before():
     flags[:, 3] = True
     with set_recurrent_mode(True):
         whole = module(TensorDict({"x": x, "is_init": flags, "memory": {"h": h}}, [1, 6]))["y"]
-        rest = TensorDict({"x": x[:, 3:], "is_init": flags[:, :3], "memory": {"h": h[:, 3:]}}, [1, 3])
+        rest = TensorDict(
+            {"x": x[:, 3:], "is_init": flags[:, :3], "memory": {"h": h[:, 3:]}}, [1, 3]
+        )
         torch.testing.assert_close(whole[:, 3:], module(rest)["y"])
 
 
 def test_sequential_mode_forgets_at_a_start_and_recurrent_mode_does_not():
     module = MemoryModule(make_memory("gru", 3, 4), in_key="x", out_key="y")
     step = TensorDict(
-        {"x": torch.randn(2, 3), "is_init": torch.tensor([[True], [False]]), "memory": {"h": torch.randn(2, 4)}}, [2]
+        {
+            "x": torch.randn(2, 3),
+            "is_init": torch.tensor([[True], [False]]),
+            "memory": {"h": torch.randn(2, 4)},
+        },
+        [2],
     )
     fresh = step.clone().set(("memory", "h"), torch.zeros(2, 4))
     same = (module(step.clone())["y"] == module(fresh)["y"]).all(-1)
@@ -192,10 +230,15 @@ def test_gae_gives_the_advantages_of_a_loop_over_acted_values(name, shifted, vma
         MemoryModule(make_memory(name, 3, 8), in_key="observation", out_key="remembered"),
         TensorDictModule(nn.Linear(8, 1), in_keys=["remembered"], out_keys=["state_value"]),
     )
-    env = TransformedEnv(Countdown(), InitTracker()).append_transform(get_primers_from_module(critic))
-    act = TensorDictModule(lambda x: torch.zeros(x.shape[:-1], dtype=torch.int64), ["observation"], ["action"])
+    env = TransformedEnv(Countdown(), InitTracker()).append_transform(
+        get_primers_from_module(critic)
+    )
+    act = TensorDictModule(
+        lambda x: torch.zeros(x.shape[:-1], dtype=torch.int64), ["observation"], ["action"]
+    )
     data = env.rollout(16, TensorDictSequential(critic, act), break_when_any_done=False)
-    with torch.no_grad():  # the oracle: values as they were acted, next values by one more step, advantages by a loop
+    # The oracle: values as they were acted, next values by one more step, advantages by a loop.
+    with torch.no_grad():
         following = data["next"].select("observation", *critic[0].state_keys)
         following["is_init"] = torch.zeros_like(data["is_init"])
         next_value, value = critic(following)["state_value"], data["state_value"]
@@ -204,14 +247,23 @@ def test_gae_gives_the_advantages_of_a_loop_over_acted_values(name, shifted, vma
         delta = data["next", "reward"][:, t] + 0.9 * next_value[:, t] * live[:, t] - value[:, t]
         expected[:, t] = advantage = delta + 0.72 * advantage * ~data["next", "done"][:, t]
     data = data.exclude("state_value", "remembered", ("next", "state_value"))
-    gae = GAE(gamma=0.9, lmbda=0.8, value_network=critic, shifted=shifted, deactivate_vmap=not vmap, shifted_budget=8)
+    gae = GAE(
+        gamma=0.9,
+        lmbda=0.8,
+        value_network=critic,
+        shifted=shifted,
+        deactivate_vmap=not vmap,
+        shifted_budget=8,
+    )
     with set_recurrent_mode(True):
         gae(data)
     torch.testing.assert_close(data["advantage"], expected, rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_the_memory_through_time():
-    module = MemoryModule(make_memory("lru", 3, 4), in_key="x", out_key="y", default_recurrent_mode=True)
+    module = MemoryModule(
+        make_memory("lru", 3, 4), in_key="x", out_key="y", default_recurrent_mode=True
+    )
     x = torch.randn(2, 5, 3, requires_grad=True)
     y = module(TensorDict({"x": x, "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)}, [2, 5]))["y"]
     y[:, -1].sum().backward()
@@ -226,7 +278,12 @@ def test_actor_and_critic_keep_separate_states():
     env = TransformedEnv(Countdown(), InitTracker()).append_transform(get_primers_from_module(pair))
     act = TensorDictModule(lambda a: (a.sum(-1) > 0).long(), ["a"], ["action"])
     data = env.rollout(5, TensorDictSequential(pair, act), break_when_any_done=False)
-    assert data["actor_memory", "h"].shape == (4, 5, 4) and data["critic", "memory", "h"].shape == (4, 5, 4, 2)
+    assert data["actor_memory", "h"].shape == (4, 5, 4) and data["critic", "memory", "h"].shape == (
+        4,
+        5,
+        4,
+        2,
+    )
     assert (data["actor_memory", "h"][:, 1] == data["next", "actor_memory", "h"][:, 0]).all()
 
 
@@ -239,23 +296,31 @@ def test_tensors_can_be_passed_by_name():
 def test_wrong_flags_and_missing_time_get_one_clear_line():
     module = MemoryModule(make_memory("gru", 3, 4), in_key="x", out_key="y")
     with pytest.raises(ValueError, match=r"bool \[2, 1\], got \[2\]"):
-        module(TensorDict({"x": torch.zeros(2, 3), "is_init": torch.zeros(2, dtype=torch.bool)}, [2]))
+        module(
+            TensorDict({"x": torch.zeros(2, 3), "is_init": torch.zeros(2, dtype=torch.bool)}, [2])
+        )
     with set_recurrent_mode(True), pytest.raises(ValueError, match="time"):
         module(TensorDict({"x": torch.zeros(3), "is_init": torch.zeros(1, dtype=torch.bool)}, []))
     with pytest.raises(KeyError, match="x"):
         module(TensorDict({"is_init": torch.zeros(2, 1, dtype=torch.bool)}, [2]))
     with pytest.raises(KeyError, match="memory"):
-        MemoryModule(make_memory("gru", 3, 4), store="sequence").begin_with(TensorDict({}, [2, 5]), TensorDict({}, [2]))
+        MemoryModule(make_memory("gru", 3, 4), store="sequence").begin_with(
+            TensorDict({}, [2, 5]), TensorDict({}, [2])
+        )
 
 
 @pytest.mark.parametrize("start", [1.0, None])
-def test_a_memory_that_does_not_begin_with_zeros_or_learns_its_start_learns_from_what_it_acted(start):
+def test_a_memory_that_does_not_begin_with_zeros_or_learns_its_start_learns_from_what_it_acted(
+    start,
+):
     policy = make_policy(OnlyTwoMethods(start))
     if start is None:  # it begins with zeros, and moves
         nn.init.constant_(policy[1].memory.start, 0.5)
     data = make_env(policy).rollout(20, policy, break_when_any_done=False)
     assert policy[1].store == "sequence" and data["is_init"][:, 1:].any()
-    torch.testing.assert_close(replayed(policy, data)["action_value"], data["action_value"], rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        replayed(policy, data)["action_value"], data["action_value"], rtol=0, atol=1e-6
+    )
     with pytest.raises(ValueError, match="zeros"):
         MemoryModule(OnlyTwoMethods(start), store="step")
 
@@ -263,7 +328,10 @@ def test_a_memory_that_does_not_begin_with_zeros_or_learns_its_start_learns_from
 @pytest.mark.parametrize("name", MEMORIES)
 def test_autocast_around_a_module_changes_nothing_in_the_memory(name):
     module = MemoryModule(MEMORIES[name](), in_key="x", out_key="y")
-    data = TensorDict({"x": torch.randn(2, 5, 8).bfloat16(), "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)}, [2, 5])
+    data = TensorDict(
+        {"x": torch.randn(2, 5, 8).bfloat16(), "is_init": torch.zeros(2, 5, 1, dtype=torch.bool)},
+        [2, 5],
+    )
     exact = data.clone().set("x", data["x"].float())
     for mode in (False, True):
         with set_recurrent_mode(mode), torch.no_grad():
@@ -279,7 +347,9 @@ def test_autocast_around_a_module_changes_nothing_in_the_memory(name):
 def test_a_write_into_the_output_leaves_the_state_alone(name):
     memory = MEMORIES[name]()
     with torch.no_grad():
-        y, state = memory(torch.randn(2, 1, 8), memory.initial_state(2), torch.zeros(2, 1, dtype=torch.bool))
+        y, state = memory(
+            torch.randn(2, 1, 8), memory.initial_state(2), torch.zeros(2, 1, dtype=torch.bool)
+        )
         before = state.clone()
         y.fill_(7.0)
     assert (state == before).all()

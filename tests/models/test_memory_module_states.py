@@ -1,4 +1,6 @@
-"""Where MemoryModule keeps states: one a step while they are small, one a sequence when larger than a frame."""
+"""Where MemoryModule keeps states: one a step while they are small, one a sequence when larger than
+a frame.
+"""
 
 import pytest
 import torch
@@ -29,8 +31,12 @@ def make_critic(name, store):
 
 
 def rollout(critic, steps):
-    env = TransformedEnv(Countdown(), InitTracker()).append_transform(get_primers_from_module(critic))
-    act = TensorDictModule(lambda x: torch.zeros(x.shape[:-1], dtype=torch.int64), ["observation"], ["action"])
+    env = TransformedEnv(Countdown(), InitTracker()).append_transform(
+        get_primers_from_module(critic)
+    )
+    act = TensorDictModule(
+        lambda x: torch.zeros(x.shape[:-1], dtype=torch.int64), ["observation"], ["action"]
+    )
     with torch.no_grad():
         return env.rollout(steps, TensorDictSequential(critic, act), break_when_any_done=False)
 
@@ -75,7 +81,9 @@ def test_shifted_gae_is_the_same_with_one_state_a_sequence(name):
     every, once = make_critic(name, "step"), make_critic(name, "sequence")
     once.load_state_dict(every.state_dict())
     data = rollout(every, 18).exclude("state_value", "remembered", ("next", "state_value"))
-    assert not data["is_init"][:, -1].any()  # where TorchRL would call the frame after it a start, too
+    assert not data["is_init"][
+        :, -1
+    ].any()  # where TorchRL would call the frame after it a start, too
     advantages = []
     for critic in (every, once):
         gae = GAE(gamma=0.9, lmbda=0.8, value_network=critic, shifted=True, shifted_budget=8)
@@ -87,7 +95,9 @@ def test_shifted_gae_is_the_same_with_one_state_a_sequence(name):
 @pytest.mark.parametrize("name", ["attention", "ttt"])
 def test_a_window_of_our_collector_replays_from_its_initial_state(name):
     layers = nn.Sequential(nn.Flatten(-3), nn.Linear(192, 8), nn.Tanh())
-    encoder = TensorDictModule(lambda pixels: layers(pixels.float() / 255), ["pixels"], ["features"])
+    encoder = TensorDictModule(
+        lambda pixels: layers(pixels.float() / 255), ["pixels"], ["features"]
+    )
     memory = MemoryModule(make_memory(name, 8, 8), "features", "hidden", store="sequence")
     head = TensorDictModule(nn.Linear(8, 5), ["hidden"], ["action_value"])
     policy = TensorDictSequential(encoder, memory, head, QValueModule(spec=Categorical(5)))
@@ -99,7 +109,9 @@ def test_a_window_of_our_collector_replays_from_its_initial_state(name):
         with torch.no_grad(), set_recurrent_mode(True):
             policy(memory.begin_with(again, batch["initial_state"]))
         torch.testing.assert_close(again["action_value"], batch["action_value"], rtol=0, atol=1e-5)
-    assert batch["is_init"].any() and any((batch["initial_state", *key] != 0).any() for key in memory.state_keys)
+    assert batch["is_init"].any() and any(
+        (batch["initial_state", *key] != 0).any() for key in memory.state_keys
+    )
     collector.shutdown()
 
 
@@ -107,10 +119,15 @@ def test_a_window_of_our_collector_replays_from_its_initial_state(name):
 @pytest.mark.parametrize("name", ["attention", "gdn", "ttt"])
 def test_the_module_compiles_into_one_graph(name, recurrent):
     torch._dynamo.reset()
-    module = MemoryModule(make_memory(name, 3, 4), "x", "y", store="step" if name == "gdn" else None)
+    module = MemoryModule(
+        make_memory(name, 3, 4), "x", "y", store="step" if name == "gdn" else None
+    )
     shape = (2, 5) if recurrent else (2,)
     state = module.memory.initial_state(shape)
-    data = TensorDict({"x": torch.randn(*shape, 3), "is_init": torch.rand(*shape, 1) < 0.3, "memory": state}, shape)
+    data = TensorDict(
+        {"x": torch.randn(*shape, 3), "is_init": torch.rand(*shape, 1) < 0.3, "memory": state},
+        shape,
+    )
     with set_recurrent_mode(recurrent):
         compiled = torch.compile(module, fullgraph=True, backend="eager")
         ours, eager = compiled(data.clone()), module(data.clone())

@@ -31,7 +31,9 @@ def test_the_papers_network_has_the_published_size(memory):
     assert count(make_network("paper", memory)) == 1_428_613 + 2 * CELLS[memory]
 
 
-@pytest.mark.parametrize(("memory", "size"), [("mingru", 225_733), ("mlp", 209_221), ("gru", 291_397)])
+@pytest.mark.parametrize(
+    ("memory", "size"), [("mingru", 225_733), ("mlp", 209_221), ("gru", 291_397)]
+)
 def test_the_small_network_has_the_documented_size(memory, size):
     assert count(make_network("small", memory)) == size
 
@@ -52,7 +54,9 @@ def test_acting_step_by_step_equals_learning_on_the_sequence(memory):
         state, stepped = network.initial_state(3), []
         for t in range(9):
             features = network.encode(network.compress(pixels[:, t])).unsqueeze(1)
-            q, state = network.remember(features, last_action[:, t : t + 1], is_init[:, t : t + 1], state)
+            q, state = network.remember(
+                features, last_action[:, t : t + 1], is_init[:, t : t + 1], state
+            )
             stepped.append(q)
     torch.testing.assert_close(torch.cat(stepped, 1), out, rtol=0, atol=1e-5)
     for key in last.keys(True, True):
@@ -66,7 +70,13 @@ def test_the_papers_network_acts_as_it_learns():
         out, _ = run(network, pixels, last_action, is_init, network.initial_state(2))
         state, stepped = network.initial_state(2), []
         for t in range(3):
-            q, state = run(network, pixels[:, t : t + 1], last_action[:, t : t + 1], is_init[:, t : t + 1], state)
+            q, state = run(
+                network,
+                pixels[:, t : t + 1],
+                last_action[:, t : t + 1],
+                is_init[:, t : t + 1],
+                state,
+            )
             stepped.append(q)
     torch.testing.assert_close(torch.cat(stepped, 1), out, rtol=0, atol=1e-5)
 
@@ -75,7 +85,10 @@ def test_the_residual_skip_lets_the_input_bypass_the_memory_and_none_does_not():
     x, flags = torch.randn(2, 4, 3), torch.zeros(2, 4, dtype=torch.bool)
     for skip in ("residual", "none"):
         block = MemoryBlock(3, 4, "gru", layers=1, skip=skip)
-        block.linears[0].weight.data.zero_(), block.linears[0].bias.data.zero_()  # the layer then adds LeakyReLU(0)
+        (
+            block.linears[0].weight.data.zero_(),
+            block.linears[0].bias.data.zero_(),
+        )  # the layer then adds LeakyReLU(0)
         y, _ = block(x, block.initial_state(2), flags)
         expected = block.linear(x) if skip == "residual" else torch.zeros(2, 4, 4)
         torch.testing.assert_close(y, expected)
@@ -109,7 +122,9 @@ def predicting(memory, **options):
 def test_the_error_of_prediction_is_the_one_written_out_and_changes_nothing_else(memory):
     network = predicting(memory, predicts=True)
     pixels, last_action, is_init = inputs(3, 6)
-    batch = TensorDict({"pixels": pixels, "last_action": last_action, "is_init": is_init.unsqueeze(-1)}, [3, 6])
+    batch = TensorDict(
+        {"pixels": pixels, "last_action": last_action, "is_init": is_init.unsqueeze(-1)}, [3, 6]
+    )
     with torch.no_grad(), set_recurrent_mode(True):
         found, plain = network(batch.clone()), predicting(memory)(batch.clone())
     assert "prediction_error" not in plain
@@ -117,7 +132,11 @@ def test_the_error_of_prediction_is_the_one_written_out_and_changes_nothing_else
     with torch.no_grad():
         features = network.encode(pixels)
         one_hot = F.one_hot(last_action, 5).float()
-        seen = torch.cat([features, one_hot * ~is_init.unsqueeze(-1)], -1) if memory == "lru" else features
+        seen = (
+            torch.cat([features, one_hot * ~is_init.unsqueeze(-1)], -1)
+            if memory == "lru"
+            else features
+        )
         y, _ = network.block(seen, network.initial_state(3), is_init)
         nexts = features[:, 1:].reshape(-1, 128)
         mean, deviation = nexts.mean(0), nexts.var(0, correction=0).sqrt()
@@ -186,7 +205,9 @@ def test_small_starts_with_small_values_and_slow_gates():
 
 
 def test_sizes_heads_and_outputs_are_options():
-    network = make_network("paper", "mingru", layers=8, hidden_size=128, head="paper", num_outputs=1)
+    network = make_network(
+        "paper", "mingru", layers=8, hidden_size=128, head="paper", num_outputs=1
+    )
     assert len(network.block.cells) == 8 and network.block.hidden_size == 128
     assert count(network.head) == (128 * 256 + 256) + (256 * 256 + 256) + 512 + 257
     for name in HEADS:
@@ -233,7 +254,9 @@ def test_a_network_runs_under_one_compiled_graph(memory):
         return network.remember(features, last_action, is_init, state)[0].square().mean()
 
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
-    torch.testing.assert_close(compiled(features, last_action, is_init), loss(features, last_action, is_init))
+    torch.testing.assert_close(
+        compiled(features, last_action, is_init), loss(features, last_action, is_init)
+    )
     weights = [p for p in network.parameters() if isinstance(p, nn.Parameter)]
     ours = torch.autograd.grad(compiled(features, last_action, is_init), weights, allow_unused=True)
     eager = torch.autograd.grad(loss(features, last_action, is_init), weights, allow_unused=True)
@@ -251,7 +274,10 @@ def test_a_network_runs_under_one_compiled_graph(memory):
         ({"skip": "dense"}, "residual"),
         ({"memory": "feedforward", "head": "big"}, "one of reference, paper, .*linear.*got 'big'"),
         ({"memory": "feedforward", "skip": "dense"}, "residual"),
-        ({"memory": "feedforward", "actor_critic_head": "big"}, "actor_critic_head must be one of .*got 'big'"),
+        (
+            {"memory": "feedforward", "actor_critic_head": "big"},
+            "actor_critic_head must be one of .*got 'big'",
+        ),
         ({"layers": 0}, "at least 1"),
         ({"obs_size": 100}, "128 and 256"),
     ],

@@ -1,4 +1,6 @@
-"""The linear scan: every form equals the plain loop, and its derivatives equal finite differences."""
+"""The linear scan: every form equals the plain loop, and its derivatives equal finite
+differences.
+"""
 
 from types import SimpleNamespace
 
@@ -24,7 +26,9 @@ DTYPES = [torch.float64, torch.complex128]
 
 def problem(batch=2, steps=7, features=(3,), dtype=torch.float64, resets=0.3, grad=False):
     """Random (a, b, start, h0) with |a| about 1."""
-    a, b, h0 = (torch.randn(batch, *rest, *features, dtype=dtype) for rest in ((steps,), (steps,), ()))
+    a, b, h0 = (
+        torch.randn(batch, *rest, *features, dtype=dtype) for rest in ((steps,), (steps,), ())
+    )
     start = torch.rand(batch, steps) < resets
     for x in (a, b, h0):
         x.requires_grad_(grad)
@@ -47,7 +51,10 @@ def test_scan_equals_the_loop(batch, steps, features, dtype, resets, seed):
     for flags in (start, None):
         for state in (h0, None):
             torch.testing.assert_close(
-                linear_scan(a, b, flags, state), linear_scan_loop(a, b, flags, state), rtol=tolerance, atol=tolerance
+                linear_scan(a, b, flags, state),
+                linear_scan_loop(a, b, flags, state),
+                rtol=tolerance,
+                atol=tolerance,
             )
 
 
@@ -60,7 +67,9 @@ def test_the_doubling_form_equals_the_serial_form_forward_and_backward(dtype, st
         torch.testing.assert_close(scan_doubling(a, b, flags, h0), h)
         grad = torch.randn_like(h)
         for ours, serial in zip(
-            scan_backward_doubling(a, flags, h0, h, grad), scan_backward(a, flags, h0, h, grad), strict=True
+            scan_backward_doubling(a, flags, h0, h, grad),
+            scan_backward(a, flags, h0, h, grad),
+            strict=True,
         ):
             torch.testing.assert_close(ours, serial)
 
@@ -72,7 +81,9 @@ def test_factors_broadcast_over_batch_and_time(shape):
     h, loop = linear_scan(a, b, start, h0), linear_scan_loop(a, b, start, h0)
     torch.testing.assert_close(h, loop)
     grad = torch.randn_like(h)
-    torch.testing.assert_close(torch.autograd.grad(h, a, grad)[0], torch.autograd.grad(loop, a, grad)[0])
+    torch.testing.assert_close(
+        torch.autograd.grad(h, a, grad)[0], torch.autograd.grad(loop, a, grad)[0]
+    )
 
 
 def test_real_factors_meet_complex_inputs():
@@ -104,11 +115,15 @@ def test_a_state_per_position_is_loaded_at_index_zero_and_at_starts(dtype):
     a, b, start, _ = problem(3, 9, (2,), dtype, grad=True)
     stored = torch.randn(3, 9, 2, dtype=dtype, requires_grad=True)
     for flags in (start, None):
-        torch.testing.assert_close(linear_scan(a, b, flags, stored), linear_scan_loop(a, b, flags, stored))
+        torch.testing.assert_close(
+            linear_scan(a, b, flags, stored), linear_scan_loop(a, b, flags, stored)
+        )
     start[:, 4], start[:, 5:] = True, False
     whole = linear_scan(a, b, start, stored)
     torch.testing.assert_close(whole[:, 4:], linear_scan(a[:, 4:], b[:, 4:], None, stored[:, 4]))
-    assert torch.autograd.gradcheck(lambda a, b, s: linear_scan(a, b, start, s), (a, b, stored), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda a, b, s: linear_scan(a, b, start, s), (a, b, stored), fast_mode=True
+    )
 
 
 def test_one_step_at_a_time_equals_one_call():
@@ -120,7 +135,9 @@ def test_one_step_at_a_time_equals_one_call():
     torch.testing.assert_close(torch.stack(states, 1), linear_scan(a, b, start, h0))
 
 
-@pytest.mark.parametrize("form", [linear_scan, linear_scan_loop, lambda a, b, s, h: scan_doubling(a, b, s, h)])
+@pytest.mark.parametrize(
+    "form", [linear_scan, linear_scan_loop, lambda a, b, s, h: scan_doubling(a, b, s, h)]
+)
 @pytest.mark.parametrize("steps", [1, 6])
 def test_nan_before_a_start_does_not_come_through(form, steps):
     a, b, start, h0 = problem(1, 6, (3,), resets=0.0)
@@ -139,7 +156,9 @@ def test_nan_before_a_start_does_not_come_through(form, steps):
 def test_gradients_stop_at_a_start():
     a, b, start, h0 = problem(1, 6, (3,), resets=0.0, grad=True)
     start[:, 3] = True
-    grad_a, grad_b, grad_h0 = torch.autograd.grad(linear_scan(a, b, start, h0)[:, 3:].sum(), (a, b, h0))
+    grad_a, grad_b, grad_h0 = torch.autograd.grad(
+        linear_scan(a, b, start, h0)[:, 3:].sum(), (a, b, h0)
+    )
     assert (grad_a[:, :4] == 0).all() and (grad_b[:, :3] == 0).all() and (grad_h0 == 0).all()
     assert (grad_a[:, 4:] != 0).all() and (grad_b[:, 3:] != 0).all()
 
@@ -150,11 +169,15 @@ def test_vmap_equals_a_python_loop_values_and_gradients(dtype):
     batched = [x.unflatten(0, (2, 2)) for x in (a, b, start, h0)]
     mapped = torch.vmap(linear_scan)(*batched)
     torch.testing.assert_close(mapped.flatten(0, 1), linear_scan(a, b, start, h0))
-    some = torch.vmap(linear_scan, in_dims=(None, 0, None, None))(a[:2], b.unflatten(0, (2, 2)), start[:2], h0[:2])
+    some = torch.vmap(linear_scan, in_dims=(None, 0, None, None))(
+        a[:2], b.unflatten(0, (2, 2)), start[:2], h0[:2]
+    )
     torch.testing.assert_close(some[1], linear_scan(a[:2], b[2:], start[:2], h0[:2]))
 
     leaves = [x.clone().requires_grad_() for x in (a, b, h0)]
-    plain = torch.autograd.grad(linear_scan(*leaves[:2], start, leaves[2]).abs().square().sum(), leaves)
+    plain = torch.autograd.grad(
+        linear_scan(*leaves[:2], start, leaves[2]).abs().square().sum(), leaves
+    )
     split = [x.unflatten(0, (2, 2)) for x in (*leaves[:2], start, leaves[2])]
     through_vmap = torch.autograd.grad(torch.vmap(linear_scan)(*split).abs().square().sum(), leaves)
     for mapped_grad, grad in zip(through_vmap, plain, strict=True):
@@ -166,9 +189,13 @@ def test_many_gradients_in_one_batched_call_equal_one_at_a_time(dtype):
     a, b, start, h0 = problem(2, 5, (3,), dtype, grad=True)
     h = linear_scan(a, b, start, h0)
     directions = torch.randn(4, *h.shape, dtype=dtype)
-    together = torch.autograd.grad(h, (a, b, h0), directions, is_grads_batched=True, retain_graph=True)
+    together = torch.autograd.grad(
+        h, (a, b, h0), directions, is_grads_batched=True, retain_graph=True
+    )
     for k, direction in enumerate(directions):
-        for ours, alone in zip(together, torch.autograd.grad(h, (a, b, h0), direction, retain_graph=True), strict=True):
+        for ours, alone in zip(
+            together, torch.autograd.grad(h, (a, b, h0), direction, retain_graph=True), strict=True
+        ):
             torch.testing.assert_close(ours[k], alone)
 
 

@@ -1,4 +1,5 @@
-"""The linear scan on a CUDA device: the Triton back end is the loop, and how near it comes to the speed of a copy.
+"""The linear scan on a CUDA device: the Triton back end is the loop, and how near it comes to the
+speed of a copy.
 
 In a rehearsal on the CPU the serial back end stands in.
 """
@@ -11,7 +12,12 @@ import torch
 
 from arcade_torch.models.scan import _back_end_of, back_end
 from arcade_torch.tools.bench.memory import COPY, bench_scans
-from tests.models.scan_cases import LENGTHS, assert_equals_the_loop, assert_nothing_crosses_a_start, problem
+from tests.models.scan_cases import (
+    LENGTHS,
+    assert_equals_the_loop,
+    assert_nothing_crosses_a_start,
+    problem,
+)
 
 DTYPES = [torch.float32, torch.float64, torch.complex64, torch.complex128]
 NEEDS_TRITON = pytest.mark.usefixtures("triton")
@@ -32,7 +38,9 @@ def test_on_a_card_the_kernels_are_the_loop(steps: int, dtype: torch.dtype, devi
     a, b, start, h0 = problem(3, steps, (70,), dtype, device=device)
     assert _back_end_of(b) == ("triton" if device == "cuda" else "serial")
     assert_equals_the_loop(a, b, start, h0)
-    assert_equals_the_loop(a.mT.contiguous().mT, b, None, h0 if steps == 1 else None)  # a single step reads no a
+    assert_equals_the_loop(
+        a.mT.contiguous().mT, b, None, h0 if steps == 1 else None
+    )  # a single step reads no a
 
 
 @NEEDS_TRITON

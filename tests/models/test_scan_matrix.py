@@ -1,22 +1,36 @@
-"""The matrix-valued scan: every chunk size equals the plain loop, gradients too; nothing grows, overflows or leaks."""
+"""The matrix-valued scan: every chunk size equals the plain loop, gradients too; nothing grows,
+overflows or leaks.
+"""
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_loop, matrix_scan_stored
+from arcade_torch.models.scan_matrix import (
+    MatrixSteps,
+    matrix_scan,
+    matrix_scan_loop,
+    matrix_scan_stored,
+)
 
 KINDS = ["sum", "decay", "delta", "gated delta"]
 
 
 def problem(kind, batch=2, length=7, keys=3, values=4, dtype=torch.float64, resets=0.2):
     """Random steps with unit keys, flags and a state."""
-    query, key = (torch.nn.functional.normalize(torch.randn(batch, length, keys, dtype=dtype), dim=-1) for _ in "qk")
+    query, key = (
+        torch.nn.functional.normalize(torch.randn(batch, length, keys, dtype=dtype), dim=-1)
+        for _ in "qk"
+    )
     erase = 2 * torch.rand(batch, length, 1, dtype=dtype) if "delta" in kind else None
     decay = torch.nn.functional.logsigmoid(2 * torch.randn(batch, length, 1, dtype=dtype))
     steps = MatrixSteps(
-        query, key, torch.randn(batch, length, values, dtype=dtype), erase, decay if kind in KINDS[1::2] else None
+        query,
+        key,
+        torch.randn(batch, length, values, dtype=dtype),
+        erase,
+        decay if kind in KINDS[1::2] else None,
     )
     return steps, torch.rand(batch, length) < resets, torch.randn(batch, keys, values, dtype=dtype)
 
@@ -77,7 +91,9 @@ def test_pieces_with_a_carried_state_equal_the_whole(kind, cuts, chunk, seed):
     o, last = matrix_scan(steps, start, h0, chunk=chunk)
     parts, state = [], h0
     for begin, end in zip([0, *sorted(cuts)], [*sorted(cuts), 30], strict=True):
-        part, state = matrix_scan(cut(steps, slice(begin, end)), start[:, begin:end], state, chunk=chunk)
+        part, state = matrix_scan(
+            cut(steps, slice(begin, end)), start[:, begin:end], state, chunk=chunk
+        )
         parts.append(part)
     torch.testing.assert_close(torch.cat(parts, 1), o, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(state, last, rtol=1e-12, atol=1e-12)
@@ -85,7 +101,9 @@ def test_pieces_with_a_carried_state_equal_the_whole(kind, cuts, chunk, seed):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("length", [1, 2, 9, 70])
-def test_stored_states_are_loaded_at_index_zero_and_at_starts_and_all_states_come_back(kind, length):
+def test_stored_states_are_loaded_at_index_zero_and_at_starts_and_all_states_come_back(
+    kind, length
+):
     steps, start, _ = problem(kind, batch=3, length=length)
     stored = torch.randn(3, length, 3, 4, dtype=torch.float64)
     o, states = matrix_scan_stored(steps, start, stored)
@@ -101,7 +119,9 @@ def test_gradients_equal_finite_differences_across_chunks_and_starts(kind):
     names = [name for name, x in steps._asdict().items() if x is not None]
 
     def outputs(h0, *given):
-        return matrix_scan(steps._replace(**dict(zip(names, given, strict=True))), start, h0, chunk=2)
+        return matrix_scan(
+            steps._replace(**dict(zip(names, given, strict=True))), start, h0, chunk=2
+        )
 
     inputs = leaves(steps, h0)
     assert torch.autograd.gradcheck(outputs, (inputs[-1], *inputs[:-1]))
@@ -114,7 +134,10 @@ def test_nothing_crosses_a_start_not_even_rounding(kind):
     other, _, other_h0 = problem(kind, length=50, dtype=torch.float32)
     other = other._replace(value=100 * other.value)
     mixed = MatrixSteps(
-        *(None if x is None else torch.cat([y[:, :21], x[:, 21:]], 1) for x, y in zip(steps, other, strict=True))
+        *(
+            None if x is None else torch.cat([y[:, :21], x[:, 21:]], 1)
+            for x, y in zip(steps, other, strict=True)
+        )
     )
     inputs = leaves(steps, h0)
     o, last = matrix_scan(steps, start, h0, chunk=8)
@@ -152,17 +175,25 @@ def test_vanishing_decays_neither_overflow_nor_poison_the_gradient(length):
     o, last = matrix_scan(steps, start, h0)
     only_now = (steps.query * steps.key).sum(-1, keepdim=True) * steps.value
     torch.testing.assert_close(o, only_now)
-    assert all(torch.isfinite(grad).all() for grad in torch.autograd.grad(o.sum() + last.sum(), inputs))
+    assert all(
+        torch.isfinite(grad).all() for grad in torch.autograd.grad(o.sum() + last.sum(), inputs)
+    )
 
 
 def test_erasing_twice_what_is_there_stays_bounded_over_a_thousand_equal_keys():
     steps, start, h0 = problem("delta", length=1000, dtype=torch.float32, resets=0.0)
     key = steps.key[:, :1].expand(-1, 1000, -1)
-    steps = steps._replace(key=key, query=key, erase=torch.full_like(steps.erase, 2.0), value=0 * steps.value)
+    steps = steps._replace(
+        key=key, query=key, erase=torch.full_like(steps.erase, 2.0), value=0 * steps.value
+    )
     o, _ = matrix_scan(steps, start, h0)
     remembered = torch.einsum("bk,bkv->bv", key[:, 0], h0)
-    torch.testing.assert_close(o[:, 0::2], -remembered[:, None].expand(-1, 500, -1), rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(o[:, 1::2], remembered[:, None].expand(-1, 500, -1), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        o[:, 0::2], -remembered[:, None].expand(-1, 500, -1), rtol=1e-3, atol=1e-3
+    )
+    torch.testing.assert_close(
+        o[:, 1::2], remembered[:, None].expand(-1, 500, -1), rtol=1e-3, atol=1e-3
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -170,7 +201,9 @@ def test_no_state_per_step_is_kept_for_the_backward_pass(kind):
     steps, start, h0 = problem(kind, batch=1, length=1024, keys=16, values=16, dtype=torch.float32)
     leaves(steps, h0)
     sizes = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: (sizes.append(x.numel()), x)[1], lambda x: x):
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda x: (sizes.append(x.numel()), x)[1], lambda x: x
+    ):
         matrix_scan(steps, start, h0)
     assert sizes and max(sizes) < 1024 * 16 * 16 / 4
 

@@ -1,7 +1,9 @@
-"""The Triton kernels, run on the CPU by Triton's interpreter: they are the loop, values and gradients.
+"""The Triton kernels, run on the CPU by Triton's interpreter: they are the loop, values and
+gradients.
 
-``make test-triton`` runs these. The interpreter scans a chunk from front to back, a card as a tree: most tests run both
-ways, the second by a scan of our own in the interpreter's place, which brackets as a card does and is much faster.
+``make test-triton`` runs these. The interpreter scans a chunk from front to back, a card as a tree:
+most tests run both ways, the second by a scan of our own in the interpreter's place, which brackets
+as a card does and is much faster.
 """
 
 import importlib.util
@@ -34,12 +36,17 @@ from tests.models.scan_cases import (
 ROOT = Path(__file__).resolve().parents[2]
 DTYPES = [torch.float32, torch.float64, torch.complex64, torch.complex128]
 
-pytestmark = [pytest.mark.triton, pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning")]
+pytestmark = [
+    pytest.mark.triton,
+    pytest.mark.filterwarnings("ignore:.* encountered in:RuntimeWarning"),
+]
 
 
 @pytest.fixture(autouse=True)
 def _interpreted() -> Iterator[None]:
-    """Every scan of these tests runs by the kernels; without the interpreter there is nothing to test."""
+    """Every scan of these tests runs by the kernels; without the interpreter there is nothing to
+    test.
+    """
     if importlib.util.find_spec("triton") is None:
         pytest.skip("needs the triton extra: make test-triton")
     if os.environ.get("TRITON_INTERPRET") != "1":
@@ -49,7 +56,9 @@ def _interpreted() -> Iterator[None]:
 
 
 def tree_scan(self: Any, inputs: Any) -> list[Any]:
-    """A scan in log2(n) rounds, of whole arrays (Hillis and Steele 1986), in place of one entry after the other."""
+    """A scan in log2(n) rounds, of whole arrays (Hillis and Steele 1986), in place of one entry
+    after the other.
+    """
     arrays = [np.moveaxis(x.handle.data, self.axis, 0) for x in inputs]
     rows, shift = np.arange(len(arrays[0])).reshape(-1, *[1] * (arrays[0].ndim - 1)), 1
 
@@ -57,7 +66,10 @@ def tree_scan(self: Any, inputs: Any) -> list[Any]:
         return self.to_tensor(np.ascontiguousarray(array), like.dtype)
 
     while shift < len(rows):
-        left = [tensor(np.roll(array, shift, axis=0), x) for array, x in zip(arrays, inputs, strict=True)]
+        left = [
+            tensor(np.roll(array, shift, axis=0), x)
+            for array, x in zip(arrays, inputs, strict=True)
+        ]
         right = [tensor(array, x) for array, x in zip(arrays, inputs, strict=True)]
         joined = self.combine_fn.fn(*left, *right)
         arrays = [
@@ -65,7 +77,9 @@ def tree_scan(self: Any, inputs: Any) -> list[Any]:
             for array, x in zip(arrays, joined, strict=True)
         ]
         shift *= 2
-    return [tensor(np.moveaxis(array, 0, self.axis), x) for array, x in zip(arrays, inputs, strict=True)]
+    return [
+        tensor(np.moveaxis(array, 0, self.axis), x) for array, x in zip(arrays, inputs, strict=True)
+    ]
 
 
 @pytest.fixture
@@ -121,7 +135,9 @@ def test_strides_of_any_kind_are_read_where_they_stand(dtype: torch.dtype) -> No
     grad = torch.randn_like(h)
     expected = scan_backward(a, start, h0, h, grad)
     strided = [x.mT.contiguous().mT for x in (a, b, h, grad)]
-    every_other = [torch.stack([x, torch.full_like(x, torch.nan)], -1).flatten(-2)[..., ::2] for x in strided]
+    every_other = [
+        torch.stack([x, torch.full_like(x, torch.nan)], -1).flatten(-2)[..., ::2] for x in strided
+    ]
     flags = torch.stack([start, ~start], -1).flatten(-2)[:, ::2]
     conjugated = [x.conj_physical().conj() for x in (a, b, h, grad)]
     assert conjugated[0].is_conj() and not every_other[0].is_contiguous()
@@ -145,7 +161,12 @@ def test_expanded_factors_and_gradients_are_not_spread_out(shape: tuple[int, ...
 def test_of_no_sequences_or_no_features_nothing_comes_out() -> None:
     for shape in ((0, 4, 3), (2, 4, 0)):
         a = torch.rand(shape, requires_grad=True)
-        h = linear_scan(a, torch.rand(shape), torch.zeros(shape[:2], dtype=torch.bool), torch.rand(shape[0], shape[2]))
+        h = linear_scan(
+            a,
+            torch.rand(shape),
+            torch.zeros(shape[:2], dtype=torch.bool),
+            torch.rand(shape[0], shape[2]),
+        )
         assert h.shape == torch.autograd.grad(h.sum(), a)[0].shape == shape
 
 
@@ -154,26 +175,37 @@ def test_of_no_sequences_or_no_features_nothing_comes_out() -> None:
 def test_gradients_equal_finite_differences_and_so_do_theirs(dtype, monkeypatch):
     monkeypatch.setattr(scan_triton, "CHUNK", 8)
     a, b, start, h0 = problem(2, 10, (1,), dtype, resets=0.0)
-    start[0, 8], start[1, 0] = True, True  # at the end of a chunk of either direction, and at the beginning
+    start[0, 8], start[1, 0] = (
+        True,
+        True,
+    )  # at the end of a chunk of either direction, and at the beginning
     inputs = [x.requires_grad_() for x in (a, b, h0)]
-    assert torch.autograd.gradcheck(lambda a, b, h0: linear_scan(a, b, start, h0), inputs, fast_mode=dtype.is_complex)
+    assert torch.autograd.gradcheck(
+        lambda a, b, h0: linear_scan(a, b, start, h0), inputs, fast_mode=dtype.is_complex
+    )
     short = [x.detach()[:1, :3].requires_grad_() for x in (a, b)]
     short.append(h0.detach()[:1].requires_grad_())
     flags = torch.tensor([[False, True, False]])
-    assert torch.autograd.gradgradcheck(lambda a, b, h0: linear_scan(a, b, flags, h0), short, fast_mode=True)
+    assert torch.autograd.gradgradcheck(
+        lambda a, b, h0: linear_scan(a, b, flags, h0), short, fast_mode=True
+    )
 
 
 @pytest.mark.usefixtures("tree")
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("where", [1, 8, 11, 16, 19])
-def test_what_stands_before_a_start_has_exactly_no_influence(where: int, dtype: torch.dtype, monkeypatch) -> None:
+def test_what_stands_before_a_start_has_exactly_no_influence(
+    where: int, dtype: torch.dtype, monkeypatch
+) -> None:
     monkeypatch.setattr(scan_triton, "CHUNK", 8)
     assert_nothing_crosses_a_start(where, dtype)
 
 
 @pytest.mark.usefixtures("tree")
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_a_nan_lasts_to_the_end_of_its_episode_as_in_the_other_back_ends(dtype: torch.dtype, monkeypatch) -> None:
+def test_a_nan_lasts_to_the_end_of_its_episode_as_in_the_other_back_ends(
+    dtype: torch.dtype, monkeypatch
+) -> None:
     monkeypatch.setattr(scan_triton, "CHUNK", 8)
     a, b, start, h0 = problem(2, 30, (3,), dtype, resets=0.0)
     start[:, 20] = True
@@ -189,7 +221,9 @@ def test_a_nan_lasts_to_the_end_of_its_episode_as_in_the_other_back_ends(dtype: 
     assert not found["triton"][0][0, 5:20, 1].any() and found["triton"][0][:, 20:].all()
     assert not found["triton"][2][0, 20:26, 0].any() and found["triton"][2][0, :20, 0].all()
     for name in ("serial", "doubling"):
-        assert all(torch.equal(x, y) for x, y in zip(found["triton"], found[name], strict=True)), name
+        assert all(torch.equal(x, y) for x, y in zip(found["triton"], found[name], strict=True)), (
+            name
+        )
 
 
 @pytest.mark.usefixtures("tree")
@@ -219,9 +253,13 @@ def test_they_compile_for_cards_and_read_neighbours_together(tmp_path: Path) -> 
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     environment["TRITON_CACHE_DIR"] = str(tmp_path)
     command = [sys.executable, "-W", "ignore", "-m", "tests.models.triton_targets"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) == 2 * 4 * 2 and all(row["code"] > 0 for row in rows)
     for row in rows:
-        assert row["widest"] == (4 if (row["kernel"].endswith("real") and row["dtype"] == "fp32") else 2), row
+        assert row["widest"] == (
+            4 if (row["kernel"].endswith("real") and row["dtype"] == "fp32") else 2
+        ), row

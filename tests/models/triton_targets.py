@@ -1,7 +1,8 @@
-"""Compiles every Triton kernel for cards that need not be there: python -m tests.models.triton_targets
+"""Compiles every Triton kernel for cards that need not be there: python -m
+tests.models.triton_targets
 
-Prints a JSON line a kernel, card and dtype: name, card, dtype, whether machine code came out, and the widest access to
-memory in it (4: four neighbours at a time).
+Prints a JSON line a kernel, card and dtype: name, card, dtype, whether machine code came out, and
+the widest access to memory in it (4: four neighbours at a time).
 """
 
 import json
@@ -27,7 +28,9 @@ def source(name: str, dtype: str) -> ASTSource:
     for i, argument in enumerate(kernel.arg_names):
         if argument in ("CHUNK", "LANES"):
             kinds[argument] = "constexpr"
-            constants[argument] = CHUNK if argument == "CHUNK" else LANE_BYTES // SIZES[dtype] // parts
+            constants[argument] = (
+                CHUNK if argument == "CHUNK" else LANE_BYTES // SIZES[dtype] // parts
+            )
         elif argument.endswith("_by"):
             count = 2 if argument in ("start_by", "h0_by") else 3
             kinds[argument] = ("i32",) * (count - 1) + ("constexpr",)
@@ -48,8 +51,13 @@ def main() -> None:
         for name in _triton_kernels.__all__:
             for dtype in SIZES:
                 target = GPUTarget("cuda", card, 32)
-                made = triton.compile(source(name, dtype), target=target, options={"num_warps": WARPS})
-                widths = [int(width) for width in re.findall(r"\b(?:ld|st)\.global\.v(\d)", made.asm["ptx"])]
+                made = triton.compile(
+                    source(name, dtype), target=target, options={"num_warps": WARPS}
+                )
+                widths = [
+                    int(width)
+                    for width in re.findall(r"\b(?:ld|st)\.global\.v(\d)", made.asm["ptx"])
+                ]
                 row = {"kernel": name, "card": card, "dtype": dtype, "code": len(made.asm["cubin"])}
                 print(json.dumps(row | {"widest": max(widths, default=1)}))
 

@@ -1,8 +1,9 @@
 """How fast the published games and ours are in the same run: ``make bench-parity``.
 
-Both step a batch of the Easy level with auto-reset and draw every frame. Frames are results of the compiled call, so
-they must be written; a checksum outside it then reads every byte. Measures take turns, so that a slow minute hits both.
-The published AutoEncode is compiled without folding of constants, with which XLA was not done after 20 minutes.
+Both step a batch of the Easy level with auto-reset and draw every frame. Frames are results of the
+compiled call, so they must be written; a checksum outside it then reads every byte. Measures take
+turns, so that a slow minute hits both. The published AutoEncode is compiled without folding of
+constants, with which XLA was not done after 20 minutes.
 """
 
 import argparse
@@ -25,7 +26,15 @@ from tests.parity.reference import PACKAGE, missing, published, resets, without_
 
 ENVS, SIZE = 128, 128
 UNFOLDED = {"AutoEncode": {"xla_disable_hlo_passes": "constant_folding"}}
-COLUMNS = ("game", "published, frames/s", "ours, frames/s", "ratio", "ratio with checksum", "frames", "checksums")
+COLUMNS = (
+    "game",
+    "published, frames/s",
+    "ours, frames/s",
+    "ratio",
+    "ratio with checksum",
+    "frames",
+    "checksums",
+)
 
 
 def actions() -> Any:
@@ -39,7 +48,9 @@ def actions() -> Any:
 def theirs(game: str, partial_obs: bool) -> Measure:
     """The published step, which resets by itself, vectorised and compiled as its users do."""
     env, params = published(f"{game}Easy", partial_obs=partial_obs, obs_size=SIZE)
-    bare, _ = without_picture(f"{game}Easy")  # the same first states, without minutes of compiling their pictures
+    bare, _ = without_picture(
+        f"{game}Easy"
+    )  # the same first states, without minutes of compiling their pictures
     state = resets(bare, jax.random.PRNGKey(0), ENVS, params)
     action = actions()
 
@@ -76,16 +87,31 @@ def line(game: str, found: dict[str, Measured]) -> list[str]:
     """One row of the table."""
     them, us = found["theirs"], found["ours"]
     rates = [f"{them.rate:,.0f}", f"{us.rate:,.0f}"]
-    ratios = [f"{us.rate / them.rate:.1f}", f"{median(us.rates_with_check) / median(them.rates_with_check):.1f}"]
-    return [game, *rates, *ratios, f"{them.units:,} / {us.units:,}", f"{them.checksum:016x} / {us.checksum:016x}"]
+    ratios = [
+        f"{us.rate / them.rate:.1f}",
+        f"{median(us.rates_with_check) / median(them.rates_with_check):.1f}",
+    ]
+    return [
+        game,
+        *rates,
+        *ratios,
+        f"{them.units:,} / {us.units:,}",
+        f"{them.checksum:016x} / {us.checksum:016x}",
+    ]
 
 
 def main() -> int:
     """Measure and print; exit code 2 where the published package is missing."""
     parser = argparse.ArgumentParser(prog="make bench-parity", description=__doc__.splitlines()[0])
-    parser.add_argument("--games", nargs="+", choices=GAMES, default=GAMES, help="which games, Easy level")
-    parser.add_argument("--partial", action="store_true", help="the POMDP twins instead of the MDP twins")
-    parser.add_argument("--seconds", type=float, default=1.0, help="for each measure in each repeat")
+    parser.add_argument(
+        "--games", nargs="+", choices=GAMES, default=GAMES, help="which games, Easy level"
+    )
+    parser.add_argument(
+        "--partial", action="store_true", help="the POMDP twins instead of the MDP twins"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=1.0, help="for each measure in each repeat"
+    )
     parser.add_argument("--repeats", type=int, default=5, help="the median counts")
     options = parser.parse_args()
     if reason := missing():
@@ -96,9 +122,13 @@ def main() -> int:
         rows.append(line(game, interleaved(measures, options.seconds, options.repeats)))
         print(" | ".join(rows[-1]), flush=True)
     twin = "POMDP" if options.partial else "MDP"
-    made = ", ".join(f"{name} {value}" for name, value in {**machine(), PACKAGE: version(PACKAGE)}.items())
+    made = ", ".join(
+        f"{name} {value}" for name, value in {**machine(), PACKAGE: version(PACKAGE)}.items()
+    )
     caption = f"published {', '.join(UNFOLDED)} compiled without constant folding; {made}"
-    Table(f"{twin} twins, Easy, {ENVS} envs, {SIZE} px, every frame consumed", COLUMNS, rows, caption).show()
+    Table(
+        f"{twin} twins, Easy, {ENVS} envs, {SIZE} px, every frame consumed", COLUMNS, rows, caption
+    ).show()
     return 0
 
 

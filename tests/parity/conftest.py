@@ -1,4 +1,6 @@
-"""Skips these tests where the published package is missing, and writes their table for ``make parity``."""
+"""Skips these tests where the published package is missing, and writes their table for ``make
+parity``.
+"""
 
 import os
 from collections.abc import Iterator
@@ -32,7 +34,9 @@ def rows(request: pytest.FixtureRequest) -> Iterator[dict[str, Row]]:
         request.config.stash[WRITTEN] = write(Path(path), found)
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, config: pytest.Config
+) -> None:
     """Print the table."""
     if WRITTEN in config.stash:
         terminalreporter.write_line(config.stash[WRITTEN])

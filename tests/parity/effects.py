@@ -1,6 +1,8 @@
-"""What each difference is worth in return: ``python -m tests.parity.effects`` writes it into docs/differences.md.
+"""What each difference is worth in return: ``python -m tests.parity.effects`` writes it into
+docs/differences.md.
 
-Needs no published package: our ``rules="reference"`` stands for it, which ``make parity`` shows to be the same law.
+Needs no published package: our ``rules="reference"`` stands for it, which ``make parity`` shows to
+be the same law.
 """
 
 import argparse
@@ -47,8 +49,13 @@ A3, C1, K3, S9 and T5, the number of actions (A5, C11) and everything that is on
 
 
 def returns(game: Any, planner: Any) -> dict[str, Returns]:
-    """Returns of both players, one entry an episode; env i of two games with one law sees the same random numbers."""
-    players = {"random": (RandomPlayer(0), RANDOM_EPISODES), "oracle": (make_oracle(planner), ORACLE_EPISODES)}
+    """Returns of both players, one entry an episode; env i of two games with one law sees the same
+    random numbers.
+    """
+    players = {
+        "random": (RandomPlayer(0), RANDOM_EPISODES),
+        "oracle": (make_oracle(planner), ORACLE_EPISODES),
+    }
     return {
         name: play(game, player, episodes, block=episodes).returns.astype(np.float64)
         for name, (player, episodes) in players.items()
@@ -82,7 +89,10 @@ def task_line(task: str, before: dict[str, Returns], after: dict[str, Returns]) 
 def fault_line(fault: Fault, changes: list[dict[str, Returns]]) -> str:
     """One difference on all levels."""
     ids = f"{fault.ids} ({fault.game})"
-    cells = [" / ".join(interval(change[player], signed=True) for change in changes) for player in ("random", "oracle")]
+    cells = [
+        " / ".join(interval(change[player], signed=True) for change in changes)
+        for player in ("random", "oracle")
+    ]
     return f"| {ids} | {' | '.join(cells)} |"
 
 
@@ -100,7 +110,9 @@ def measure(games: Iterable[str]) -> tuple[list[str], list[str]]:
             tasks.append(task_line(task, before, returns(everything, planner)))
             for fault in own:
                 after = returns(*fault.corrected(task))
-                changes[fault.ids].append({player: after[player] - before[player] for player in before})
+                changes[fault.ids].append(
+                    {player: after[player] - before[player] for player in before}
+                )
             print(f"{tasks[-1]}  {time.perf_counter() - start:.0f} s", flush=True)
         faults += [fault_line(fault, changes[fault.ids]) for fault in own]
         print(*faults[len(faults) - len(own) :], sep="\n", flush=True)
@@ -109,19 +121,27 @@ def measure(games: Iterable[str]) -> tuple[list[str], list[str]]:
 
 def main() -> None:
     """Measure, and write the section if all games were measured."""
-    parser = argparse.ArgumentParser(prog="python -m tests.parity.effects", description=__doc__.splitlines()[0])
-    parser.add_argument("--games", nargs="+", choices=GAMES, default=GAMES, help="fewer games are printed alone")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.parity.effects", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        "--games", nargs="+", choices=GAMES, default=GAMES, help="fewer games are printed alone"
+    )
     games = parser.parse_args().games
     tasks, faults = measure(games)
     if set(games) != set(GAMES):
         return
-    made = ", ".join(f"{name} {value}" for name, value in versions().items() if not name.startswith("t"))
+    made = ", ".join(
+        f"{name} {value}" for name, value in versions().items() if not name.startswith("t")
+    )
     tables = {"tasks": "\n".join(tasks), "faults": "\n".join(faults)}
     text = TEXT.format(random=RANDOM_EPISODES, oracle=ORACLE_EPISODES, versions=made, **tables)
     page = PAGE.read_text(encoding="utf-8")
     head, found, rest = page.partition(BEGIN)
     if not found or END not in rest:
-        raise SystemExit(f"{PAGE} has no place for the effects: a line {BEGIN!r} and below it a line {END!r}")
+        raise SystemExit(
+            f"{PAGE} has no place for the effects: a line {BEGIN!r} and below it a line {END!r}"
+        )
     write_atomic(PAGE, head + BEGIN + text + END + rest.partition(END)[2])
 
 

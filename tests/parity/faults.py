@@ -1,7 +1,8 @@
-"""One game at a time with a single fault of the published law taken out, to see what that fault is worth.
+"""One game at a time with a single fault of the published law taken out, to see what that fault is
+worth.
 
-The base is our game under ``rules="reference"``. A correction replaces its reset, or its step, or its step where a
-condition on state and action holds, by those of the default rules.
+The base is our game under ``rules="reference"``. A correction replaces its reset, or its step, or
+its step where a condition on state and action holds, by those of the default rules.
 """
 
 import copy
@@ -21,7 +22,9 @@ from arcade_torch.envs_jax.tetris import rules as tetris
 from arcade_torch.envs_jax.tetris.params import GOAL, MAX_STEPS, TOP_OUT_REWARD
 
 Correct = Callable[[Any, Any], None]
-"""``(game, fixed)``: change ``game``, a copy of the reference rules, with parts of ``fixed``, the default rules."""
+"""``(game, fixed)``: change ``game``, a copy of the reference rules, with parts of ``fixed``, the
+default rules.
+"""
 
 
 def take_all(game: Any, fixed: Any) -> None:
@@ -53,7 +56,9 @@ def take_step_where(condition: Callable[[Any, Any, Any], Any], game: Any, fixed:
 
 @contextmanager
 def default_rules_in(*names: str) -> Iterator[None]:
-    """Functions of the law of Tetris that read the default rules whatever the game says, while it is traced."""
+    """Functions of the law of Tetris that read the default rules whatever the game says, while it
+    is traced.
+    """
 
     def fixed(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *args: function(*args[:-1], "default")  # the rules come last in all of them
@@ -101,8 +106,8 @@ class Fault:
         ids: its rows in docs/differences.md.
         game: which game.
         correct: takes it out.
-        planner: the rules that the state oracle reckons with: those of the corrected game where its plans depend on
-            this fault.
+        planner: the rules that the state oracle reckons with: those of the corrected game where its
+            plans depend on this fault.
     """
 
     ids: str
@@ -123,7 +128,9 @@ def where(condition: Callable[[Any, Any, Any], Any]) -> Correct:
 
 
 FAULTS = (
-    Fault("A1", "AutoEncode", where(lambda game, s, a: (s.timestep == game.level.cards) & (a != FIRE))),
+    Fault(
+        "A1", "AutoEncode", where(lambda game, s, a: (s.timestep == game.level.cards) & (a != FIRE))
+    ),
     Fault("A2", "AutoEncode", where(lambda game, s, a: s.given >= game.level.cards - 1), "default"),
     Fault("A4", "AutoEncode", where(lambda game, s, a: s.timestep >= game.max_steps - 1)),
     Fault("B1", "BattleShip", take_reset),

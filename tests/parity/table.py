@@ -58,8 +58,12 @@ def write(path: Path, rows: Mapping[str, Row]) -> str:
         return f"{path} is left as it is: {len(absent)} of {len(TASKS)} tasks were not walked"
     lines = [line(task, rows[task]) for task in TASKS]
     total = tuple(sum_of([row[kind] for row in rows.values()]) for kind in (0, 1))
-    made = ", ".join(f"{name} {value}" for name, value in {**versions(), PACKAGE: version(PACKAGE)}.items())
-    text = HEAD.format(published=version(PACKAGE)) + "\n".join([*lines, line("all", (total[0], total[1]))])
+    made = ", ".join(
+        f"{name} {value}" for name, value in {**versions(), PACKAGE: version(PACKAGE)}.items()
+    )
+    text = HEAD.format(published=version(PACKAGE)) + "\n".join(
+        [*lines, line("all", (total[0], total[1]))]
+    )
     text += f"\n\nMade with {made}.\n"
     write_atomic(path, text)
     return text
@@ -67,4 +71,9 @@ def write(path: Path, rows: Mapping[str, Row]) -> str:
 
 def sum_of(tallies: list[Tally]) -> Tally:
     """All counts added up."""
-    return Tally(**{name: sum(getattr(tally, name) for tally in tallies) for name in Tally.__dataclass_fields__})
+    return Tally(
+        **{
+            name: sum(getattr(tally, name) for tally in tallies)
+            for name in Tally.__dataclass_fields__
+        }
+    )

@@ -26,7 +26,9 @@ def test_both_games_pay_and_end_alike_at_every_step(task, rows):
     assert not plain.mismatches and not rare.mismatches, (plain, rare)
 
 
-@pytest.mark.parametrize("task", ["AutoEncodeEasy", "CartPoleEasy", "MineSweeperEasy", "NavigatorEasy", "TetrisHard"])
+@pytest.mark.parametrize(
+    "task", ["AutoEncodeEasy", "CartPoleEasy", "MineSweeperEasy", "NavigatorEasy", "TetrisHard"]
+)
 def test_the_comparison_notices_the_default_rules(task):
     plain, rare = walk(task, rules="default", steps=STEPS // 2)
     assert plain.reward + rare.reward > 0 or plain.ending + rare.ending > 0
@@ -41,7 +43,10 @@ def test_first_states_have_the_same_law(task):
     theirs = jax.vmap(lambda state: say.to_ours(game, state))(theirs)
     ours = jax.vmap(game.reset)(env_keys(1, RESETS))
     for name in set(ours._fields) - NOT_COMPARED:
-        a, b = (np.asarray(getattr(states, name), np.float64).reshape(RESETS, -1) for states in (ours, theirs))
+        a, b = (
+            np.asarray(getattr(states, name), np.float64).reshape(RESETS, -1)
+            for states in (ours, theirs)
+        )
         for power in (1, 2):
             apart = (a**power).mean(0) - (b**power).mean(0)
             spread = np.sqrt(((a**power).var(0) + (b**power).var(0)) / RESETS)
@@ -73,12 +78,16 @@ def test_all_published_games_are_compared_and_pieces_have_the_same_shapes():
 
 
 def test_the_game_without_its_picture_is_the_published_game():
-    """What the walks step is what a user of the published package steps: the same state, reward and end."""
+    """What the walks step is what a user of the published package steps: the same state, reward and
+    end.
+    """
     whole, params = published("MineSweeperEasy")
     bare, _ = without_picture("MineSweeperEasy")
     key = jax.random.PRNGKey(0)
     _, state = whole.reset_env(key, params)
     for action in (4, 1, 4, 4):
-        full, quick = (game.step_env(key, state, jnp.int32(action), params)[1:4] for game in (whole, bare))
+        full, quick = (
+            game.step_env(key, state, jnp.int32(action), params)[1:4] for game in (whole, bare)
+        )
         assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), full, quick))
         state = full[0]

@@ -1,4 +1,6 @@
-"""What a game has to say for its states to be compared: how they translate, and where random draws come in."""
+"""What a game has to say for its states to be compared: how they translate, and where random draws
+come in.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,16 +24,20 @@ class Translation:
 
     Attributes:
         to_ours: ``(game, theirs)`` to our state.
-        to_theirs: ``(game, ours)`` to a dict of all fields of the published state, for a state in mid-episode.
+        to_theirs: ``(game, ours)`` to a dict of all fields of the published state, for a state in
+            mid-episode.
         clock: name of our field that counts steps.
-        inject: ``(game, ours, theirs, their next)`` to ours: puts the outcome of a random draw of the published step
-            where our step will find it.
-        adopt: ``(game, our next, their next)`` to our next: replaces what our step drew by what the published one drew.
-        reported: ``(game, our next, terminated, truncated)`` to the flags that the published game reports for that
-            step, where they are not ours: an intended difference, named in the translation.
+        inject: ``(game, ours, theirs, their next)`` to ours: puts the outcome of a random draw of
+            the published step where our step will find it.
+        adopt: ``(game, our next, their next)`` to our next: replaces what our step drew by what the
+            published one drew.
+        reported: ``(game, our next, terminated, truncated)`` to the flags that the published game
+            reports for that step, where they are not ours: an intended difference, named in the
+            translation.
         hasten: ``(key, game, ours)`` to ours: leads a first state close to rare events.
         tolerance: absolute, on floating-point fields of the state.
-        resync: after each comparison go on from the published state. For games that let rounding grow.
+        resync: after each comparison go on from the published state. For games that let rounding
+            grow.
     """
 
     to_ours: Callable[[Any, State], State]
@@ -47,7 +53,9 @@ class Translation:
 
 def cast(like: State, fields: dict[str, Any]) -> State:
     """A published state with new values and the types of another one."""
-    return like.replace(**{name: jnp.asarray(value, getattr(like, name).dtype) for name, value in fields.items()})
+    return like.replace(
+        **{name: jnp.asarray(value, getattr(like, name).dtype) for name, value in fields.items()}
+    )
 
 
 def number(value: Any) -> Array:

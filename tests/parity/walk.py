@@ -1,7 +1,8 @@
 """Both games side by side: the same states, the same actions, every step compared.
 
-Half of the envs play at random from published first states. The others look for rare events: they hold on to an action
-for long, or follow the oracle, and half of their episodes begin near an end of the game or near the time limit.
+Half of the envs play at random from published first states. The others look for rare events: they
+hold on to an action for long, or follow the oracle, and half of their episodes begin near an end of
+the game or near the time limit.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,7 +23,9 @@ from tests.parity.translations import translation_of
 
 RANDOM_ENVS = 16
 OTHER_ENVS = 16
-STEPS = 640  # times 16 envs: 10,240 random steps a task, and whole episodes of all but the longest ones
+STEPS = (
+    640  # times 16 envs: 10,240 random steps a task, and whole episodes of all but the longest ones
+)
 NEAR = 12  # steps from the limit at which a hurried episode begins, at most
 REWARD_TOLERANCE = 1e-6
 
@@ -109,7 +112,9 @@ class SideBySide:
         self.advance = jax.jit(self._advance)
 
     def _advance(self, key: Array, index: Array, pair: Pair, action: Array) -> tuple[Pair, Seen]:
-        """One step of all envs; where an episode ended in either game, both begin the same new one."""
+        """One step of all envs; where an episode ended in either game, both begin the same new
+        one.
+        """
         envs = len(action)
         for_step, for_begin = jax.random.split(jax.random.fold_in(key, index))
         stepped, seen = jax.vmap(self._step)(jax.random.split(for_step, envs), pair, action)
@@ -119,13 +124,17 @@ class SideBySide:
         """One step of one env."""
         say, theirs = self.translation, pair.theirs
         for_them, for_us = jax.random.split(key)
-        _, then, their_reward, their_done, info = self.reference.step_env(for_them, theirs, action, self.params)
+        _, then, their_reward, their_done, info = self.reference.step_env(
+            for_them, theirs, action, self.params
+        )
         then = cast(theirs, {name: getattr(then, name) for name in theirs.__dataclass_fields__})
         before = say.inject(self.game, pair.ours, theirs, then)
         ours, reward, terminated, truncated = self.game.step(for_us, before, action)
         done = terminated | truncated
         flags = say.reported(self.game, ours, terminated, truncated)
-        ours = say.adopt(self.game, ours, then)._replace(terminated=None, truncated=None)  # theirs say nothing of it
+        ours = say.adopt(self.game, ours, then)._replace(
+            terminated=None, truncated=None
+        )  # theirs say nothing of it
         back = cast(then, say.to_theirs(self.game, ours))
         either = done | their_done
         seen = Seen(
@@ -140,19 +149,25 @@ class SideBySide:
         return Pair(then, self.to_ours(then) if say.resync else ours), seen
 
     def _begin(self, key: Array, envs: int) -> Pair:
-        """First states: published ones, and half of those of the second half of the envs led near an end."""
+        """First states: published ones, and half of those of the second half of the envs led near
+        an end.
+        """
         for_reset, for_hasten, for_near, for_which = jax.random.split(key, 4)
         theirs = resets(self.reference, for_reset, envs, self.params)
         ours = jax.vmap(self.to_ours)(theirs)
         hasten = partial(self.translation.hasten, game=self.game)
-        near = jax.vmap(lambda key, ours: hasten(key, ours=ours))(jax.random.split(for_hasten, envs), ours)
+        near = jax.vmap(lambda key, ours: hasten(key, ours=ours))(
+            jax.random.split(for_hasten, envs), ours
+        )
         which = jax.random.uniform(for_which, (2, envs)) < 0.5
         hasty, late = which & (jnp.arange(envs) >= RANDOM_ENVS)
         ours = choose(hasty, near, ours)
         clock = self.game.max_steps - jax.random.randint(for_near, (envs,), 1, NEAR + 1)
         pushed = ours._replace(**{self.translation.clock: clock})
         ours = choose(late, pushed, ours)
-        again = jax.vmap(lambda like, ours: cast(like, self.translation.to_theirs(self.game, ours)))(theirs, ours)
+        again = jax.vmap(
+            lambda like, ours: cast(like, self.translation.to_theirs(self.game, ours))
+        )(theirs, ours)
         return Pair(choose(hasty | late, again, theirs), ours)
 
 
@@ -187,7 +202,9 @@ class Actions:
         return self.last
 
 
-def walk(task: str, rules: Rules = "reference", steps: int = STEPS, seed: int = 0) -> tuple[Tally, Tally]:
+def walk(
+    task: str, rules: Rules = "reference", steps: int = STEPS, seed: int = 0
+) -> tuple[Tally, Tally]:
     """Compare a task over ``steps`` steps of all envs.
 
     Returns:

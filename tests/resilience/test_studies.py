@@ -51,12 +51,27 @@ class Place:
         (place / "short.toml").write_text(STUDY)
         return place / "out"
 
-    def start(self, root: Path, engine: str = "processes", *options: str) -> "subprocess.Popen[bytes]":
+    def start(
+        self, root: Path, engine: str = "processes", *options: str
+    ) -> "subprocess.Popen[bytes]":
         """Start the study, or go on with it."""
-        words = [sys.executable, "-m", "arcade_torch.tools", "study", "short.toml", "--out", "out", "--no-report"]
+        words = [
+            sys.executable,
+            "-m",
+            "arcade_torch.tools",
+            "study",
+            "short.toml",
+            "--out",
+            "out",
+            "--no-report",
+        ]
         with (root.parent / "printed.log").open("ab") as log:
             return subprocess.Popen(
-                [*words, "--engine", engine, *options], cwd=root.parent, stdout=log, stderr=log, start_new_session=True
+                [*words, "--engine", engine, *options],
+                cwd=root.parent,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
 
     def carry_out(self, root: Path, engine: str = "processes", *options: str) -> int:
@@ -79,7 +94,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
 def finished(root: Path) -> dict[str, tuple[int, str]]:
     """Run name -> time and content of its final evaluation."""
     files = root.glob("runs/*/eval.json")
-    return {file.parent.name: (file.stat().st_mtime_ns, digest(file.read_bytes())) for file in files}
+    return {
+        file.parent.name: (file.stat().st_mtime_ns, digest(file.read_bytes())) for file in files
+    }
 
 
 def digest(data: bytes) -> str:
@@ -87,13 +104,24 @@ def digest(data: bytes) -> str:
 
 
 def fingerprint(root: Path) -> dict[str, str]:
-    """What a study found, without what a clock says: its table, and every run's curve, returns and weights."""
+    """What a study found, without what a clock says: its table, and every run's curve, returns and
+    weights.
+    """
     found = {"results.csv": digest((root / "results.csv").read_bytes())}
     for run in sorted(path for path in (root / "runs").iterdir() if path.is_dir()):
         final = read_json(run / "eval.json")
-        rows = [[row[key] for key in row if key not in ("seconds", "fps")] for row in read_csv(run / "metrics.csv")]
+        rows = [
+            [row[key] for key in row if key not in ("seconds", "fps")]
+            for row in read_csv(run / "metrics.csv")
+        ]
         weights = sorted(run.glob("checkpoints/frames-*/weights.safetensors"))[-1]
-        parts = [final["returns"], final["lengths"], final["train_max_ewm"], rows, digest(weights.read_bytes())]
+        parts = [
+            final["returns"],
+            final["lengths"],
+            final["train_max_ewm"],
+            rows,
+            digest(weights.read_bytes()),
+        ]
         found[run.name] = digest(repr(parts).encode())
     return found
 
@@ -115,7 +143,9 @@ def descendants(pid: int) -> list[int]:
 
 
 def ray_workers(pid: int) -> list[int]:
-    """Processes in which the Ray cluster of a study carries out runs, or waits for one; Ray's own agents left out."""
+    """Processes in which the Ray cluster of a study carries out runs, or waits for one; Ray's own
+    agents left out.
+    """
     found = []
     for each in descendants(pid):
         with contextlib.suppress(OSError):
@@ -163,7 +193,9 @@ def test_a_killed_worker_costs_nothing(place: Place) -> None:
 
 
 @pytest.mark.ray
-def test_a_killed_ray_worker_is_tried_again_and_a_killed_cluster_costs_nothing(place: Place) -> None:
+def test_a_killed_ray_worker_is_tried_again_and_a_killed_cluster_costs_nothing(
+    place: Place,
+) -> None:
     pytest.importorskip("ray")
     expected, root = place.undisturbed(), place.root("head")
     study = place.start(root, "ray")
@@ -199,7 +231,11 @@ def test_kills_at_random_moments_cost_nothing(place: Place) -> None:
     assert place.carry_out(root) == 0
     assert {name: finished(root)[name] for name in seen} == seen
     assert fingerprint(root) == expected
-    litter = [path for path in (root / "runs").rglob(".*") if re.fullmatch(r"\..*\.\d+-[0-9a-f]{8}", path.name)]
+    litter = [
+        path
+        for path in (root / "runs").rglob(".*")
+        if re.fullmatch(r"\..*\.\d+-[0-9a-f]{8}", path.name)
+    ]
     assert not litter
 
 
@@ -211,14 +247,22 @@ def small_disk(at: Path, kib: int) -> Iterator[Callable[[int], None]]:
     if subprocess.run(words, check=False, capture_output=True).returncode:
         pytest.skip("this user may not mount a small disk")
     try:
-        yield lambda size: subprocess.run(["mount", "-o", f"remount,size={size}k", str(at)], check=True) and None
+        yield (
+            lambda size: (
+                subprocess.run(["mount", "-o", f"remount,size={size}k", str(at)], check=True)
+                and None
+            )
+        )
     finally:
         subprocess.run(["umount", "-l", str(at)], check=False)
 
 
 def test_a_full_disk_costs_nothing(place: Place) -> None:
     expected = place.undisturbed()
-    kib = sum(file.stat().st_size for file in place.root("inline").rglob("*") if file.is_file()) // 1024
+    kib = (
+        sum(file.stat().st_size for file in place.root("inline").rglob("*") if file.is_file())
+        // 1024
+    )
     before = dict[str, tuple[int, str]]()
     with small_disk(place.work / "small", kib // 4) as resize:
         root = place.root("small")
@@ -235,7 +279,9 @@ def test_a_full_disk_costs_nothing(place: Place) -> None:
         assert fingerprint(root) == expected
 
 
-def test_shards_in_one_folder_do_every_run_once_and_one_that_is_killed_goes_on(place: Place) -> None:
+def test_shards_in_one_folder_do_every_run_once_and_one_that_is_killed_goes_on(
+    place: Place,
+) -> None:
     expected, root = place.undisturbed(), place.root("shards")
     shards = [place.start(root, "inline", "--shard", f"{number}/3") for number in (1, 2, 3)]
     wait_for(shards[0], lambda: len(finished(root)) >= RUNS // 3)
@@ -248,7 +294,9 @@ def test_shards_in_one_folder_do_every_run_once_and_one_that_is_killed_goes_on(p
     assert fingerprint(root) == expected
 
 
-def test_a_fingerprint_sees_a_single_bit_of_the_weights_and_no_clock(place: Place, tmp_path: Path) -> None:
+def test_a_fingerprint_sees_a_single_bit_of_the_weights_and_no_clock(
+    place: Place, tmp_path: Path
+) -> None:
     before = place.undisturbed()
     root = Path(shutil.copytree(place.root("inline"), tmp_path / "out"))
     for file in root.glob("runs/*/metrics.csv"):

@@ -10,7 +10,12 @@ import numpy as np
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
-FINAL = {("full", "mingru"): 0.51, ("full", "mlp"): 0.45, ("partial", "mingru"): 0.47, ("partial", "mlp"): 0.30}
+FINAL = {
+    ("full", "mingru"): 0.51,
+    ("full", "mlp"): 0.45,
+    ("partial", "mingru"): 0.47,
+    ("partial", "mlp"): 0.30,
+}
 
 
 def small_study(**changes: object) -> Study:
@@ -34,7 +39,9 @@ def write_run(
     status: str = "finished",
     settings: Mapping[str, Any] | None = None,
 ) -> None:
-    """A run folder with config, metrics, evaluations and progress; finished unless told otherwise."""
+    """A run folder with config, metrics, evaluations and progress; finished unless told
+    otherwise.
+    """
     rng = np.random.default_rng(abs(hash((run.memory, run.observability, run.seed))) % 2**32)
     path.mkdir(parents=True, exist_ok=True)
     config = {
@@ -46,7 +53,9 @@ def write_run(
         "total_frames": frames,
         "pqn": {"gamma": 0.99, "lam": 0.8},
     } | dict(settings or {})
-    (path / "config.json").write_text(json.dumps({"config": config, "versions": {}, "command": ["x"]}))
+    (path / "config.json").write_text(
+        json.dumps({"config": config, "versions": {}, "command": ["x"]})
+    )
     xs = np.linspace(frames / 5, frames, 5).astype(int)
     means = final * np.linspace(0.1, 1.0, 5) + 0.02 * rng.standard_normal(5)
     lines = ["frames,mean,std,n", *(f"{x},{m:.4f},0.3,128" for x, m in zip(xs, means, strict=True))]
@@ -55,10 +64,20 @@ def write_run(
     means = final * np.linspace(0.0, 0.9, 40)
     lines = ["frames,train_return_ewm", *(f"{x},{m:.4f}" for x, m in zip(xs, means, strict=True))]
     (path / "metrics.csv").write_text("\n".join(lines) + "\n")
-    progress = {"frames": frames if status == "finished" else frames // 2, "total_frames": frames, "status": status}
+    progress = {
+        "frames": frames if status == "finished" else frames // 2,
+        "total_frames": frames,
+        "status": status,
+    }
     (path / "progress.json").write_text(json.dumps(progress))
     if status == "finished":
-        values = {"status": status, "frames": frames, "seconds": 95.0, "mean": final, "train_max_ewm": 0.9 * final}
+        values = {
+            "status": status,
+            "frames": frames,
+            "seconds": 95.0,
+            "mean": final,
+            "train_max_ewm": 0.9 * final,
+        }
         values |= {"returns": [final - 0.1, final + 0.1], "lengths": [20, 30]}
         (path / "eval.json").write_text(json.dumps(values))
 
@@ -70,6 +89,11 @@ def write_study(root: Path, study: Study, spread: float = 0.02) -> StudyFolder:
     for run in study.runs():
         shift = spread * (run.seed - (len(study.seeds) - 1) / 2)
         settings = study.config(run).to_dict()
-        write_run(folder.run(run).path, run, FINAL[run.observability, run.memory] + shift, settings=settings)
+        write_run(
+            folder.run(run).path,
+            run,
+            FINAL[run.observability, run.memory] + shift,
+            settings=settings,
+        )
     folder.write_results(study)
     return folder

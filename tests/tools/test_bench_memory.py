@@ -28,24 +28,37 @@ CPU = torch.device("cpu")
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.complex128])
 @pytest.mark.parametrize("form", [LOOP, "doubling"])
-def test_every_form_of_the_scan_gives_the_same_values_and_gradients(form: str, dtype: torch.dtype) -> None:
+def test_every_form_of_the_scan_gives_the_same_values_and_gradients(
+    form: str, dtype: torch.dtype
+) -> None:
     a, b = (torch.randn(2, 11, 3, dtype=dtype, requires_grad=True) for _ in "ab")
     weight = torch.randn(2, 11, 3, dtype=dtype)
     run = unbind_loop if form == LOOP else linear_scan
-    h, *ours = solve(form, lambda: ((out := run(a, b)), *torch.autograd.grad(out, (a, b), weight)))()
+    h, *ours = solve(
+        form, lambda: ((out := run(a, b)), *torch.autograd.grad(out, (a, b), weight))
+    )()
     expected = linear_scan(a, b)
     torch.testing.assert_close(h, expected)
     torch.testing.assert_close(tuple(ours), torch.autograd.grad(expected, (a, b), weight))
 
 
-def test_a_form_is_solved_by_the_back_end_it_names_in_both_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_form_is_solved_by_the_back_end_it_names_in_both_passes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     called = list[str]()
     for name, solvers in scan.BACK_ENDS.items():
         noting = [lambda *args, of=name, do=do: called.append(of) or do(*args) for do in solvers]
         monkeypatch.setitem(scan.BACK_ENDS, name, tuple(noting))
     a, b = (torch.rand(1, 3, 2, requires_grad=True) for _ in "ab")
     for form in ("serial", "doubling"):
-        time_passes({form: linear_scan}, lambda h: h.sum().backward(), (a.detach(), b.detach()), 1e-9, 1, solve)
+        time_passes(
+            {form: linear_scan},
+            lambda h: h.sum().backward(),
+            (a.detach(), b.detach()),
+            1e-9,
+            1,
+            solve,
+        )
         assert set(called) == {form} and len(called) >= 3
         called.clear()
 
@@ -54,7 +67,9 @@ def test_a_form_is_solved_by_the_back_end_it_names_in_both_passes(monkeypatch: p
 def test_a_model_and_the_same_with_its_loop_agree(name: str) -> None:
     compared = forms([name], 2, 9)
     x, is_init = torch.randn(2, 20, 9), torch.rand(2, 20) < 0.1
-    torch.testing.assert_close(compared[name, "scan"](x, is_init), compared[name, "loop"](x, is_init))
+    torch.testing.assert_close(
+        compared[name, "scan"](x, is_init), compared[name, "loop"](x, is_init)
+    )
     assert compared[TORCH_GRU, "torch"](x, is_init).shape == (2, 20, 9)
 
 
@@ -72,14 +87,32 @@ def test_saliency_is_timed_in_two_stages_and_through_the_whole_network() -> None
 
 
 def test_kinds_of_operation_share_the_time_of_the_work() -> None:
-    x, weight = torch.rand(4, 8, 32, 32, requires_grad=True), torch.rand(8, 8, 3, 3, requires_grad=True)
+    x, weight = (
+        torch.rand(4, 8, 32, 32, requires_grad=True),
+        torch.rand(8, 8, 3, 3, requires_grad=True),
+    )
     shares = op_breakdown(lambda: torch.nn.functional.conv2d(x, weight).square().sum().backward())
     assert set(shares) == {*KINDS, REST} and sum(shares.values()) == pytest.approx(1)
     assert shares["convolutions"] > 0.2 and shares["recurrence"] == 0
 
 
-def test_the_command_prints_all_tables_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["bench", "memory", "mingru", "gru", "--steps", "6", "--layers", "1", "--size", "8", "--seconds", "0.001"]
+def test_the_command_prints_all_tables_and_writes_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "bench",
+        "memory",
+        "mingru",
+        "gru",
+        "--steps",
+        "6",
+        "--layers",
+        "1",
+        "--size",
+        "8",
+        "--seconds",
+        "0.001",
+    ]
     words += ["--frames", "4"]
     assert cli.main([*words, "--repeats", "1", "--out", str(tmp_path / "m.csv")]) == cli.EXIT_OK
     out = capsys.readouterr().out

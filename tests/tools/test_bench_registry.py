@@ -18,11 +18,27 @@ RESULTS: dict[str, Any] = {
     "tables": {
         "envs": {
             "rows": [
-                {"game": "G", "obs_size": 128, "num_envs": 16, "measure": "env", "frames_per_s": 1000.0},
-                {"game": "G", "obs_size": 128, "num_envs": 32, "measure": "env", "frames_per_s": 2000.0},
+                {
+                    "game": "G",
+                    "obs_size": 128,
+                    "num_envs": 16,
+                    "measure": "env",
+                    "frames_per_s": 1000.0,
+                },
+                {
+                    "game": "G",
+                    "obs_size": 128,
+                    "num_envs": 32,
+                    "measure": "env",
+                    "frames_per_s": 2000.0,
+                },
             ]
         },
-        "scans": {"rows": [{"form": "a|b", "steps": 8, "numbers": "real", "forward_ms": 2.0, "both_ms": 4.0}]},
+        "scans": {
+            "rows": [
+                {"form": "a|b", "steps": 8, "numbers": "real", "forward_ms": 2.0, "both_ms": 4.0}
+            ]
+        },
     },
 }
 
@@ -31,7 +47,9 @@ def changed(**numbers: float) -> dict[str, Any]:
     """The same results with other numbers in the first row that has them."""
     results = copy.deepcopy(RESULTS)
     for column, value in numbers.items():
-        next(row for table in results["tables"].values() for row in table["rows"] if column in row)[column] = value
+        next(row for table in results["tables"].values() for row in table["rows"] if column in row)[
+            column
+        ] = value
     return results
 
 
@@ -59,7 +77,9 @@ def test_a_result_equals_itself() -> None:
         ({"forward_ms": 0.0}, "better"),
     ],
 )
-def test_a_rate_that_falls_and_a_time_that_grows_are_worse(numbers: dict[str, float], verdict: str) -> None:
+def test_a_rate_that_falls_and_a_time_that_grows_are_worse(
+    numbers: dict[str, float], verdict: str
+) -> None:
     found = compare(RESULTS, changed(**numbers), 0.2)
     assert {name: len(lines) for name, lines in found.items() if lines} == (
         {"same": 4} if verdict == "same" else {"same": 3, verdict: 1}
@@ -69,7 +89,9 @@ def test_a_rate_that_falls_and_a_time_that_grows_are_worse(numbers: dict[str, fl
 def test_comparing_backwards_turns_better_into_worse() -> None:
     (forth,) = compare(RESULTS, changed(both_ms=8.0), 0.2)["worse"]
     (back,) = compare(changed(both_ms=8.0), RESULTS, 0.2)["better"]
-    assert forth.endswith("both_ms 4 -> 8 ms (x 0.50)") and back.endswith("both_ms 8 -> 4 ms (x 2.00)")
+    assert forth.endswith("both_ms 4 -> 8 ms (x 0.50)") and back.endswith(
+        "both_ms 8 -> 4 ms (x 2.00)"
+    )
 
 
 def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
@@ -82,7 +104,10 @@ def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
     assert cli.main(["bench", "compare", str(old), str(other)]) == cli.EXIT_FAILED
     said = capsys.readouterr().out
     assert "not the same machine: cores 2 and 4" in said
-    assert "worse: envs: game G, obs_size 128, num_envs 16, measure env: frames_per_s 1,000 -> 500 frames/s" in said
+    assert (
+        "worse: envs: game G, obs_size 128, num_envs 16, measure env: frames_per_s 1,000 -> 500 "
+        "frames/s" in said
+    )
     assert said.count("missing: scans") == 2 and said.count("new: scans") == 2
     assert said.endswith("1 same, 1 worse, 0 better, 2 missing, 2 new\n")
     assert cli.main(["bench", "compare", str(old), str(other), "--tolerance", "0.6"]) == cli.EXIT_OK
@@ -101,7 +126,10 @@ def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
         (RESULTS | {"tables": {"cooking": {"rows": []}}}, "unknown table 'cooking'"),
         (RESULTS | {"tables": {"envs": []}}, "has no list of rows"),
         (RESULTS | {"tables": {"envs": {"rows": [1]}}}, "has no list of rows"),
-        (RESULTS | {"tables": {"envs": {"rows": [{"game": "G"}]}}}, "a row of table envs has no obs_size"),
+        (
+            RESULTS | {"tables": {"envs": {"rows": [{"game": "G"}]}}},
+            "a row of table envs has no obs_size",
+        ),
         (changed(frames_per_s=float("nan")), "frames_per_s is nan, wanted a number"),
         (changed(frames_per_s=-1.0), "frames_per_s is -1.0, wanted a number"),
         (changed(num_envs=32), "has two rows for game G, obs_size 128, num_envs 32"),
@@ -113,8 +141,12 @@ def test_a_file_that_is_none_is_refused_in_one_line(
     good, bad = written(tmp_path / "good.json", RESULTS), written(tmp_path / "bad.json", value)
     for words in ([str(good), str(bad)], [str(bad), str(good)]):
         assert message in one_error(capsys, ["bench", "compare", *words])
-    assert "does not exist" in one_error(capsys, ["bench", "compare", str(good), str(tmp_path / "none.json")])
-    assert "between 0 and 1" in one_error(capsys, ["bench", "compare", str(good), str(good), "--tolerance", "1.5"])
+    assert "does not exist" in one_error(
+        capsys, ["bench", "compare", str(good), str(tmp_path / "none.json")]
+    )
+    assert "between 0 and 1" in one_error(
+        capsys, ["bench", "compare", str(good), str(good), "--tolerance", "1.5"]
+    )
 
 
 def test_the_page_has_a_table_each_and_hostile_names_stay_in_their_cells() -> None:
@@ -132,7 +164,9 @@ def test_a_tiny_benchmark_of_everything_is_written_read_and_equals_itself(
     assert cli.main(["bench", "all", "--size", "tiny", "--out", str(out)]) == 0
     results = read_results(out)
     assert set(results["tables"]) == set(TABLES) and results["machine"]["torch"]
-    assert results["machine"]["keep_memory"] == "train"  # the others show what a loop of your own gets
+    assert (
+        results["machine"]["keep_memory"] == "train"
+    )  # the others show what a loop of your own gets
     assert page(results) == out.with_suffix(".md").read_text()
     capsys.readouterr()
     assert cli.main(["bench", "compare", str(out), str(out)]) == 0

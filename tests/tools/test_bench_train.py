@@ -16,22 +16,44 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
 ) -> None:
     smoke = bench.preset("smoke")
     monkeypatch.setattr(
-        bench, "preset", lambda name, **changes: bench.dataclasses.replace(smoke, **{**changes, "network": "small"})
+        bench,
+        "preset",
+        lambda name, **changes: bench.dataclasses.replace(smoke, **{**changes, "network": "small"}),
     )
     file, step, steps = tmp_path / "speed.csv", Learner.gradient_step, list[float]()
     monkeypatch.setattr(
-        Learner, "gradient_step", lambda self, rows, frames: (steps.append(frames), step(self, rows, frames))
+        Learner,
+        "gradient_step",
+        lambda self, rows, frames: (steps.append(frames), step(self, rows, frames)),
     )
     monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")
-    words = ["--networks", "small", "--memories", "gru", "--env", "SignpostEasy", "--grad-steps", "6", "--repeats", "1"]
+    words = [
+        "--networks",
+        "small",
+        "--memories",
+        "gru",
+        "--env",
+        "SignpostEasy",
+        "--grad-steps",
+        "6",
+        "--repeats",
+        "1",
+    ]
     words += ["--forms", "amp", "compiled+amp"]
     assert cli.main(["bench", "train", *words, "--out", str(file)]) == cli.EXIT_OK
     with file.open(newline="") as stream:
         row, compiled = csv.DictReader(stream)
     assert (row["form"], compiled["form"]) == ("amp", "compiled+amp")
     assert float(compiled["train_fps"]) > 0
-    assert len(steps) == 2 * 4 * 6  # a warm-up, the timed pass and two of the profiler; an epoch has four steps
-    assert (row["memory"], row["num_envs"], row["grad_steps"], row["device"]) == ("gru", "8", "8", "cpu")
+    assert (
+        len(steps) == 2 * 4 * 6
+    )  # a warm-up, the timed pass and two of the profiler; an epoch has four steps
+    assert (row["memory"], row["num_envs"], row["grad_steps"], row["device"]) == (
+        "gru",
+        "8",
+        "8",
+        "cpu",
+    )
     shares = [float(value) for key, value in row.items() if key.startswith("learning: ")]
     assert len(shares) >= 6 and sum(shares) == pytest.approx(1, abs=1e-2)
     assert float(row["learning: convolutions"]) > 0
@@ -52,11 +74,19 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
             "--grad-steps must be at most 32 with the small network; got 33",
         ),
         (["--threads", "-1"], "--threads must be at least 0"),
-        (["--forms", "amp+fast"], "a form must be eager, amp, compiled, graphs, or several of them joined by '+'; got"),
-        (["--forms", "graphs"], "cuda_graphs must be false on device 'cpu'; it needs a CUDA device"),
+        (
+            ["--forms", "amp+fast"],
+            "a form must be eager, amp, compiled, graphs, or several of them joined by '+'; got",
+        ),
+        (
+            ["--forms", "graphs"],
+            "cuda_graphs must be false on device 'cpu'; it needs a CUDA device",
+        ),
     ],
 )
-def test_wrong_options_get_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_get_one_line(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["bench", "train", *words]) == cli.EXIT_BAD_INPUT
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1

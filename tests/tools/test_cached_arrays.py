@@ -1,4 +1,6 @@
-"""Arrays of an analysis that stand in a file: used as they were written, else measured anew; nothing else is read."""
+"""Arrays of an analysis that stand in a file: used as they were written, else measured anew;
+nothing else is read.
+"""
 
 import io
 import os
@@ -97,9 +99,13 @@ def npy(header: str) -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode()
 
 
-def test_an_array_that_claims_more_than_is_there_is_refused_before_memory_is_asked_for(tmp_path: Path) -> None:
+def test_an_array_that_claims_more_than_is_there_is_refused_before_memory_is_asked_for(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.npz"
-    path.write_bytes(archive(a=npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }")))
+    path.write_bytes(
+        archive(a=npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"))
+    )
     with pytest.raises(ValueError, match=r"claims to be float64 \[1000000000000\]"):
         read_npz(path)
 
@@ -111,5 +117,7 @@ def test_an_archive_that_unpacks_to_more_than_memory_is_refused(
     np.savez_compressed(path, a=np.zeros(2**20))
     monkeypatch.setattr(files, "MOST_ARRAYS", 2**20)
     assert path.stat().st_size < 2**20
-    with pytest.raises(ValueError, match="its arrays take 8,388,736 bytes, at most 1,048,576 are read"):
+    with pytest.raises(
+        ValueError, match="its arrays take 8,388,736 bytes, at most 1,048,576 are read"
+    ):
         read_npz(path)

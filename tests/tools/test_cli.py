@@ -1,4 +1,6 @@
-"""The command line: help is quick, bad input is one line with exit code 2, work goes on after an interruption."""
+"""The command line: help is quick, bad input is one line with exit code 2, work goes on after an
+interruption.
+"""
 
 import json
 import subprocess
@@ -21,8 +23,12 @@ from tests.tools.fabricated import small_study, write_study
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def one_error(capsys: pytest.CaptureFixture[str], words: Sequence[str], code: int = cli.EXIT_BAD_INPUT) -> str:
-    """Run in this process, check that stderr is a single line and nothing is on stdout, and return it."""
+def one_error(
+    capsys: pytest.CaptureFixture[str], words: Sequence[str], code: int = cli.EXIT_BAD_INPUT
+) -> str:
+    """Run in this process, check that stderr is a single line and nothing is on stdout, and return
+    it.
+    """
     assert cli.main(words) == code
     out, err = capsys.readouterr()
     assert not out and err.count("\n") == 1 and err.startswith("arcade-torch: "), err
@@ -30,17 +36,29 @@ def one_error(capsys: pytest.CaptureFixture[str], words: Sequence[str], code: in
 
 
 def test_help_is_quick_and_loads_neither_torch_nor_jax() -> None:
-    code = "import sys; from arcade_torch.tools.cli import main; main(['--help']); print(sorted(sys.modules))"
+    code = (
+        "import sys; from arcade_torch.tools.cli import main; main(['--help']); "
+        "print(sorted(sys.modules))"
+    )
     start = time.perf_counter()
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
     assert time.perf_counter() - start < 10  # a third of a second on an idle machine
-    for heavy in ("'torch'", "'jax'", "'tyro'"):  # NumPy comes with Gymnasium, in whose registry the games stand
+    # NumPy comes with Gymnasium, in whose registry the games stand.
+    for heavy in (
+        "'torch'",
+        "'jax'",
+        "'tyro'",
+    ):
         assert heavy not in result.stdout
     assert "analyze gap-bias" in result.stdout
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
-def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_explains_itself_with_an_example(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main([*name.split(), "--help"]) == cli.EXIT_OK
     text = " ".join(capsys.readouterr().out.split())
     assert f"usage: arcade-torch {name}" in text
@@ -55,7 +73,10 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
         (["analyze", "gap"], "did you mean 'gap-bias'?"),
         (["analyze", "zzz"], "not 'zzz'"),
         (["train", "--preset", "huge"], "unknown preset 'huge'"),
-        (["train", "--total-frame", "5"], "Unrecognized options: --total-frame, 5; perhaps you meant --total-frames"),
+        (
+            ["train", "--total-frame", "5"],
+            "Unrecognized options: --total-frame, 5; perhaps you meant --total-frames",
+        ),
         (["train", "--seed", "x"], "'x' is no whole number"),
         (["train", "--env-option", "nonsense=1", "--env", "CartPoleEasy"], "nonsense"),
         (["study", "--preset", "demo", "--shard", "3"], "a shard is written 3/10"),
@@ -69,12 +90,18 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
         (["analyze", "gap-bias"], "name at least one"),
         (["analyze", "gap-bias", "no/such.csv"], "does not exist"),
         (["analyze", "gap-bias", "README.md", "--confidence", "2"], "between 0 and 1"),
-        (["bench", "envs", "--out", "x.txt"], "--out must be a file that ends in .csv or .json; got 'x.txt'"),
+        (
+            ["bench", "envs", "--out", "x.txt"],
+            "--out must be a file that ends in .csv or .json; got 'x.txt'",
+        ),
         (["bench", "envs", "--batches", "0"], "--batches must be at least 1"),
         (["bench", "envs", "--repeats", "0"], "--repeats must be at least 1"),
         (["bench", "memory", "--repeats", "0"], "--repeats must be at least 1"),
         (["bench", "recall", "--seed", "-1"], "--seed must be at least 0"),
-        (["bench", "recall", "--out", "x.json"], "--out must be a file that ends in .csv; got 'x.json'"),
+        (
+            ["bench", "recall", "--out", "x.json"],
+            "--out must be a file that ends in .csv; got 'x.json'",
+        ),
         (["analyze", "recall-density", ".", "--seed", "-1"], "--seed must be at least 0"),
         (["analyze", "contamination", ".", "--seed", "-1"], "--seed must be at least 0"),
         (["bench", "envs", "--batches", "1" + "0" * 30], "--batches must be at most 1,048,576"),
@@ -82,7 +109,10 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
         (["bench", "envs", "--seconds", "inf"], "--seconds must be at most"),
         (["bench", "recall", "--seed", "1" + "0" * 30], "--seed must be at most"),
         (["list", "baselines", "CartPoleEasy", "--seconds", "nan"], "--seconds must be at least 0"),
-        (["record", "CartPoleEasy", "--out", "x.gif", "--scale", "1" + "0" * 30], "--scale must be at most 32"),
+        (
+            ["record", "CartPoleEasy", "--out", "x.gif", "--scale", "1" + "0" * 30],
+            "--scale must be at most 32",
+        ),
         (["record", "CartPoleEasy", "--out", "x.gif", "--fps", "nan"], "--fps must be"),
         (["train", "--preset", "smoke", "--wait", "nan"], "--wait must be at least 0"),
         (["train", "--preset", "smoke", "--seed", ""], "'' is no whole number"),
@@ -92,26 +122,44 @@ def test_every_command_explains_itself_with_an_example(name: str, capsys: pytest
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert message in one_error(capsys, words)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unknown_game_is_named_with_the_nearest(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["train", "--preset", "smoke", "--env", "MineSweperEasy", "--out", str(tmp_path / "run")]
+def test_an_unknown_game_is_named_with_the_nearest(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = [
+        "train",
+        "--preset",
+        "smoke",
+        "--env",
+        "MineSweperEasy",
+        "--out",
+        str(tmp_path / "run"),
+    ]
     assert "did you mean 'MineSweeperEasy'" in one_error(capsys, words)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_taken_run_folder_is_left_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_taken_run_folder_is_left_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
     assert "not empty" in one_error(capsys, ["train", "--preset", "smoke", "--out", str(tmp_path)])
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_corrupt_checkpoint_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_corrupt_checkpoint_is_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     (tmp_path / "checkpoints" / "frames-000000000001").mkdir(parents=True)
     (tmp_path / "checkpoints" / "frames-000000000001" / "meta.json").write_text("{")
     assert "is damaged" in one_error(capsys, ["evaluate", str(tmp_path)])
@@ -135,13 +183,23 @@ def test_a_missing_package_is_named_with_its_extra(
 
 
 def test_a_missing_option_parser_is_named_too() -> None:
-    code = "import sys; sys.modules['tyro'] = None; from arcade_torch.tools.cli import main; sys.exit(main(['list']))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    code = (
+        "import sys; sys.modules['tyro'] = None; from arcade_torch.tools.cli import main; "
+        "sys.exit(main(['list']))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
     assert result.returncode == 2
-    assert result.stderr == "arcade-torch: the package tyro is missing: pip install 'arcade-torch[tools]'\n"
+    assert (
+        result.stderr
+        == "arcade-torch: the package tyro is missing: pip install 'arcade-torch[tools]'\n"
+    )
 
 
-@pytest.mark.parametrize("fault", [lambda: 1 // 0, lambda: whole_number(None), lambda: int("x"), lambda: {}["x"]])
+@pytest.mark.parametrize(
+    "fault", [lambda: 1 // 0, lambda: whole_number(None), lambda: int("x"), lambda: {}["x"]]
+)
 def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
     fault: Callable[[], Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,22 +220,35 @@ def test_a_failure_below_what_was_imported_is_not_called_ours(
 ) -> None:
     from arcade_torch.tools.commands import list as command
 
-    (tmp_path / "mine.py").write_text("import arcade_torch.tools\narcade_torch.tools.broken = lambda: 1 // 0\n")
-    monkeypatch.setattr(command.List, "run", lambda self: sys.modules["arcade_torch.tools"].broken())
+    (tmp_path / "mine.py").write_text(
+        "import arcade_torch.tools\narcade_torch.tools.broken = lambda: 1 // 0\n"
+    )
+    monkeypatch.setattr(
+        command.List, "run", lambda self: sys.modules["arcade_torch.tools"].broken()
+    )
     assert cli.main(["list", "--import", str(tmp_path / "mine.py")]) == cli.EXIT_FAILED
     said = capsys.readouterr().err
-    assert said.startswith(f"arcade-torch: {tmp_path / 'mine.py'} failed:\n") and "ZeroDivisionError" in said
+    assert (
+        said.startswith(f"arcade-torch: {tmp_path / 'mine.py'} failed:\n")
+        and "ZeroDivisionError" in said
+    )
 
 
-def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_says_how_to_go_on(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     from arcade_torch.tools.commands import study as command
 
     def interrupted(self: object) -> int:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command.Demo, "run", interrupted)
-    said = one_error(capsys, ["demo", "--frames", "4096", "--out", "runs/a b"], cli.EXIT_INTERRUPTED)
-    assert said.endswith("go on from their checkpoints with: arcade-torch demo --frames 4096 --out 'runs/a b'\n")
+    said = one_error(
+        capsys, ["demo", "--frames", "4096", "--out", "runs/a b"], cli.EXIT_INTERRUPTED
+    )
+    assert said.endswith(
+        "go on from their checkpoints with: arcade-torch demo --frames 4096 --out 'runs/a b'\n"
+    )
 
 
 @pytest.mark.usefixtures("own_registry")
@@ -185,7 +256,18 @@ def test_an_interruption_says_how_to_go_on(capsys: pytest.CaptureFixture[str], m
     "words",
     [
         ["demo", "--workers", "3", "--seeds", "2"],
-        ["study", "--preset", "demo", "--workers", "3", "--no-report", "--engine", "inline", "--shard", "1/2"],
+        [
+            "study",
+            "--preset",
+            "demo",
+            "--workers",
+            "3",
+            "--no-report",
+            "--engine",
+            "inline",
+            "--shard",
+            "1/2",
+        ],
         ["train", "--preset", "smoke", "--env", "PairsEasy", "--out", "1e3", "--resume"],
     ],
 )
@@ -202,11 +284,25 @@ def test_the_hint_after_an_interruption_keeps_every_option(
 
 
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
-    words = ["--preset", "small", "--total-frames", "2e4", "--eval-every", "40_000", "--ppo.lam", "0.5"]
-    config = Train.parse([*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train").settings
+    words = [
+        "--preset",
+        "small",
+        "--total-frames",
+        "2e4",
+        "--eval-every",
+        "40_000",
+        "--ppo.lam",
+        "0.5",
+    ]
+    config = Train.parse(
+        [*words, "--env-option", "noise=0.5", "--network-option", "skip=residual"], "train"
+    ).settings
     assert (config.total_frames, config.eval_every, config.ppo.lam) == (20_000, 40_000, 0.5)
     assert config.ppo.num_envs == 64  # of the preset
-    assert (dict(config.env_options), config.network_options["skip"]) == ({"noise": 0.5}, "residual")
+    assert (dict(config.env_options), config.network_options["skip"]) == (
+        {"noise": 0.5},
+        "residual",
+    )
 
 
 def test_a_folder_may_be_called_like_a_number() -> None:
@@ -220,33 +316,51 @@ def test_a_run_can_start_from_the_config_of_another_and_change_it(tmp_path: Path
     for content in (config.to_dict(), {"config": config.to_dict(), "versions": {}}):
         file.write_text(json.dumps(content))
         assert Train.parse(["--config", str(file)], "train").settings == config
-    changed = Train.parse(["--config", str(file), "--seed", "3", "--pqn.gamma", "0.5"], "train").settings
+    changed = Train.parse(
+        ["--config", str(file), "--seed", "3", "--pqn.gamma", "0.5"], "train"
+    ).settings
     assert changed == preset("smoke", env="SignpostEasy", seed=3, pqn={"lam": 0.5, "gamma": 0.5})
 
 
-def test_a_config_file_that_is_none_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_config_file_that_is_none_is_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     file = tmp_path / "config.json"
     assert "no config at" in one_error(capsys, ["train", "--config", str(file)])
-    for content, message in (("{", "does not hold JSON"), ("[]", "holds no config"), ('{"x": 1}', "unknown field 'x'")):
+    for content, message in (
+        ("{", "does not hold JSON"),
+        ("[]", "holds no config"),
+        ('{"x": 1}', "unknown field 'x'"),
+    ):
         file.write_text(content)
         assert message in one_error(capsys, ["train", "--config", str(file)])
     assert "not both" in one_error(capsys, ["train", "--config", str(file), "--preset", "smoke"])
 
 
-def test_a_dry_run_prints_every_run_with_its_frames(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_dry_run_prints_every_run_with_its_frames(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     file = tmp_path / "grid.toml"
     file.write_text('games = ["CartPoleEasy"]\nmemories = ["mlp"]\nseeds = 2\n')
     assert cli.main(["study", str(file), "--out", str(tmp_path / "out"), "--dry-run"]) == 0
     out, err = capsys.readouterr()
-    assert out.splitlines()[0] == "CartPoleEasy__full__mlp__pqn__seed0  9,998,336 frames" and len(out.splitlines()) == 4
+    assert (
+        out.splitlines()[0] == "CartPoleEasy__full__mlp__pqn__seed0  9,998,336 frames"
+        and len(out.splitlines()) == 4
+    )
     assert err == "4 runs, 39,993,344 frames in all\n"
     assert not (tmp_path / "out").exists()
 
 
-def test_gap_bias_prints_and_saves_its_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_gap_bias_prints_and_saves_its_table(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     write_study(tmp_path / "s", small_study())
     out = tmp_path / "table.csv"
-    assert cli.main(["analyze", "gap-bias", str(tmp_path / "s"), "--draws", "50", "--out", str(out)]) == 0
+    assert (
+        cli.main(["analyze", "gap-bias", str(tmp_path / "s"), "--draws", "50", "--out", str(out)])
+        == 0
+    )
     text = capsys.readouterr().out
     assert "mingru" in text and "measured coverage" in text
     assert out.read_text().startswith("agent,without,seeds,mdp_raw")

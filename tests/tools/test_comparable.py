@@ -1,4 +1,6 @@
-"""Runs that learned by different settings are never pooled as seeds of one agent, also where a setting is missing."""
+"""Runs that learned by different settings are never pooled as seeds of one agent, also where a
+setting is missing.
+"""
 
 import json
 from pathlib import Path
@@ -39,7 +41,11 @@ def two_seeds(folder: Path, name: str, first: Any, second: Any) -> Path:
     for seed, value in enumerate((first, second)):
         settings = json.loads(json.dumps(SETTINGS))
         change(settings, name, value)
-        own = {key: settings[key] for key in settings if key not in ("env", "memory", "seed", "observability")}
+        own = {
+            key: settings[key]
+            for key in settings
+            if key not in ("env", "memory", "seed", "observability")
+        }
         run = write(folder / str(seed), "lru", "full", seed, 0.5, **own)
         if value is ABSENT and "." not in name:
             change_config(run, lambda config: config.pop(name, None))
@@ -84,7 +90,11 @@ EQUAL = [
     ("network_options", ABSENT, {}),
     ("network_options", {"chunk": 4}, {"chunk": 4.0}),
     ("network_options", {"hidden_size": 512}, {"hidden_size": 512.0}),
-    ("network_options", {"memory_options": {"sizes": [1, 2]}}, {"memory_options": {"sizes": [1.0, 2.0]}}),
+    (
+        "network_options",
+        {"memory_options": {"sizes": [1, 2]}},
+        {"memory_options": {"sizes": [1.0, 2.0]}},
+    ),
     ("ppo.clip", 0.1, 0.3),  # another learner's
     ("threads", 1, ABSENT),
 ]
@@ -102,9 +112,16 @@ def test_a_missing_setting_is_its_default_and_a_number_is_the_same_in_every_form
 def test_one_function_answers_for_resuming_and_for_pooling() -> None:
     old = {"env": GAME, "seed": 0, "pqn": {"gamma": 0.99}}
     changes = {"amp": True, "rules": "reference"}
-    new = TrainConfig.from_dict({"env": GAME, "pqn": {"average_share": 0.5, "bootstrap": "last"}} | changes)
+    new = TrainConfig.from_dict(
+        {"env": GAME, "pqn": {"average_share": 0.5, "bootstrap": "last"}} | changes
+    )
     named = differing_fields(TrainConfig.from_dict(old), new)
-    assert [each.partition(" ")[0] for each in named] == ["amp", "pqn.average_share", "pqn.bootstrap", "rules"]
+    assert [each.partition(" ")[0] for each in named] == [
+        "amp",
+        "pqn.average_share",
+        "pqn.bootstrap",
+        "rules",
+    ]
     assert differing_fields(old, new) == named
     assert differing_fields(old, new.to_dict()) == named
 
@@ -113,14 +130,21 @@ def test_all_settings_that_differ_are_named(tmp_path: Path) -> None:
     two_seeds(tmp_path, "amp", ABSENT, True)
     change_config(tmp_path / "0", lambda config: config["pqn"].pop("average_share"))
     change_config(tmp_path / "1", lambda config: config["pqn"].update(average_share=0.5))
-    with pytest.raises(ValueError, match=r"differ in amp: False and True, pqn.average_share: 0.0 and 0.5; give runs"):
+    with pytest.raises(
+        ValueError,
+        match=r"differ in amp: False and True, pqn.average_share: 0.0 and 0.5; give runs",
+    ):
         find_runs([tmp_path])
 
 
 @pytest.mark.parametrize("bare", ["CartPoleEasy", "NoisyPoleEasy"])
-def test_a_game_with_and_without_its_version_or_by_its_alias_is_one_game(bare: str, tmp_path: Path) -> None:
+def test_a_game_with_and_without_its_version_or_by_its_alias_is_one_game(
+    bare: str, tmp_path: Path
+) -> None:
     full = {"CartPoleEasy": "CartPoleEasy-v0", "NoisyPoleEasy": "NoisyCartPoleEasy-v0"}[bare]
-    assert {run.game for run in find_runs([two_seeds(tmp_path, "env_options", {}, {})]).runs} == {GAME}
+    assert {run.game for run in find_runs([two_seeds(tmp_path, "env_options", {}, {})]).runs} == {
+        GAME
+    }
     change_config(tmp_path / "0", lambda config: config.update(env=bare))
     change_config(tmp_path / "1", lambda config: config.update(env=full))
     assert list(find_runs([tmp_path]).groups()) == [("lru", full, "full")]
@@ -135,8 +159,12 @@ def test_a_game_of_ones_own_that_is_not_imported_is_one_game_too(tmp_path: Path)
 
 def test_an_alias_in_a_table_is_the_game_of_the_runs(tmp_path: Path) -> None:
     run = write(tmp_path / "run", "lru", "full", 0, 0.5, env="NoisyCartPoleEasy-v0")
-    (tmp_path / "scores.csv").write_text("agent,game,observability,seed,score\nlru,NoisyPoleEasy,full,1,0.5\n")
-    assert {score.game for score in read_scores([run, tmp_path / "scores.csv"])} == {"NoisyCartPoleEasy-v0"}
+    (tmp_path / "scores.csv").write_text(
+        "agent,game,observability,seed,score\nlru,NoisyPoleEasy,full,1,0.5\n"
+    )
+    assert {score.game for score in read_scores([run, tmp_path / "scores.csv"])} == {
+        "NoisyCartPoleEasy-v0"
+    }
 
 
 def test_curves_and_report_refuse_what_the_measures_refuse(tmp_path: Path) -> None:
@@ -176,15 +204,28 @@ def test_settings_nested_without_end_are_refused(tmp_path: Path) -> None:
     two_seeds(tmp_path, "amp", False, False)
     text = (tmp_path / "0" / "config.json").read_text()
     deep = '{"x": ' * 900 + "1" + "}" * 900
-    (tmp_path / "0" / "config.json").write_text(text.replace('"config": {', f'"config": {{"deep": {deep}, ', 1))
-    with pytest.raises(ValueError, match=r"config\.json (is damaged|does not hold JSON)|differ in deep"):
+    (tmp_path / "0" / "config.json").write_text(
+        text.replace('"config": {', f'"config": {{"deep": {deep}, ', 1)
+    )
+    with pytest.raises(
+        ValueError, match=r"config\.json (is damaged|does not hold JSON)|differ in deep"
+    ):
         find_runs([tmp_path])
 
 
 def test_settings_of_the_wrong_kind_are_refused_in_one_line(tmp_path: Path) -> None:
-    for name, value in (("algorithm", [1]), ("pqn", 5), ("total_frames", {"a": 1}), ("rules", None), ("obs_size", [])):
+    for name, value in (
+        ("algorithm", [1]),
+        ("pqn", 5),
+        ("total_frames", {"a": 1}),
+        ("rules", None),
+        ("obs_size", []),
+    ):
         two_seeds(tmp_path / name, "amp", False, False)
-        change_config(tmp_path / name / "0", lambda config, name=name, value=value: config.update({name: value}))
+        change_config(
+            tmp_path / name / "0",
+            lambda config, name=name, value=value: config.update({name: value}),
+        )
         try:
             find_runs([tmp_path / name])
         except ValueError as error:

@@ -33,7 +33,16 @@ def test_a_moment_behind_the_end_is_refused_with_the_length_of_the_episode() -> 
 
 
 def test_a_strip_is_of_one_game(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["list", "sheet", "SignpostEasy", "SignpostHard", "--steps", "0", "--out", str(tmp_path / "s.png")]
+    words = [
+        "list",
+        "sheet",
+        "SignpostEasy",
+        "SignpostHard",
+        "--steps",
+        "0",
+        "--out",
+        str(tmp_path / "s.png"),
+    ]
     assert cli.main(words) == cli.EXIT_BAD_INPUT
     assert "one game" in capsys.readouterr().err
     assert cli.main([*words[:3], *words[4:]]) == cli.EXIT_OK

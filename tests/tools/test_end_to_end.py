@@ -30,7 +30,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study of two runs, trained in this process."""
     root = tmp_path_factory.mktemp("study")
     (root / "toy.toml").write_text(TOML)
-    words = ["study", str(root / "toy.toml"), "--out", str(root / "out"), "--engine", "inline", "--no-report"]
+    words = [
+        "study",
+        str(root / "toy.toml"),
+        "--out",
+        str(root / "out"),
+        "--engine",
+        "inline",
+        "--no-report",
+    ]
     assert cli.main(words) == 0
     return root / "out"
 
@@ -43,9 +51,19 @@ def test_a_study_trains_every_run_and_collects_the_results(finished: Path) -> No
     assert all(float(row["seconds"]) > 0 for row in read_csv(finished / "timings.csv"))
 
 
-def test_a_finished_study_is_not_trained_again(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_finished_study_is_not_trained_again(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = {path: path.stat().st_mtime_ns for path in (finished / "runs").rglob("*.csv")}
-    words = ["study", str(finished.parent / "toy.toml"), "--out", str(finished), "--engine", "inline", "--no-report"]
+    words = [
+        "study",
+        str(finished.parent / "toy.toml"),
+        "--out",
+        str(finished),
+        "--engine",
+        "inline",
+        "--no-report",
+    ]
     assert cli.main(words) == 0
     assert "2 of 2 runs finished" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in (finished / "runs").rglob("*.csv")}
@@ -57,8 +75,14 @@ def test_a_job_is_a_config_in_json_and_trains_the_same_run(finished: Path, tmp_p
         assert words[:2] == ["train", "--config"] and words[3:] == ["--out", words[4], "--resume"]
     words[4] = str(tmp_path / "again")
     assert cli.main(words) == 0
-    found = [json.loads((path / "eval.json").read_text()) for path in (tmp_path / "again", Path(line.split()[5]))]
-    assert found[0]["returns"] == found[1]["returns"] and found[0]["train_max_ewm"] == found[1]["train_max_ewm"]
+    found = [
+        json.loads((path / "eval.json").read_text())
+        for path in (tmp_path / "again", Path(line.split()[5]))
+    ]
+    assert (
+        found[0]["returns"] == found[1]["returns"]
+        and found[0]["train_max_ewm"] == found[1]["train_max_ewm"]
+    )
 
 
 @pytest.mark.parametrize("engine", ["inline", "processes"])
@@ -70,19 +94,39 @@ def test_a_run_that_fails_leaves_its_reason_and_a_log(
     run.mkdir(parents=True)
     (run / "thesis.tex").write_text("precious")
     (tmp_path / "out" / "study.json").write_text("")
-    words = ["study", str(tmp_path / "toy.toml"), "--out", str(tmp_path / "out"), "--engine", engine, "--no-report"]
+    words = [
+        "study",
+        str(tmp_path / "toy.toml"),
+        "--out",
+        str(tmp_path / "out"),
+        "--engine",
+        engine,
+        "--no-report",
+    ]
     assert cli.main(words) == 1
     (row,) = read_csv(tmp_path / "out" / "results.csv")
     assert (row["status"], row["error"]) == ("failed", f"{run} is not empty; choose another folder")
     log = tmp_path / "out" / "logs" / f"{run.name}.log"
-    assert f"{row['error']} (log: {log})" in capsys.readouterr().out and "is not empty" in log.read_text()
+    assert (
+        f"{row['error']} (log: {log})" in capsys.readouterr().out
+        and "is not empty" in log.read_text()
+    )
 
 
 def test_an_agent_can_be_evaluated_on_both_twins(
     finished: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     run = next((finished / "runs").iterdir())
-    words = ["evaluate", str(run), "--episodes", "3", "--observability", "partial", "--json", str(tmp_path / "e.json")]
+    words = [
+        "evaluate",
+        str(run),
+        "--episodes",
+        "3",
+        "--observability",
+        "partial",
+        "--json",
+        str(tmp_path / "e.json"),
+    ]
     assert cli.main(words) == 0
     assert "over 3 episodes" in capsys.readouterr().out
     assert len(json.loads((tmp_path / "e.json").read_text())["returns"]) == 3
@@ -92,7 +136,10 @@ def test_an_agent_can_be_evaluated_on_both_twins(
 
 def test_saliency_is_drawn_and_its_numbers_are_kept(finished: Path, tmp_path: Path) -> None:
     run = next((finished / "runs").iterdir())
-    assert cli.main(["analyze", "saliency", str(run), "--out", str(tmp_path / "s.png"), "--show", "4"]) == 0
+    assert (
+        cli.main(["analyze", "saliency", str(run), "--out", str(tmp_path / "s.png"), "--show", "4"])
+        == 0
+    )
     assert (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
     with np.load(tmp_path / "s.npz", allow_pickle=False) as kept:
         assert kept["frames_0"].shape[1:] == (128, 128, 3)
@@ -109,10 +156,15 @@ def test_the_report_holds_a_strip_of_every_agent(
     assert text.count("data:image/png;base64,") >= 2
     assert "100.0 % of the gradient on the last one" in text
     folder = StudyFolder(finished)
-    assert all(list((folder.run(run).path / "analysis").glob("episode_saliency-*.npz")) for run in folder.load().runs())
+    assert all(
+        list((folder.run(run).path / "analysis").glob("episode_saliency-*.npz"))
+        for run in folder.load().runs()
+    )
 
 
-def test_reference_returns_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reference_returns_are_computed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = players.references("MineSweeperEasy", tmp_path, episodes=16)
     assert found["random"].mean < found["frames"].mean < found["state"].mean == pytest.approx(1.0)
     monkeypatch.setattr(players, "measure", None)
@@ -125,10 +177,15 @@ def test_the_benchmark_consumes_every_frame_it_counts(tmp_path: Path) -> None:
     rows = {row["measure"]: row for row in read_csv(tmp_path / "b.csv")}
     assert list(rows) == ["step+draw", "step", "env", "collector", "fill", "copy"]
     for name in ("step+draw", "env", "collector"):
-        row = {key: float(rows[name][key]) for key in ("frames", "frames_per_s", "frames_per_s_with_check")}
+        row = {
+            key: float(rows[name][key])
+            for key in ("frames", "frames_per_s", "frames_per_s_with_check")
+        }
         assert row["frames"] >= 4 and row["frames"] % 2 == 0 and int(rows[name]["checksum"]) > 0
         assert 0 < row["frames_per_s_with_check"] < row["frames_per_s"]
-        assert float(rows[name]["gb_per_s"]) == pytest.approx(row["frames_per_s"] * 49_152 / 1e9, rel=1e-3)
+        assert float(rows[name]["gb_per_s"]) == pytest.approx(
+            row["frames_per_s"] * 49_152 / 1e9, rel=1e-3
+        )
     assert float(rows["fill"]["share_of_fill"]) == float(rows["copy"]["share_of_copy"]) == 1
     assert float(rows["step"]["gb_per_s"]) == 0
 
@@ -158,10 +215,21 @@ def test_the_checksum_reads_every_byte() -> None:
 
 @pytest.mark.slow
 def test_ctrl_c_stops_a_study_in_processes_and_the_same_command_finishes_it(tmp_path: Path) -> None:
-    (tmp_path / "toy.toml").write_text(TOML + "total_frames = 4096\n[settings]\ncheckpoint_every = 64\n")
-    words = [sys.executable, "-m", "arcade_torch.tools", "study", str(tmp_path / "toy.toml"), "--out"]
+    (tmp_path / "toy.toml").write_text(
+        TOML + "total_frames = 4096\n[settings]\ncheckpoint_every = 64\n"
+    )
+    words = [
+        sys.executable,
+        "-m",
+        "arcade_torch.tools",
+        "study",
+        str(tmp_path / "toy.toml"),
+        "--out",
+    ]
     words += [str(tmp_path / "out"), "--engine", "processes", "--no-report"]
-    first = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    first = subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("out/runs/*/checkpoints/latest")) and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -169,8 +237,12 @@ def test_ctrl_c_stops_a_study_in_processes_and_the_same_command_finishes_it(tmp_
     _, err = first.communicate(timeout=90)
     assert first.returncode == 130, err
     assert "go on from their checkpoints with: arcade-torch study" in err
-    status = [json.loads(file.read_text())["status"] for file in tmp_path.glob("out/runs/*/progress.json")]
+    status = [
+        json.loads(file.read_text())["status"] for file in tmp_path.glob("out/runs/*/progress.json")
+    ]
     assert status and set(status) <= {"interrupted", "finished"}
-    second = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False)
+    second = subprocess.run(
+        words, cwd=ROOT, capture_output=True, text=True, timeout=240, check=False
+    )
     assert second.returncode == 0, second.stderr
     assert "2 of 2 runs finished" in second.stdout

@@ -1,4 +1,6 @@
-"""``--import``: a file or module of a user is there before the command runs, in workers too; errors are one line."""
+"""``--import``: a file or module of a user is there before the command runs, in workers too; errors
+are one line.
+"""
 
 import os
 import subprocess
@@ -17,7 +19,10 @@ OWN_GAME = Path(__file__).resolve().parents[2] / "examples/own_game.py"
 
 def test_imports_are_taken_out_wherever_they_stand() -> None:
     words = ["--import", "one", "train", "--import=two.py", "--env", "PairsEasy"]
-    assert take_imports(words) == (["one", str(Path("two.py").resolve())], ["train", "--env", "PairsEasy"])
+    assert take_imports(words) == (
+        ["one", str(Path("two.py").resolve())],
+        ["train", "--env", "PairsEasy"],
+    )
     for incomplete in (["train", "--import"], ["train", "--import="]):
         with pytest.raises(ValueError, match=r"--import needs a file \(games.py\) or a module"):
             take_imports(incomplete)
@@ -29,11 +34,16 @@ def test_a_file_is_imported_once_and_handed_on_to_workers() -> None:
     load_extensions([str(OWN_GAME)])
     assert "PairsEasy-v0" in registered_ids()
     assert os.environ[VARIABLE] == str(OWN_GAME)
-    assert command_line(["train", "--env", "PairsEasy"]) == f"arcade-torch train --env PairsEasy --import {OWN_GAME}"
+    assert (
+        command_line(["train", "--env", "PairsEasy"])
+        == f"arcade-torch train --env PairsEasy --import {OWN_GAME}"
+    )
 
 
 @pytest.mark.usefixtures("own_registry")
-def test_a_module_is_found_on_the_import_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_module_is_found_on_the_import_path(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "own_game_module.py").write_text(OWN_GAME.read_text())
     monkeypatch.syspath_prepend(str(tmp_path))
     load_extensions(["own_game_module"])
@@ -43,7 +53,9 @@ def test_a_module_is_found_on_the_import_path(monkeypatch: pytest.MonkeyPatch, t
 def test_a_worker_process_knows_the_game_of_the_study_that_started_it() -> None:
     code = "import sys; from arcade_torch.tools.cli import main; sys.exit(main(['list', 'envs']))"
     environment = {**os.environ, VARIABLE: str(OWN_GAME)}
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     assert "PairsEasy-v0" in result.stdout
 
 

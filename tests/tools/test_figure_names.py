@@ -30,9 +30,20 @@ def test_any_name_in_a_table_of_scores_is_drawn(
     for agent in (*HOSTILE, "mlp"):
         for game in ("TetrisEasy", "$x^{$", "$y_{\x07$"):
             cells = ",".join('"' + cell.replace('"', '""') + '"' for cell in (agent, game))
-            lines += [f"{cells},{twin},{seed},0.{seed + 2}" for twin in ("full", "partial") for seed in (0, 1)]
+            lines += [
+                f"{cells},{twin},{seed},0.{seed + 2}"
+                for twin in ("full", "partial")
+                for seed in (0, 1)
+            ]
     (tmp_path / "scores.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    words = ["figure", figure, "--runs", str(tmp_path / "scores.csv"), "--out", str(tmp_path / "f.pdf")]
+    words = [
+        "figure",
+        figure,
+        "--runs",
+        str(tmp_path / "scores.csv"),
+        "--out",
+        str(tmp_path / "f.pdf"),
+    ]
     words = words if figure == "gap-bias" else [*words[:-1], str(tmp_path)]
     assert cli.main(words) == 0, capsys.readouterr().err
 
@@ -70,15 +81,29 @@ def test_options_and_settings_with_dollars_are_drawn(tmp_path: Path) -> None:
 def test_names_of_games_in_a_file_of_rates_are_drawn(tmp_path: Path) -> None:
     lines = ["game,measure,obs_size,num_envs,frames_per_s_with_check,jax_device"]
     for game in (r"$\frac{", "_x", "a\x1bb"):
-        lines += [f"{game},step+draw,128,{count},{1000 * count},$\\frac{{ cpu" for count in (1, 16, 256)]
+        lines += [
+            f"{game},step+draw,128,{count},{1000 * count},$\\frac{{ cpu" for count in (1, 16, 256)
+        ]
     (tmp_path / "rates.csv").write_text("\n".join(lines) + "\n")
-    assert cli.main(["figure", "throughput", str(tmp_path / "rates.csv"), "--out", str(tmp_path / "f")]) == 0
-    assert {row["series"] for row in read_csv(tmp_path / "f" / "throughput.csv")} >= {r"$\frac{", "_x", r"a\x1bb"}
+    assert (
+        cli.main(
+            ["figure", "throughput", str(tmp_path / "rates.csv"), "--out", str(tmp_path / "f")]
+        )
+        == 0
+    )
+    assert {row["series"] for row in read_csv(tmp_path / "f" / "throughput.csv")} >= {
+        r"$\frac{",
+        "_x",
+        r"a\x1bb",
+    }
 
 
 def test_ticks_of_rates_are_powers_of_ten(tmp_path: Path) -> None:
     lines = ["game,measure,obs_size,num_envs,frames_per_s_with_check"]
-    lines += [f"A,step+draw,128,{count},{rate}" for count, rate in ((1, 900), (16, 12_000), (256, 1_200_000))]
+    lines += [
+        f"A,step+draw,128,{count},{rate}"
+        for count, rate in ((1, 900), (16, 12_000), (256, 1_200_000))
+    ]
     (tmp_path / "rates.csv").write_text("\n".join(lines) + "\n")
     with drawing("light"):
         (picture,) = logs.throughput(logs.Options((tmp_path / "rates.csv",)), None).pictures
@@ -93,11 +118,19 @@ def test_titles_of_saliency_are_text_and_its_times_are_mathematics() -> None:
         figure = saliency_figure([(r"$\frac{ 50 %", frames, maps)], figure=given)
         figure.canvas.draw()
         (part,) = figure.subfigs
-        assert part._suptitle.get_text().startswith(r"$\frac{ 50 %") and not part._suptitle.get_parse_math()
+        assert (
+            part._suptitle.get_text().startswith(r"$\frac{ 50 %")
+            and not part._suptitle.get_parse_math()
+        )
         assert all(axis.title.get_parse_math() for axis in part.axes)
 
 
 def test_every_maker_of_figures_is_covered_here_or_has_no_names() -> None:
     drawn_here = {"returns", "gap-bias", "curves", "hyperparameters", "throughput", "saliency"}
-    others: Any = {"human", "size-sweep", "recall-density", "contamination"}  # fixed names, or by the style alone
+    others: Any = {
+        "human",
+        "size-sweep",
+        "recall-density",
+        "contamination",
+    }  # fixed names, or by the style alone
     assert set(FIGURES) == drawn_here | others

@@ -1,4 +1,6 @@
-"""Figures look the same whatever the user has set in matplotlib, and leave what the user has set alone."""
+"""Figures look the same whatever the user has set in matplotlib, and leave what the user has set
+alone.
+"""
 
 import os
 import subprocess
@@ -59,7 +61,9 @@ def test_settings_figures_and_environment_of_the_user_stay(tmp_path: Path) -> No
         with pytest.raises(ZeroDivisionError), drawing("print"):
             1 / 0  # noqa: B018
         assert dict(mpl.rcParams.copy()) == before
-        assert plt.get_fignums() == figures and plt.gcf() is mine and dict(os.environ) == environment
+        assert (
+            plt.get_fignums() == figures and plt.gcf() is mine and dict(os.environ) == environment
+        )
         plt.close(mine)
 
 
@@ -84,14 +88,26 @@ INLINE = "module://matplotlib_inline.backend_inline"
         ("MATPLOTLIBRC", "no: such: thing\nfigure.figsize: huge\n"),
     ],
 )
-def test_a_command_draws_whatever_the_environment_says(variable: str, value: str, tmp_path: Path) -> None:
+def test_a_command_draws_whatever_the_environment_says(
+    variable: str, value: str, tmp_path: Path
+) -> None:
     if variable == "MATPLOTLIBRC":
         file = tmp_path / "matplotlibrc"
         file.write_bytes(value.encode(errors="surrogateescape"))
         value = str(file)
-    words = [sys.executable, "-m", "arcade_torch.tools", "figure", "human", "--out", str(tmp_path / "human.png")]
+    words = [
+        sys.executable,
+        "-m",
+        "arcade_torch.tools",
+        "figure",
+        "human",
+        "--out",
+        str(tmp_path / "human.png"),
+    ]
     environment = {**os.environ, variable: value}
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        words, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert (tmp_path / "human.png").read_bytes() == drawn(tmp_path / "here")
 
@@ -108,6 +124,10 @@ assert dict(os.environ) == before
 assert "matplotlib.pyplot" not in sys.modules
 """
     done = subprocess.run(
-        [sys.executable, "-c", script, os.devnull], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", script, os.devnull],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.returncode == 0, done.stderr

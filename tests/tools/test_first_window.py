@@ -1,4 +1,6 @@
-"""Where the paper's returns of Tetris without memory come from: docs/differences.md, "The training score"."""
+"""Where the paper's returns of Tetris without memory come from: docs/differences.md, "The training
+score".
+"""
 
 import csv
 from pathlib import Path
@@ -13,7 +15,9 @@ WINDOWS, ENVS, STEPS = 10, 16, 128
 
 def published(difficulty: str) -> tuple[float, float]:
     with PAPER.open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["model"], row["env"]) == ("MLP", "Tetris")]
+        rows = [
+            row for row in csv.DictReader(file) if (row["model"], row["env"]) == ("MLP", "Tetris")
+        ]
     row = next(row for row in rows if row["difficulty"] == difficulty)
     assert (row["mdp_mean"], row["mdp_std"]) == (row["pomdp_mean"], row["pomdp_std"])
     return float(row["mdp_mean"]), float(row["mdp_std"])
@@ -21,9 +25,13 @@ def published(difficulty: str) -> tuple[float, float]:
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 def test_random_play_that_has_not_ended_yet_scores_what_the_paper_has(difficulty: str) -> None:
-    """Zeros for the environments whose first episode is not over, as the published code counts them."""
+    """Zeros for the environments whose first episode is not over, as the published code counts
+    them.
+    """
     id, rules = f"Tetris{difficulty.capitalize()}", "reference"
-    env = arcade_torch.make(id, num_envs=WINDOWS * ENVS, observability="partial", seed=0, rules=rules)
+    env = arcade_torch.make(
+        id, num_envs=WINDOWS * ENVS, observability="partial", seed=0, rules=rules
+    )
     options = {"seed": 0, "final_frames": "none", "compress": lambda frames: frames[:, :1, :1]}
     steps = arcade_torch.ArcadeCollector(env, None, WINDOWS * ENVS * STEPS, **options).collect()
     done = steps["next", "done"].squeeze(-1)

@@ -22,7 +22,8 @@ from arcade_torch.tools.runs import Score, read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
 
-# agent: MDP, POMDP, Gap, Bias; then POMDP, Gap, Bias without Tetris (spec of the analyses, section 1.3)
+# agent: MDP, POMDP, Gap, Bias; then POMDP, Gap, Bias without Tetris (spec of the analyses, section
+# 1.3)
 AGGREGATES = {
     "MLP": (0.672, 0.439, 0.233, 0.0, 0.451, 0.259, 0.0),
     "LRU": (0.659, 0.594, 0.065, -0.013, 0.659, 0.073, 0.022),
@@ -51,7 +52,9 @@ def test_published_tables_give_the_published_aggregates(paper: GapBias, agent: s
 def test_the_texts_quoted_differences_come_out(paper: GapBias) -> None:
     assert paper.row("GDN").pomdp.value == pytest.approx(0.469, abs=5e-4)
     assert paper.row("MinGRU").pomdp.value == pytest.approx(0.471, abs=5e-4)
-    assert paper.row("GDN").bias.value - paper.row("MinGRU").bias.value == pytest.approx(-0.091, abs=5e-4)
+    assert paper.row("GDN").bias.value - paper.row("MinGRU").bias.value == pytest.approx(
+        -0.091, abs=5e-4
+    )
     assert paper.difference("gap", "MinGRU", "GDN").value == pytest.approx(0.089, abs=5e-4)
     assert len(paper.tasks) == 30 and len(paper.without) == 10
 
@@ -71,7 +74,13 @@ def test_five_games_and_the_probe_are_mapped_and_five_are_not(value: float) -> N
         "TetrisEasy-v3",
         "NavigatorHard",
     )
-    plain = ("CartPoleEasy", "NoisyCartPoleEasy", "AutoEncodeHard", "CountRecallMedium-v0", "SkittlesEasy")
+    plain = (
+        "CartPoleEasy",
+        "NoisyCartPoleEasy",
+        "AutoEncodeHard",
+        "CountRecallMedium-v0",
+        "SkittlesEasy",
+    )
     assert all(normalise(game, value) == (value + 1) / 2 for game in signed)
     assert all(normalise(game, value) == value for game in plain)
 
@@ -83,7 +92,9 @@ def test_an_alias_is_the_same_game() -> None:
 def scores(values: dict[tuple[str, str], list[float]], game: str = "CartPoleEasy") -> list[Score]:
     """Scores of one game: (agent, twin) -> values of its seeds."""
     return [
-        Score(agent, game, twin, seed, value) for (agent, twin), vs in values.items() for seed, value in enumerate(vs)
+        Score(agent, game, twin, seed, value)
+        for (agent, twin), vs in values.items()
+        for seed, value in enumerate(vs)
     ]
 
 
@@ -126,24 +137,45 @@ def test_gap_and_bias_share_the_resample_of_the_mdp_runs() -> None:
 def test_twins_and_agents_are_resampled_apart_even_where_their_scores_are_equal() -> None:
     same = [0.0, 0.2, 0.5, 0.6, 1.0]
     table = gap_and_bias(
-        scores({(agent, twin): same for agent in ("mlp", "lru") for twin in ("full", "partial")}), draws=300
+        scores({(agent, twin): same for agent in ("mlp", "lru") for twin in ("full", "partial")}),
+        draws=300,
     )
-    for interval in (table.row("lru").gap, table.row("lru").bias, table.difference("pomdp", "lru", "mlp")):
+    for interval in (
+        table.row("lru").gap,
+        table.row("lru").bias,
+        table.difference("pomdp", "lru", "mlp"),
+    ):
         assert interval.value == 0 and interval.low < -0.2 and interval.high > 0.2
 
 
 def test_confidence_decides_intervals_differences_and_their_measured_coverage() -> None:
     rng = np.random.default_rng(4)
-    runs = scores({(a, twin): list(rng.normal(size=4)) for a in ("mlp", "lru") for twin in ("full", "partial")})
-    wide, narrow = (gap_and_bias(runs, draws=400, confidence=confidence) for confidence in (0.95, 0.5))
+    runs = scores(
+        {
+            (a, twin): list(rng.normal(size=4))
+            for a in ("mlp", "lru")
+            for twin in ("full", "partial")
+        }
+    )
+    wide, narrow = (
+        gap_and_bias(runs, draws=400, confidence=confidence) for confidence in (0.95, 0.5)
+    )
     of = [(table.row("lru").gap, table.difference("gap", "lru", "mlp")) for table in (wide, narrow)]
     assert all(a.low < b.low and b.high < a.high for a, b in zip(*of, strict=True))
-    assert narrow.row("lru").coverage == measured_coverage((4,), (4,), 0.5) < wide.row("lru").coverage - 0.2
+    assert (
+        narrow.row("lru").coverage
+        == measured_coverage((4,), (4,), 0.5)
+        < wide.row("lru").coverage - 0.2
+    )
     assert measured_coverage((5,), (), 0.5) < measured_coverage((5,), ()) - 0.2
 
 
-def test_the_least_coverage_stands_under_figure_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Both agents have a cell of two seeds; in the other cells one of them has two and the other five."""
+def test_the_least_coverage_stands_under_figure_and_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both agents have a cell of two seeds; in the other cells one of them has two and the other
+    five.
+    """
     lines, rng = ["agent,game,observability,seed,score"], np.random.default_rng(0)
     cells = product(("mlp", "lru"), range(6), ("full", "partial"), range(5))
     for agent, game, twin, seed in cells:
@@ -154,7 +186,9 @@ def test_the_least_coverage_stands_under_figure_and_table(tmp_path: Path, capsys
     shares = [row.coverage for row in table.rows]
     assert shares[0] > shares[1] + 0.03 and table.coverage == {2: shares[1]}
     with drawing("light"):
-        made = figures.gap_bias.gap_bias(ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10), None)
+        made = figures.gap_bias.gap_bias(
+            ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10), None
+        )
     share = f"{100 * shares[1]:.0f} %"
     assert made.pictures[0].note.endswith(f"measured coverage with 2 seeds {share}")
     assert made.tables[0].caption.endswith(f"measured coverage of the gap's: {share} with 2 seeds")
@@ -162,43 +196,76 @@ def test_the_least_coverage_stands_under_figure_and_table(tmp_path: Path, capsys
 
 def test_a_single_seed_of_one_side_leaves_no_interval_of_the_difference() -> None:
     many, one = [0.1, 0.2, 0.4], [0.3]
-    values = {("mlp", "full"): one, ("mlp", "partial"): one, ("lru", "full"): many, ("lru", "partial"): many}
+    values = {
+        ("mlp", "full"): one,
+        ("mlp", "partial"): one,
+        ("lru", "full"): many,
+        ("lru", "partial"): many,
+    }
     table = gap_and_bias(scores(values), draws=50)
     assert table.row("lru").gap.low < table.row("lru").gap.high
-    assert np.isnan(table.row("lru").bias.low) and np.isnan(table.difference("gap", "lru", "mlp").low)
+    assert np.isnan(table.row("lru").bias.low) and np.isnan(
+        table.difference("gap", "lru", "mlp").low
+    )
 
 
 def test_raw_returns_stay_as_they_are_and_only_the_normalised_ones_are_mapped() -> None:
-    values = {(agent, twin): [-0.5, 0.5, 0.6] for agent in ("mlp", "lru") for twin in ("full", "partial")}
+    values = {
+        (agent, twin): [-0.5, 0.5, 0.6] for agent in ("mlp", "lru") for twin in ("full", "partial")
+    }
     row = gap_and_bias(scores(values, "TetrisEasy"), draws=10).row("lru")
     assert [row.mdp_raw.value, row.mdp.value, row.mdp_iqm.value] == pytest.approx([0.2, 0.6, 0.6])
-    assert [row.pomdp_raw.value, row.pomdp.value, row.pomdp_iqm.value] == pytest.approx([0.2, 0.6, 0.6])
+    assert [row.pomdp_raw.value, row.pomdp.value, row.pomdp_iqm.value] == pytest.approx(
+        [0.2, 0.6, 0.6]
+    )
 
 
 def test_the_bias_of_the_memory_free_agent_is_exactly_zero() -> None:
     rng = np.random.default_rng(1)
-    values = {(agent, twin): list(rng.normal(size=4)) for agent in ("gru", "MLP") for twin in ("full", "partial")}
+    values = {
+        (agent, twin): list(rng.normal(size=4))
+        for agent in ("gru", "MLP")
+        for twin in ("full", "partial")
+    }
     table = gap_and_bias(scores(values), draws=100)
     assert table.baseline == "MLP" and table.rows[0].agent == "MLP"
-    assert (table.rows[0].bias.low, table.rows[0].bias.value, table.rows[0].bias.high) == (0.0, 0.0, 0.0)
+    assert (table.rows[0].bias.low, table.rows[0].bias.value, table.rows[0].bias.high) == (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 def test_bias_is_measured_against_the_memory_free_agent_of_the_same_algorithm() -> None:
     mdp = {"pqn-lru": 0.3, "pqn-mlp": 0.3, "dqn-lru": 0.5, "ppo-lru 2x64": 0.7, "ppo-mlp": 0.9}
-    values = {(agent, twin): [value] * 2 for agent, value in mdp.items() for twin in ("full", "partial")}
+    values = {
+        (agent, twin): [value] * 2 for agent, value in mdp.items() for twin in ("full", "partial")
+    }
     table = gap_and_bias(scores(values), draws=10)
-    assert [row.agent for row in table.rows] == ["pqn-mlp", "ppo-mlp", "pqn-lru", "dqn-lru", "ppo-lru 2x64"]
+    assert [row.agent for row in table.rows] == [
+        "pqn-mlp",
+        "ppo-mlp",
+        "pqn-lru",
+        "dqn-lru",
+        "ppo-lru 2x64",
+    ]
     assert table.baseline == "pqn-mlp" and table.baselines["dqn-lru"] is None
     found = {row.agent: row.bias.value for row in table.rows}
     assert np.isnan(found.pop("dqn-lru"))  # that algorithm has none without memory
     assert found == pytest.approx({"pqn-mlp": 0, "ppo-mlp": 0, "pqn-lru": 0, "ppo-lru 2x64": -0.2})
-    table = gap_and_bias(scores(values), baseline="ppo-mlp", draws=10)  # who names one agent measures all against it
+    table = gap_and_bias(
+        scores(values), baseline="ppo-mlp", draws=10
+    )  # who names one agent measures all against it
     assert {row.agent: row.bias.value + 0.9 for row in table.rows} == pytest.approx(mdp)
 
 
 def test_the_order_of_the_runs_does_not_matter() -> None:
     rng = np.random.default_rng(2)
-    values = {(agent, twin): list(rng.normal(size=4)) for agent in ("mlp", "lru") for twin in ("full", "partial")}
+    values = {
+        (agent, twin): list(rng.normal(size=4))
+        for agent in ("mlp", "lru")
+        for twin in ("full", "partial")
+    }
     runs = scores(values)
     shuffled = [runs[index] for index in rng.permutation(len(runs))]
     assert gap_and_bias(runs, draws=300).row("lru") == gap_and_bias(shuffled, draws=300).row("lru")
@@ -213,7 +280,9 @@ def test_bootstrap_spread_is_that_of_the_mean_of_resampled_seeds() -> None:
 
 
 def test_measured_coverage_is_below_nominal_and_grows_with_seeds() -> None:
-    few, some, many = (measured_coverage((n,), (n,), simulations=600, draws=300) for n in (2, 5, 20))
+    few, some, many = (
+        measured_coverage((n,), (n,), simulations=600, draws=300) for n in (2, 5, 20)
+    )
     assert 0.5 < few < some < many < 0.98
     assert 0.82 < some < 0.94
 
@@ -223,7 +292,9 @@ def test_coverage_of_a_single_cell_of_five_is_the_known_84_percent() -> None:
     inside = []
     for _ in range(1500):
         seeds = rng.standard_normal(5)
-        interval = percentile_interval(float(seeds.mean()), mean_over_tasks(resampled([seeds], 400, rng)), 0.95)
+        interval = percentile_interval(
+            float(seeds.mean()), mean_over_tasks(resampled([seeds], 400, rng)), 0.95
+        )
         inside.append(interval.low <= 0 <= interval.high)
     assert np.mean(inside) == pytest.approx(0.84, abs=0.03)
 
@@ -240,7 +311,10 @@ def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
     file = tmp_path / "runs.csv"
     lines = ["agent,game,observability,seed,score"]
     lines += [
-        f"{a},CartPoleEasy,{o},{s},{0.1 * s}" for a in ("mlp", "lru") for o in ("full", "partial") for s in (0, 1)
+        f"{a},CartPoleEasy,{o},{s},{0.1 * s}"
+        for a in ("mlp", "lru")
+        for o in ("full", "partial")
+        for s in (0, 1)
     ]
     file.write_text("\n".join(lines) + "\n")
     assert len(read_scores(file)) == 8
@@ -256,7 +330,10 @@ def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
     [
         ("agent,game\nmlp,x\n", "no column for observability, seed, score"),
         ("agent,game,observability,seed,score\nmlp,X,full,0,abc\n", "not a number"),
-        ("agent,game,observability,seed,score\nmlp,X,full,0,1\nmlp,X,full,0,2\n", "two scores for mlp"),
+        (
+            "agent,game,observability,seed,score\nmlp,X,full,0,1\nmlp,X,full,0,2\n",
+            "two scores for mlp",
+        ),
         ("agent,game,observability,seed,score\nlru,X,full,0,1\n", "memory-free agent 'mlp'"),
         ("agent,game,observability,seed,score\nmlp,X,full,0,1\n", "nothing to compare yet"),
         ("agent,game,observability,seed,score\nmlp,X,half,0,1\n", "full or partial"),
@@ -271,11 +348,16 @@ def test_bad_tables_are_refused_with_a_reason(tmp_path: Path, text: str, message
 
 
 def test_scores_of_several_rules_are_not_pooled_and_lost_runs_are_told(tmp_path: Path) -> None:
-    head, rows = "agent,game,observability,seed,status,rules,eval_mean", ["mlp,X,full,0,finished,default,.9"]
+    head, rows = (
+        "agent,game,observability,seed,status,rules,eval_mean",
+        ["mlp,X,full,0,finished,default,.9"],
+    )
     rows += ["mlp,X,partial,0,finished,default,.1", "mlp,X,partial,1,failed,default,"]
     (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
     made, table, _ = figures.gap_bias._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
-    assert table.row("mlp").gap.value == pytest.approx(0.8) and made.notes == ["left out, not finished: 1 run"]
+    assert table.row("mlp").gap.value == pytest.approx(0.8) and made.notes == [
+        "left out, not finished: 1 run"
+    ]
     (tmp_path / "s.csv").write_text("\n".join([head, *rows, "mlp,X,full,1,finished,reference,.1"]))
     with pytest.raises(ValueError, match=r"X has scores of rules, .*'default'.* and .*'reference'"):
         read_scores(tmp_path / "s.csv")

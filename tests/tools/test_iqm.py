@@ -32,7 +32,9 @@ def test_the_table_has_the_interquartile_mean_with_an_interval() -> None:
 
 @pytest.mark.parametrize("shape", [(7, 6), (5, 1), (1, 3), (2, 2)])
 def test_the_value_is_the_trimmed_mean_of_scipy(shape: tuple[int, int]) -> None:
-    """The definition of Agarwal et al.: `scipy.stats.trim_mean` of all runs, a quarter off at both ends."""
+    """The definition of Agarwal et al.: `scipy.stats.trim_mean` of all runs, a quarter off at both
+    ends.
+    """
     scores = np.random.default_rng(1).normal(size=(50, *shape))  # draws, runs, tasks
     right = pytest.importorskip("scipy.stats").trim_mean(scores.reshape(50, -1), 0.25, axis=1)
     assert iqm([scores[..., task] for task in range(shape[1])]) == pytest.approx(right, abs=1e-12)

@@ -1,4 +1,6 @@
-"""The allocator setting of training: the memory of large tensors is used again without page faults."""
+"""The allocator setting of training: the memory of large tensors is used again without page
+faults.
+"""
 
 import subprocess
 import sys
@@ -24,7 +26,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 
 def faults(word: str) -> int:
-    done = subprocess.run([sys.executable, "-c", COUNT_FAULTS, word], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COUNT_FAULTS, word], capture_output=True, text=True, check=True
+    )
     return int(done.stdout)
 
 

@@ -7,7 +7,9 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
 
-def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main(["list", "memories"]) == 0
     out = capsys.readouterr().out
     assert all(f" {name} " in out for name in memory_names())
@@ -27,9 +29,15 @@ def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(capsys: 
         ("attention", 128 * 16 + 1, 128 * 8 * 8 + 8, 3 * 8 * 8 + 2 * 128 * 8),
     ],
 )
-def test_costs_are_those_counted_by_hand(name: str, numbers: int, size_in_bytes: int, products: int) -> None:
+def test_costs_are_those_counted_by_hand(
+    name: str, numbers: int, size_in_bytes: int, products: int
+) -> None:
     cost = memory_cost(make_memory(name, 8, 8), 8)
-    assert (cost.state_numbers, cost.state_bytes, cost.products) == (numbers, size_in_bytes, products)
+    assert (cost.state_numbers, cost.state_bytes, cost.products) == (
+        numbers,
+        size_in_bytes,
+        products,
+    )
 
 
 def test_times_are_positive_and_learning_a_batch_takes_longer_than_acting_it() -> None:

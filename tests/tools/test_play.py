@@ -1,4 +1,6 @@
-"""Play: the session as a state machine, its scores, a window (on SDL's dummy driver) and a terminal (on a pty)."""
+"""Play: the session as a state machine, its scores, a window (on SDL's dummy driver) and a terminal
+(on a pty).
+"""
 
 import os
 import pty
@@ -30,7 +32,9 @@ GAME = "MineSweeperEasy"
 def session(**options: object) -> tuple[Session, list[Attempt]]:
     """A session of the shortest game, and the list that its attempts go to."""
     found: list[Attempt] = []
-    return Session(compiled_game(GAME, 128, "default", {}), on_attempt=found.append, **options), found
+    return Session(
+        compiled_game(GAME, 128, "default", {}), on_attempt=found.append, **options
+    ), found
 
 
 def press(player: Session, keys: str) -> None:
@@ -55,7 +59,10 @@ def test_a_session_walks_the_path_of_arcade_env() -> None:
         step = env.step(root.set("action", env.action_spec.zero() + int(action)))["next"]
         press(player, action)
         assert (player.frame == step["pixels"][0].numpy()).all()
-        assert (player.total, player.steps) == (step["episode_reward"].item(), step["step_count"].item())
+        assert (player.total, player.steps) == (
+            step["episode_reward"].item(),
+            step["step_count"].item(),
+        )
         if step["done"].item():
             break
         root = step.select("pixels")
@@ -68,11 +75,17 @@ def test_the_last_picture_stays_until_the_player_goes_on() -> None:
     assert player.steps == player.game.max_steps and player.end == "truncated"
     last, caption = player.frame, player.caption
     press(player, "01234")
-    assert (player.frame == last).all() and player.caption == caption and player.steps == player.game.max_steps
+    assert (
+        (player.frame == last).all()
+        and player.caption == caption
+        and player.steps == player.game.max_steps
+    )
     assert "Enter for the next" in caption
     press(player, "n")
     assert (player.seed, player.steps, player.end, player.closed) == (4, 0, None, False)
-    assert [(a.seed, a.attempt, a.end, a.steps) for a in found] == [(3, 1, "truncated", player.game.max_steps)]
+    assert [(a.seed, a.attempt, a.end, a.steps) for a in found] == [
+        (3, 1, "truncated", player.game.max_steps)
+    ]
 
 
 def test_a_session_closes_after_its_episodes() -> None:
@@ -92,12 +105,19 @@ def test_restart_begins_the_same_episode_and_counts_the_attempt() -> None:
     player, found = session(seed=5)
     first = player.frame
     press(player, "31r")
-    assert (player.frame == first).all() and (player.seed, player.steps, player.total) == (5, 0, 0.0)
+    assert (player.frame == first).all() and (player.seed, player.steps, player.total) == (
+        5,
+        0,
+        0.0,
+    )
     press(player, "r")  # nothing was played: nothing to report
     to_the_end(player)
     press(player, "r")  # an episode that has ended counts
     assert player.end == "truncated" and not player.closed
-    assert [(a.attempt, a.end, a.actions[:2]) for a in found] == [(1, "abandoned", "31"), (3, "truncated", "00")]
+    assert [(a.attempt, a.end, a.actions[:2]) for a in found] == [
+        (1, "abandoned", "31"),
+        (3, "truncated", "00"),
+    ]
 
 
 def test_quitting_reports_what_was_played() -> None:
@@ -132,7 +152,9 @@ def test_the_twin_changes_in_mid_episode_and_the_game_does_not() -> None:
         ({"both": True}, "0p", "both"),
     ],
 )
-def test_a_score_says_what_the_player_saw(options: dict[str, bool], keys: str, observability: str) -> None:
+def test_a_score_says_what_the_player_saw(
+    options: dict[str, bool], keys: str, observability: str
+) -> None:
     player, found = session(**options)
     press(player, keys + "q")
     assert found[0].observability == observability
@@ -170,7 +192,7 @@ def test_bad_sessions_and_keys_are_refused() -> None:
         session()[0].press("jump")
 
 
-# -- scores -------------------------------------------------------------------------------------------------------
+# -- scores ----------------------------------------------------------------------------------------
 
 
 def write_scores(path: Path) -> list[Attempt]:
@@ -190,9 +212,19 @@ def test_every_score_can_be_replayed_from_its_line(tmp_path: Path) -> None:
     assert tuple(rows[0]) == COLUMNS and len(rows) == 3
     for row, attempt in zip(rows, found, strict=True):
         again = replay(row)
-        assert (again.actions, again.total, again.end) == (attempt.actions, attempt.total, attempt.end)
-    assert [row["return"] == "" for row in rows] == [True, False, False]  # an abandoned episode has no score
-    assert {(row["model"], row["env"], row["difficulty"]) for row in rows} == {("human", "MineSweeper", "easy")}
+        assert (again.actions, again.total, again.end) == (
+            attempt.actions,
+            attempt.total,
+            attempt.end,
+        )
+    assert [row["return"] == "" for row in rows] == [
+        True,
+        False,
+        False,
+    ]  # an abandoned episode has no score
+    assert {(row["model"], row["env"], row["difficulty"]) for row in rows} == {
+        ("human", "MineSweeper", "easy")
+    }
     with pytest.raises(ValueError, match="the episode ends after 32"):
         replay({**rows[2], "actions": rows[2]["actions"] + "0"})
 
@@ -204,23 +236,29 @@ def test_the_analyses_read_the_scores(tmp_path: Path) -> None:
         ("human", "MineSweeperEasy-v0", "partial", 1),
         ("human", "MineSweeperEasy-v0", "partial", 2),
     ]
-    assert [s.value for s in scores] == pytest.approx([a.total for a in found if a.end != "abandoned"])
+    assert [s.value for s in scores] == pytest.approx(
+        [a.total for a in found if a.end != "abandoned"]
+    )
 
 
-# -- window -------------------------------------------------------------------------------------------------------
+# -- window ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def pygame(monkeypatch: pytest.MonkeyPatch) -> object:
     """pygame without a screen."""
-    module = pytest.importorskip("pygame", reason="needs the play extra: pip install 'arcade-torch[play]'")
+    module = pytest.importorskip(
+        "pygame", reason="needs the play extra: pip install 'arcade-torch[play]'"
+    )
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     module.display.init()
     yield module
     module.display.quit()
 
 
-def test_a_window_plays_what_is_pressed_and_shows_it(pygame: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_plays_what_is_pressed_and_shows_it(
+    pygame: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
     player, found = session(seed=3)
     shown = []
     original = screens.Window.show
@@ -262,7 +300,9 @@ def test_without_display_or_pygame_there_is_a_reason(monkeypatch: pytest.MonkeyP
     assert "pip install 'arcade-torch[play]'" in str(screens.why_no_window())
 
 
-def test_without_a_display_there_is_a_reason(pygame: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_there_is_a_reason(
+    pygame: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert screens.why_no_window() is None
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
@@ -270,7 +310,7 @@ def test_without_a_display_there_is_a_reason(pygame: object, monkeypatch: pytest
     assert screens.why_no_window() == "there is no display"
 
 
-# -- terminal -----------------------------------------------------------------------------------------------------
+# -- terminal --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -315,7 +355,9 @@ def test_half_blocks_draw_every_pixel() -> None:
 def test_a_frame_shrinks_to_the_terminal_and_keeps_its_mean(height: int, width: int) -> None:
     frame = np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8)
     side = min(height, width, 128)
-    small = painted(screens.half_blocks(frame, height, width))[:side]  # an odd last row has a black one below it
+    small = painted(screens.half_blocks(frame, height, width))[
+        :side
+    ]  # an odd last row has a black one below it
     assert small.shape == (side, side, 3)
     assert small.mean() == pytest.approx(frame.mean(), abs=1.5)
     flat = np.full_like(frame, 77)
@@ -330,8 +372,12 @@ def test_the_screen_fits_the_terminal() -> None:
     assert player.caption[:80] in plain
 
 
-def talk(words: list[str], keys: list[bytes], size: tuple[int, int] = (24, 80)) -> tuple[int, str, bytes]:
-    """Run the command on a pseudo terminal; each key is sent when the picture has been drawn anew."""
+def talk(
+    words: list[str], keys: list[bytes], size: tuple[int, int] = (24, 80)
+) -> tuple[int, str, bytes]:
+    """Run the command on a pseudo terminal; each key is sent when the picture has been drawn
+    anew.
+    """
     master, slave = pty.openpty()
     import fcntl
     import struct
@@ -339,7 +385,11 @@ def talk(words: list[str], keys: list[bytes], size: tuple[int, int] = (24, 80)) 
 
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", *size, 0, 0))
     before = termios.tcgetattr(slave)
-    env = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
+    env = {
+        k: v
+        for k, v in os.environ.items()
+        if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    }
     command = [sys.executable, "-m", "arcade_torch.tools", *words]
     process = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, cwd=ROOT, env=env)
     out, limit = b"", time.monotonic() + 120
@@ -362,26 +412,50 @@ def talk(words: list[str], keys: list[bytes], size: tuple[int, int] = (24, 80)) 
 
 
 def test_a_terminal_plays_and_is_left_as_it_was(tmp_path: Path) -> None:
-    """Without a display, so that the terminal is chosen by itself; keys arrive one picture after the other."""
+    """Without a display, so that the terminal is chosen by itself; keys arrive one picture after
+    the other.
+    """
     scores = tmp_path / "human.csv"
-    words = ["play", GAME, "--obs-size", "128", "--seed", "3", "--partial", "--scores", str(scores), "--player", "ann"]
+    words = [
+        "play",
+        GAME,
+        "--obs-size",
+        "128",
+        "--seed",
+        "3",
+        "--partial",
+        "--scores",
+        str(scores),
+        "--player",
+        "ann",
+    ]
     code, out, unread = talk(words, [b" ", b"\x1b[C", b"p", b"\x1b"])
     assert (code, unread) == (0, b""), out
     assert "playing in the terminal: " in out
-    assert out.count("\x1b[?1049h") == out.count("\x1b[?1049l") == 1 and out.count("\x1b[?25l\x1b[2J") == 1
+    assert (
+        out.count("\x1b[?1049h") == out.count("\x1b[?1049l") == 1
+        and out.count("\x1b[?25l\x1b[2J") == 1
+    )
     assert "steps 2/32" in out and " MDP " in out and " POMDP " in out
     said = out.split("\x1b[?1049l")[1]
     assert re.search(r"seed 3 \(mixed\): return [+-]\d\.\d+ in 2 steps, abandoned", said)
     (row,) = read_csv(scores)
-    assert (row["actions"], row["seed"], row["player"], row["end"]) == ("43", "3", "ann", "abandoned")
+    assert (row["actions"], row["seed"], row["player"], row["end"]) == (
+        "43",
+        "3",
+        "ann",
+        "abandoned",
+    )
 
 
 def test_a_terminal_of_twenty_columns_shows_a_picture() -> None:
-    code, out, unread = talk(["play", GAME, "--obs-size", "128", "--terminal"], [b" ", b"\x1b"], size=(3, 20))
+    code, out, unread = talk(
+        ["play", GAME, "--obs-size", "128", "--terminal"], [b" ", b"\x1b"], size=(3, 20)
+    )
     assert (code, unread) == (0, b""), out
 
 
-# -- command ------------------------------------------------------------------------------------------------------
+# -- command ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -394,14 +468,21 @@ def test_a_terminal_of_twenty_columns_shows_a_picture() -> None:
         (["play", GAME, "--episodes", "-1"], "episodes must be 0 (no end) or more; got -1"),
         (["play", GAME, "--obs-size", "64"], "64"),
         (["play", GAME, "--seed", "-1"], "seed is -1, allowed: 0 to 4294967295"),
-        (["play", GAME, "--scores", "x.txt"], "--scores must be a file that ends in .csv; got 'x.txt'"),
+        (
+            ["play", GAME, "--scores", "x.txt"],
+            "--scores must be a file that ends in .csv; got 'x.txt'",
+        ),
         (["play", GAME, "--env-option", "wind"], "NAME=VALUE"),
         (["play", GAME, "--env-option", "wind=1"], "has no option 'wind'"),
         (["play", GAME, "--terminal"], "playing needs a window or a terminal"),
     ],
 )
 def test_bad_input_is_one_line(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == cli.EXIT_BAD_INPUT
@@ -410,7 +491,9 @@ def test_bad_input_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_table_of_something_else_is_left_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_table_of_something_else_is_left_alone(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     write_csv(tmp_path / "results.csv", [{"a": 1}], ["a"])
     assert cli.main(["play", GAME, "--scores", str(tmp_path / "results.csv")]) == cli.EXIT_BAD_INPUT
     assert "is no table of human scores" in capsys.readouterr().err
@@ -418,7 +501,10 @@ def test_a_table_of_something_else_is_left_alone(capsys: pytest.CaptureFixture[s
 
 
 def test_the_command_opens_a_window_and_goes_on_with_seeds_that_the_player_has_not_met(
-    pygame: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pygame: object,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     met = []
 

@@ -23,7 +23,9 @@ def test_time_ends_the_measurement_after_a_whole_block() -> None:
     assert players.measure("SignpostEasy", "state", episodes=1000, seconds=0).episodes == 250
 
 
-def test_rows_that_are_there_are_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_that_are_there_are_not_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "b.csv"
     rows = list(players.measure_all(["SignpostEasy-v0"], 8, 60, out))
     monkeypatch.setattr(players, "measure", None)
@@ -32,7 +34,9 @@ def test_rows_that_are_there_are_not_measured_again(tmp_path: Path, monkeypatch:
     assert [row.mean for row in again] == pytest.approx([row.mean for row in rows], abs=1e-5)
 
 
-def test_the_table_is_written_between_the_marks_of_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_is_written_between_the_marks_of_a_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"before\n{players.BEGIN}old{players.END}\nafter\n")
     words = [
@@ -57,15 +61,21 @@ def test_the_table_is_written_between_the_marks_of_a_page(tmp_path: Path, capsys
     assert page.read_text() == "no marks"
 
 
-def test_a_game_without_oracles_has_the_random_player_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_game_without_oracles_has_the_random_player_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(type(make("SignpostEasy")), "oracles", {"state": "x:X"})
     assert players.players_of("SignpostEasy") == ["random", "state"]
     monkeypatch.setattr(type(make("SignpostEasy")), "oracles", {})
     rows = list(players.measure_all(["SignpostEasy-v0"], 8, 60, tmp_path / "b.csv"))
-    assert [row.player for row in rows] == ["random"] and players.markdown(rows).count("SignpostEasy") == 1
+    assert [row.player for row in rows] == ["random"] and players.markdown(rows).count(
+        "SignpostEasy"
+    ) == 1
 
 
-def test_a_file_of_something_else_is_refused_and_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_of_something_else_is_refused_and_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "b.csv"
     out.write_text("a,b\n1,2\n")
     assert cli.main(["list", "baselines", "SignpostEasy", "--out", str(out)]) == cli.EXIT_BAD_INPUT
@@ -91,8 +101,12 @@ def test_few_episodes_have_students_interval_and_one_has_none() -> None:
     one = players.measure("SignpostEasy", "random", episodes=1)
     returns = [0.25, 0.5, 1.0]
     spread = float(np.std(returns, ddof=1))
-    assert student_half_width(returns) == pytest.approx(4.302653 * spread / np.sqrt(3))  # 1.96 for very many
-    assert student_half_width(np.zeros(10**5) + np.arange(10**5) % 2) == pytest.approx(1.96 * 0.5 / 10**2.5, rel=1e-3)
+    assert student_half_width(returns) == pytest.approx(
+        4.302653 * spread / np.sqrt(3)
+    )  # 1.96 for very many
+    assert student_half_width(np.zeros(10**5) + np.arange(10**5) % 2) == pytest.approx(
+        1.96 * 0.5 / 10**2.5, rel=1e-3
+    )
     assert np.isnan(student_half_width([0.5])) and np.isnan(student_half_width([]))
     assert np.isnan(one.half_width) and not np.isnan(few.half_width)
     page = players.markdown([one])

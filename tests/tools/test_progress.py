@@ -20,7 +20,9 @@ ROW = {
 }
 
 
-def test_a_line_shows_speed_and_time_left_and_the_last_line_how_far_it_came(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_shows_speed_and_time_left_and_the_last_line_how_far_it_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now, stream = [100.0], StringIO()
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setattr("rich.console.monotonic", lambda: now[0])
@@ -44,8 +46,13 @@ def test_what_is_no_work_of_frames_prints_a_line_now_and_then_only() -> None:
     assert stream.getvalue() == "players: 2 of 3 (67 %)\n"
 
 
-def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appears_when_there_is_one() -> None:
+def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appears_when_there_is_one() -> (
+    None
+):
     row = {**ROW, "epsilon": None, "entropy": 1.5, "eval_return": -0.125}
-    assert standing(ROW) == "return 0.250, of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05"
+    assert (
+        standing(ROW)
+        == "return 0.250, of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05"
+    )
     assert "greedy -0.125, loss 0.0123, entropy 1.50, lr" in standing(row)
     assert standing({"frames": 1, "total_frames": 2, "lr": 1e-3}) == "lr 1.0e-03"

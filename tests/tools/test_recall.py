@@ -1,4 +1,6 @@
-"""Delayed recall: what is asked can be known, who has no memory guesses, and windows reach as far as theory says."""
+"""Delayed recall: what is asked can be known, who has no memory guesses, and windows reach as far
+as theory says.
+"""
 
 from pathlib import Path
 
@@ -15,7 +17,9 @@ from arcade_torch.tools.files import read_rows
 
 @pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("delay", [1, 4, 32])
-def test_the_answer_is_the_symbol_at_the_last_start_and_distractors_stand_between(delay: int, mixed: bool) -> None:
+def test_the_answer_is_the_symbol_at_the_last_start_and_distractors_stand_between(
+    delay: int, mixed: bool
+) -> None:
     batch = windows(np.random.default_rng(0), 64, delay, mixed=mixed)
     waits = []
     for tokens, is_init, answers in zip(batch.tokens, batch.is_init, batch.answers, strict=True):
@@ -37,7 +41,10 @@ def test_a_quarter_of_the_episodes_ends_before_the_question_and_symbols_are_even
     first_asked = batch.answers[:, 5] != UNLABELLED
     in_time = first_asked & ~batch.is_init[:, 1:6].any(1)
     assert in_time.double().mean() == pytest.approx(0.75, abs=0.03)
-    shares = torch.bincount(batch.answers[batch.answers != UNLABELLED]) / (batch.answers != UNLABELLED).sum()
+    shares = (
+        torch.bincount(batch.answers[batch.answers != UNLABELLED])
+        / (batch.answers != UNLABELLED).sum()
+    )
     assert shares.numpy() == pytest.approx(np.full(4, 0.25), abs=0.03)
 
 
@@ -59,10 +66,15 @@ def test_every_memory_remembers_for_eight_steps(name: str) -> None:
 
 
 @pytest.mark.parametrize(("layers", "window"), [(1, 32), (1, 34), (2, 17), (2, 24)])
-def test_the_question_is_out_of_reach_of_attention_exactly_where_theory_says(layers: int, window: int) -> None:
+def test_the_question_is_out_of_reach_of_attention_exactly_where_theory_says(
+    layers: int, window: int
+) -> None:
     delay = 32  # and the question comes 33 steps after the symbol
     block = MemoryBlock(3, 8, "attention", layers=layers, memory_options={"window": window})
-    x, is_init = torch.randn(1, delay + 2, 3, requires_grad=True), torch.zeros(1, delay + 2, dtype=torch.bool)
+    x, is_init = (
+        torch.randn(1, delay + 2, 3, requires_grad=True),
+        torch.zeros(1, delay + 2, dtype=torch.bool),
+    )
     y, _ = block(x, block.initial_state(1), is_init)
     (gradient,) = torch.autograd.grad(y[:, -1].square().sum(), x)
     in_reach = layers * (window - 1) >= delay + 1
@@ -74,11 +86,24 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
 ) -> None:
     page, out = tmp_path / "page.md", tmp_path / "r.csv"
     page.write_text(f"before\n{recall.BEGIN}old{recall.END}\nafter\n")
-    words = ["bench", "recall", "gdn", "--delays", "1", "2", "--hidden-size", "8", "--seconds", "0.2"]
+    words = [
+        "bench",
+        "recall",
+        "gdn",
+        "--delays",
+        "1",
+        "2",
+        "--hidden-size",
+        "8",
+        "--seconds",
+        "0.2",
+    ]
     words += ["--out", str(out), "--page", str(page)]
     threads = torch.get_num_threads()
     assert cli.main(words) == cli.EXIT_OK
-    assert torch.get_num_threads() == threads and "measuring gdn, delay 2" in capsys.readouterr().err
+    assert (
+        torch.get_num_threads() == threads and "measuring gdn, delay 2" in capsys.readouterr().err
+    )
     text = page.read_text()
     assert recall.markdown(read_rows(out, Recall)) in text
     assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
@@ -91,7 +116,9 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     assert cli.main(["bench", "recall", "--seconds", "0"]) == cli.EXIT_BAD_INPUT
 
 
-def test_a_row_reads_the_same_after_it_was_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_reads_the_same_after_it_was_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """0.249 s is 0.2 s, and so it stays: not 0.25 s in the file and 0.3 s when it is read."""
     out, passed = tmp_path / "r.csv", iter([0.0, 0.249])
     monkeypatch.setattr(recall.time, "process_time", lambda: next(passed))

@@ -19,7 +19,14 @@ from arcade_torch.envs_jax.oracles import make_oracle
 from arcade_torch.envs_jax.oracles import play as oracle_play
 from arcade_torch.tools import cli
 from arcade_torch.tools.play import recording
-from arcade_torch.tools.play.recording import SCRIPTED, recorded_frames, scripted, trained, write_gif, write_mp4
+from arcade_torch.tools.play.recording import (
+    SCRIPTED,
+    recorded_frames,
+    scripted,
+    trained,
+    write_gif,
+    write_mp4,
+)
 from arcade_torch.tools.play.session import Attempt, Session
 
 GAME = "MineSweeperEasy"
@@ -32,35 +39,59 @@ def session(**options: Any) -> tuple[Session, list[Attempt]]:
 
 
 def pictures(path: Path) -> tuple[np.ndarray, list[int]]:
-    """Frames of a GIF with equal neighbours put apart again, by their duration, and the hundredths of a second."""
+    """Frames of a GIF with equal neighbours put apart again, by their duration, and the hundredths
+    of a second.
+    """
     image = pytest.importorskip("PIL.Image")
     sequence = pytest.importorskip("PIL.ImageSequence")
     with image.open(path) as film:
-        shown = [(np.array(frame.convert("RGB")), frame.info["duration"]) for frame in sequence.Iterator(film)]
+        shown = [
+            (np.array(frame.convert("RGB")), frame.info["duration"])
+            for frame in sequence.Iterator(film)
+        ]
     unit = min(duration for _, duration in shown)
-    return np.stack([frame for frame, duration in shown for _ in range(duration // unit)]), [d for _, d in shown]
+    return np.stack([frame for frame, duration in shown for _ in range(duration // unit)]), [
+        d for _, d in shown
+    ]
 
 
 @pytest.mark.parametrize("kind", ["state", "frames"])
 def test_a_scripted_player_plays_as_it_does_for_the_references(kind: str) -> None:
     player, found = session(seed=4, episodes=3)
-    list(recorded_frames(player, scripted(f"{kind}-oracle", player.game, 0), max_steps=99, hold=1, scale=1))
+    list(
+        recorded_frames(
+            player, scripted(f"{kind}-oracle", player.game, 0), max_steps=99, hold=1, scale=1
+        )
+    )
     assert [a.seed for a in found] == [4, 5, 6]
     one = oracle_play(player.game, make_oracle(player.game, kind), 1, 4, frames=kind == "frames")
     assert (one.returns[0], one.lengths[0]) == (pytest.approx(found[0].total), found[0].steps)
 
 
 class Suspicious:
-    """An agent whose actions depend on everything it is shown and on what it has been shown before."""
+    """An agent whose actions depend on everything it is shown and on what it has been shown
+    before.
+    """
 
     network = torch.nn.Linear(1, 1)
 
     def initial_state(self, batch_size: int) -> TensorDict:
-        return TensorDict({"sum": torch.zeros(batch_size, dtype=torch.int64)}, batch_size=[batch_size])
+        return TensorDict(
+            {"sum": torch.zeros(batch_size, dtype=torch.int64)}, batch_size=[batch_size]
+        )
 
     def act(self, obs: Any, state: Any) -> tuple[torch.Tensor, dict[str, torch.Tensor], Any]:
-        seen = obs["pixels"].long().sum((1, 2, 3)) // 7 + 3 * obs["last_action"] + 2 * obs["is_init"][:, 0]
-        seen = seen + obs["step_count"][:, 0] + (100 * obs["episode_reward"][:, 0]).long() + state["sum"]
+        seen = (
+            obs["pixels"].long().sum((1, 2, 3)) // 7
+            + 3 * obs["last_action"]
+            + 2 * obs["is_init"][:, 0]
+        )
+        seen = (
+            seen
+            + obs["step_count"][:, 0]
+            + (100 * obs["episode_reward"][:, 0]).long()
+            + state["sum"]
+        )
         return seen % 5, {}, TensorDict({"sum": seen % 1000}, batch_size=obs.batch_size)
 
 
@@ -76,7 +107,11 @@ def test_an_agent_is_shown_what_arcade_env_shows(observability: str) -> None:
         if step["next", "done"].item():
             break
     player, found = session(seed=11, both=True)
-    list(recorded_frames(player, trained(agent, observability == "partial"), max_steps=99, hold=1, scale=1))
+    list(
+        recorded_frames(
+            player, trained(agent, observability == "partial"), max_steps=99, hold=1, scale=1
+        )
+    )
     assert found[0].actions == actions and len(set(actions)) > 1
 
 
@@ -93,7 +128,16 @@ def test_a_run_folder_plays_as_it_is_evaluated(
     run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seed = held_out_seed(0)
-    words = ["record", GAME, "--player", str(run_folder), "--seed", str(seed), "--out", str(tmp_path / "a.gif")]
+    words = [
+        "record",
+        GAME,
+        "--player",
+        str(run_folder),
+        "--seed",
+        str(seed),
+        "--out",
+        str(tmp_path / "a.gif"),
+    ]
     assert cli.main([*words, "--scale", "1"]) == 0
     result = evaluate(load(run_folder), episodes=1)
     said = f"seed {seed}: return {result.returns[0]:+.3f} in {result.lengths[0]} steps"
@@ -101,7 +145,9 @@ def test_a_run_folder_plays_as_it_is_evaluated(
     frames, _ = pictures(tmp_path / "a.gif")
     player, _ = session(seed=seed, partial=True)  # the twin it was trained on
     assert (frames[0] == player.frame).all()
-    assert cli.main([*words[:-1], str(tmp_path / "b.gif"), "--obs-size", "256"]) == cli.EXIT_BAD_INPUT
+    assert (
+        cli.main([*words[:-1], str(tmp_path / "b.gif"), "--obs-size", "256"]) == cli.EXIT_BAD_INPUT
+    )
     assert "--obs-size is 256, but the agent sees frames of 128" in capsys.readouterr().err
     words[1] = "MineSweeperMedium"
     assert cli.main([*words, "--scale", "1", "--max-steps", "2"]) == 0
@@ -111,7 +157,9 @@ def test_a_run_folder_plays_as_it_is_evaluated(
 @pytest.mark.parametrize("both", [False, True])
 def test_a_gif_holds_the_true_frames(tmp_path: Path, both: bool) -> None:
     player, found = session(seed=2, episodes=2, both=both)
-    frames = list(recorded_frames(player, scripted("random", player.game, 0), max_steps=99, hold=5, scale=2))
+    frames = list(
+        recorded_frames(player, scripted("random", player.game, 0), max_steps=99, hold=5, scale=2)
+    )
     assert len(frames) == sum(a.steps + 1 + 4 for a in found)
     assert all((frame == frames[-1]).all() for frame in frames[-5:])
     twin, _ = session(seed=2, both=both)
@@ -124,8 +172,15 @@ def test_a_gif_holds_the_true_frames(tmp_path: Path, both: bool) -> None:
 
 
 def test_a_gif_keeps_a_frame_of_256_colours(tmp_path: Path) -> None:
-    colours = np.random.default_rng(0).choice(2**24, 256, replace=False)[:, None] >> np.array([16, 8, 0]) & 255
-    frame = colours[np.random.default_rng(1).permutation(4096) % 256].reshape(64, 64, 3).astype(np.uint8)
+    colours = (
+        np.random.default_rng(0).choice(2**24, 256, replace=False)[:, None] >> np.array([16, 8, 0])
+        & 255
+    )
+    frame = (
+        colours[np.random.default_rng(1).permutation(4096) % 256]
+        .reshape(64, 64, 3)
+        .astype(np.uint8)
+    )
     kept, _ = pictures(write_gif(tmp_path / "x.gif", [frame], 10.0))
     assert (kept[0] == frame).all()
 
@@ -136,11 +191,17 @@ def test_frames_of_many_colours_are_written_too(tmp_path: Path) -> None:
     assert kept.shape == noise.shape and np.abs(kept.astype(int) - noise).mean() < 40
 
 
-@pytest.mark.filterwarnings("ignore:os.fork")  # reading through imageio_ffmpeg forks; writing does not
+@pytest.mark.filterwarnings(
+    "ignore:os.fork"
+)  # reading through imageio_ffmpeg forks; writing does not
 def test_an_mp4_holds_the_frames_nearly(tmp_path: Path) -> None:
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the video extra: pip install 'arcade-torch[video]'")
+    ffmpeg = pytest.importorskip(
+        "imageio_ffmpeg", reason="needs the video extra: pip install 'arcade-torch[video]'"
+    )
     player, _ = session(seed=2)
-    frames = list(recorded_frames(player, scripted("random", player.game, 0), max_steps=99, hold=1, scale=2))
+    frames = list(
+        recorded_frames(player, scripted("random", player.game, 0), max_steps=99, hold=1, scale=2)
+    )
     path = write_mp4(tmp_path / "x.mp4", frames, 10.0)
     film = ffmpeg.read_frames(str(path))
     assert next(film)["size"] == (256, 256)
@@ -153,12 +214,28 @@ def test_an_mp4_holds_the_frames_nearly(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("player", SCRIPTED)
-def test_the_command_records_scripted_players(player: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_records_scripted_players(
+    player: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "new" / "x.gif"
-    words = ["record", GAME, "--player", player, "--both", "--scale", "1", "--out", str(out), "--seed", "3"]
+    words = [
+        "record",
+        GAME,
+        "--player",
+        player,
+        "--both",
+        "--scale",
+        "1",
+        "--out",
+        str(out),
+        "--seed",
+        "3",
+    ]
     assert cli.main(words) == 0
     said = capsys.readouterr().out
-    assert re.search(r"seed 3: return [+-]\d\.\d+ in \d+ steps, (terminated|truncated)\nrecording: ", said)
+    assert re.search(
+        r"seed 3: return [+-]\d\.\d+ in \d+ steps, (terminated|truncated)\nrecording: ", said
+    )
     frames, _ = pictures(out)
     assert frames.shape[1:] == (128, 256, 3)
     assert [path.name for path in out.parent.iterdir()] == ["x.gif"]
@@ -168,7 +245,18 @@ def test_a_recording_is_repeated_to_the_byte_and_cut_when_it_gets_long(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "x.gif"
-    words = ["record", GAME, "--out", str(out), "--max-steps", "3", "--observability", "partial", "--scale", "1"]
+    words = [
+        "record",
+        GAME,
+        "--out",
+        str(out),
+        "--max-steps",
+        "3",
+        "--observability",
+        "partial",
+        "--scale",
+        "1",
+    ]
     assert cli.main(words) == 0
     first = out.read_bytes()
     assert cli.main(words) == 0
@@ -196,9 +284,15 @@ def test_a_recording_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         (["record", GAME], "Missing from arcade-torch record: --out"),
         (["record", "TetrisEsy", "--out", "x.gif"], "did you mean 'TetrisEasy'"),
         (["record", GAME, "--out", "x.png"], "a file that ends in .gif or .mp4; got 'x.png'"),
-        (["record", GAME, "--out", "x.gif", "--player", "nobody"], "--player must be random, state-"),
+        (
+            ["record", GAME, "--out", "x.gif", "--player", "nobody"],
+            "--player must be random, state-",
+        ),
         (["record", GAME, "--out", "x.gif", "--player", "."], "holds no checkpoint"),
-        (["record", GAME, "--out", "x.gif", "--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (
+            ["record", GAME, "--out", "x.gif", "--episodes", "0"],
+            "--episodes must be at least 1, got 0",
+        ),
         (["record", GAME, "--out", "x.gif", "--max-steps", "0"], "--max-steps must be at least 1"),
         (["record", GAME, "--out", "x.gif", "--scale", "0"], "--scale must be at least 1"),
         (
@@ -212,7 +306,11 @@ def test_a_recording_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_is_one_line(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == cli.EXIT_BAD_INPUT
@@ -227,23 +325,46 @@ def test_missing_writers_are_named_with_their_extras(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "PIL", None)
     for suffix, extra in ((".mp4", "video"), (".gif", "tools")):
-        assert cli.main(["record", GAME, "--out", str(tmp_path / f"x{suffix}")]) == cli.EXIT_BAD_INPUT
+        assert (
+            cli.main(["record", GAME, "--out", str(tmp_path / f"x{suffix}")]) == cli.EXIT_BAD_INPUT
+        )
         assert f"pip install 'arcade-torch[{extra}]'" in capsys.readouterr().err
 
 
 def test_every_evaluation_of_a_training_is_filmed_and_changes_nothing(tmp_path: Path) -> None:
-    words = ["train", "--preset", "smoke", "--env", GAME, "--total-frames", "256", "--eval-every", "128"]
+    words = [
+        "train",
+        "--preset",
+        "smoke",
+        "--env",
+        GAME,
+        "--total-frames",
+        "256",
+        "--eval-every",
+        "128",
+    ]
     assert cli.main([*words, "--out", str(tmp_path / "filmed"), "--videos", "gif"]) == 0
     assert cli.main([*words, "--out", str(tmp_path / "plain")]) == 0
     films = sorted(path.name for path in (tmp_path / "filmed" / "videos").iterdir())
     assert films == ["frames-000000128.gif", "frames-000000256.gif"]
     agent, found = load(tmp_path / "filmed"), []
     game = compiled_game(GAME, 128, "default", {})
-    player = Session(game, seed=recording.FILM_SEED, partial=False, episodes=1, on_attempt=found.append)
-    played = list(recorded_frames(player, trained(agent, False), max_steps=500, hold=recording.FILM_FPS, scale=2))
-    np.testing.assert_array_equal(pictures(tmp_path / "filmed" / "videos" / films[-1])[0], np.stack(played))
+    player = Session(
+        game, seed=recording.FILM_SEED, partial=False, episodes=1, on_attempt=found.append
+    )
+    played = list(
+        recorded_frames(
+            player, trained(agent, False), max_steps=500, hold=recording.FILM_FPS, scale=2
+        )
+    )
+    np.testing.assert_array_equal(
+        pictures(tmp_path / "filmed" / "videos" / films[-1])[0], np.stack(played)
+    )
     assert (tmp_path / "filmed/eval.csv").read_bytes() == (tmp_path / "plain/eval.csv").read_bytes()
-    weights = [sorted((tmp_path / run).rglob("*.safetensors"))[-1].read_bytes() for run in ("filmed", "plain")]
+    weights = [
+        sorted((tmp_path / run).rglob("*.safetensors"))[-1].read_bytes()
+        for run in ("filmed", "plain")
+    ]
     assert weights[0] == weights[1]
 
 

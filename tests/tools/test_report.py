@@ -1,4 +1,6 @@
-"""The report: sentences that say no more than the numbers, charts, and one page that loads nothing."""
+"""The report: sentences that say no more than the numbers, charts, and one page that loads
+nothing.
+"""
 
 import json
 import re
@@ -48,9 +50,9 @@ class Checker(HTMLParser):
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         self.count[tag] = self.count.get(tag, 0) + 1
         for name, value in attributes:
-            assert name not in ("src", "href", "xlink:href") or str(value).startswith(("data:", "#")), (
-                f"{tag} loads {value}"
-            )
+            assert name not in ("src", "href", "xlink:href") or str(value).startswith(
+                ("data:", "#")
+            ), f"{tag} loads {value}"
             if name == "id":
                 assert value not in self.ids
                 self.ids.append(str(value))
@@ -73,7 +75,9 @@ def test_the_page_is_well_formed_and_loads_nothing(page: str) -> None:
     checker.feed(page)
     assert not checker.open
     assert checker.wanted <= set(checker.ids)
-    assert checker.count["svg"] == 8  # greedy and training curves of two twins, four panels of gap and bias
+    assert (
+        checker.count["svg"] == 8
+    )  # greedy and training curves of two twins, four panels of gap and bias
     assert not re.search(r"https?://|@import|url\((?!#)", page)
 
 
@@ -102,31 +106,50 @@ def test_an_unfinished_study_is_reported_as_such(tmp_path: Path, no_oracles: Non
 
 def test_a_study_without_the_control_still_has_a_page(tmp_path: Path, no_oracles: None) -> None:
     write_study(tmp_path / "s", small_study(memories=["mingru"]))
-    assert "no scores for the memory-free agent" in report(tmp_path / "s", skip=("saliency",)).read_text()
+    assert (
+        "no scores for the memory-free agent"
+        in report(tmp_path / "s", skip=("saliency",)).read_text()
+    )
 
 
-def test_agents_are_told_about_beside_the_memory_free_one_of_their_algorithm(tmp_path: Path, no_oracles: None) -> None:
+def test_agents_are_told_about_beside_the_memory_free_one_of_their_algorithm(
+    tmp_path: Path, no_oracles: None
+) -> None:
     what = small_study(algorithms=["pqn", "ppo"])
     folder = write_study(tmp_path / "s", what)
-    for run in [run for run in what.runs() if (run.algorithm, run.memory, run.observability) == ("ppo", "mlp", "full")]:
-        write_run(folder.run(run).path, run, 0.9 + 0.02 * run.seed, settings=what.config(run).to_dict())
+    for run in [
+        run
+        for run in what.runs()
+        if (run.algorithm, run.memory, run.observability) == ("ppo", "mlp", "full")
+    ]:
+        write_run(
+            folder.run(run).path, run, 0.9 + 0.02 * run.seed, settings=what.config(run).to_dict()
+        )
     page = report(tmp_path / "s", skip=("saliency",)).read_text()
     assert "On the MDP, where memory is not needed, pqn-mingru adds 0.0" in page
-    assert "ppo-mingru costs 0.2" in page and "and ppo-mlp 0." not in page and "needed, ppo-mlp" not in page
+    assert (
+        "ppo-mingru costs 0.2" in page
+        and "and ppo-mlp 0." not in page
+        and "needed, ppo-mlp" not in page
+    )
 
 
 def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles: None) -> None:
     folder = write_study(tmp_path / "s", small_study())
     file = folder.run(small_study().runs()[0]).path / "config.json"
     file.write_text(file.read_text().replace('"gamma": 0.99', '"gamma": 0.5'))
-    with pytest.raises(ValueError, match=r"seeds of mingru on MineSweeperEasy \(full\) differ in pqn.gamma"):
+    with pytest.raises(
+        ValueError, match=r"seeds of mingru on MineSweeperEasy \(full\) differ in pqn.gamma"
+    ):
         report(tmp_path / "s", skip=("saliency",))
 
 
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no part 'strips' to skip; parts: saliency, recall"):
         report(tmp_path / "s", skip=("strips",))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="metric must be one of eval_final, train_max_ewm; got 'return'"):
+    with pytest.raises(
+        ValueError, match="metric must be one of eval_final, train_max_ewm; got 'return'"
+    ):
         report(tmp_path / "s", metric="return")
 
 
@@ -145,7 +168,10 @@ def table(mlp: list[float], lru: list[float]) -> Any:
     made = []
     for agent, values in (("mlp", mlp), ("lru", lru)):
         for seed, value in enumerate(values):
-            made += [Score(agent, "CartPoleEasy", twin, seed, v) for twin, v in (("full", 0.9), ("partial", value))]
+            made += [
+                Score(agent, "CartPoleEasy", twin, seed, v)
+                for twin, v in (("full", 0.9), ("partial", value))
+            ]
     return gap_and_bias(made, draws=500)
 
 
@@ -158,8 +184,12 @@ def test_the_headline_claims_only_what_the_interval_allows() -> None:
     assert "memory widens the observability gap by 0.70" in worse
     vague = reports.score_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "gap", "lru")
     assert "contains zero, so 3 seeds do not settle it" in vague
-    ahead = reports.score_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "pomdp", "lru")
-    assert ahead.startswith("On the POMDP lru reaches a normalised return of 0.81, the memory-free agent 0.11, a diff")
+    ahead = reports.score_sentence(
+        table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "pomdp", "lru"
+    )
+    assert ahead.startswith(
+        "On the POMDP lru reaches a normalised return of 0.81, the memory-free agent 0.11, a diff"
+    )
     assert "a difference of +0.70 [+0." in ahead
     single = reports.score_sentence(table([0.1], [0.9]), "gap", "lru")
     assert "single seed" in single and "narrows" not in single
@@ -171,7 +201,9 @@ def test_few_seeds_come_with_a_caution() -> None:
 
 
 def test_the_way_from_random_to_oracle_is_a_share() -> None:
-    said = reports.learning_sentence("X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0})
+    said = reports.learning_sentence(
+        "X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0}
+    )
     assert "mlp 25 %" in said and "a seed of mlp did not get above random" in said
     assert reports.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
 
@@ -179,14 +211,20 @@ def test_the_way_from_random_to_oracle_is_a_share() -> None:
 def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert reports.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
-    same = {player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")}
+    assert (
+        reports.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
+    )
+    same = {
+        player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")
+    }
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: same)
     write_study(tmp_path / "s", small_study())
     assert "random policy" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
-def test_reference_lines_follow_the_options_of_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reference_lines_follow_the_options_of_the_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = []
     monkeypatch.setattr(reports, "references", lambda *words: asked.append(words) or LEVELS)
     folder = write_study(tmp_path / "s", small_study())
@@ -205,12 +243,14 @@ def test_a_mine_costs_what_the_options_say_and_a_damaged_file_is_made_anew(tmp_p
     assert harsh["random"].mean < mild["random"].mean - 0.2
     (file,) = tmp_path.iterdir()
     file.write_text(file.read_text()[:50])
-    assert references("MineSweeperEasy", tmp_path, options={"mine_reward": -1}, episodes=64)["random"].mean == (
-        harsh["random"].mean
-    )
+    assert references("MineSweeperEasy", tmp_path, options={"mine_reward": -1}, episodes=64)[
+        "random"
+    ].mean == (harsh["random"].mean)
 
 
-@given(st.lists(st.sampled_from(["pqn-lru", "ppo-lru", "mlp", "gru", "lstm", "dqn-lru"]), unique=True))
+@given(
+    st.lists(st.sampled_from(["pqn-lru", "ppo-lru", "mlp", "gru", "lstm", "dqn-lru"]), unique=True)
+)
 def test_no_two_agents_share_a_colour(names: list[str]) -> None:
     assert len(set(agent_colours(names).values())) == len(names)
 
@@ -234,7 +274,10 @@ def test_a_picture_in_a_page_has_ids_of_its_own_and_escapes_names() -> None:
 
 
 def test_one_scale_serves_a_whole_row_and_few_frames_leave_places_empty() -> None:
-    frames, maps = np.zeros((2, 4, 4, 3), np.uint8), np.stack([np.full((4, 4), 2.0), np.full((4, 4), 1.0)])
+    frames, maps = (
+        np.zeros((2, 4, 4, 3), np.uint8),
+        np.stack([np.full((4, 4), 2.0), np.full((4, 4), 1.0)]),
+    )
     with drawing("light") as plt:
         _, axes = plt.subplots(1, 3)
         assert saliency.plot(frames, maps, axes, sigma_px=0.0) == 2.0

@@ -21,20 +21,37 @@ from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import write_run
 from tests.tools.test_report import LEVELS, Checker
 
-GAMES = ("CartPoleEasy-v0", "MineSweeperEasy-v0", "SkittlesEasy-v0", "TetrisEasy-v0", "NavigatorEasy-v0")
+GAMES = (
+    "CartPoleEasy-v0",
+    "MineSweeperEasy-v0",
+    "SkittlesEasy-v0",
+    "TetrisEasy-v0",
+    "NavigatorEasy-v0",
+)
 SCORES = {"mlp": 0.2, "lru": 0.5, "gru": 0.4}
 
 
-def large_study(root: Path, games: tuple[str, ...] = GAMES, seeds: int = 2) -> tuple[StudyFolder, Study]:
+def large_study(
+    root: Path, games: tuple[str, ...] = GAMES, seeds: int = 2
+) -> tuple[StudyFolder, Study]:
     """Finished runs of three agents; the agents with memory are further ahead on later games."""
     study = Study.from_dict(
-        {"name": "large", "games": list(games), "memories": list(SCORES), "seeds": list(range(seeds))}
+        {
+            "name": "large",
+            "games": list(games),
+            "memories": list(SCORES),
+            "seeds": list(range(seeds)),
+        }
     )
     folder = StudyFolder(root)
     folder.claim(study, "arcade-torch study large.toml")
     for run in study.runs():
         ahead = SCORES[run.memory] * (0.5 + 0.1 * games.index(run.game))
-        write_run(folder.run(run).path, run, ahead + 0.01 * run.seed - 0.1 * (run.observability == "partial"))
+        write_run(
+            folder.run(run).path,
+            run,
+            ahead + 0.01 * run.seed - 0.1 * (run.observability == "partial"),
+        )
     return folder, study
 
 
@@ -46,7 +63,9 @@ def check(page: str) -> Checker:
     return checker
 
 
-def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_runs_become_small_multiples_and_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
     page = report(folder.root, skip=("saliency", "recall", "contamination")).read_text()
@@ -58,7 +77,9 @@ def test_many_runs_become_small_multiples_and_tables(tmp_path: Path, monkeypatch
     assert 'class="heat best" style="--v:' in page and 'href="#curve-TetrisEasy-v0-partial"' in page
     mines = page.partition('href="#curve-MineSweeperEasy-v0-full">')[2].partition("</tr>")[0]
     heats = re.findall(r'--v:(\d+)">(-?[\d.]+)<', mines)
-    assert len(heats) == 3 and all(abs(int(heat) - 50 * (float(value) + 1)) <= 1 for heat, value in heats)
+    assert len(heats) == 3 and all(
+        abs(int(heat) - 50 * (float(value) + 1)) <= 1 for heat, value in heats
+    )
     first = page.index("Partial observability costs the memory-free agent")
     assert "and lru 0.07" in page[first : first + 200] and "The same for every other agent" in page
 
@@ -67,19 +88,32 @@ def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: P
     folder, study = large_study(tmp_path / "s", seeds=4)
     for run in study.runs():
         (folder.run(run).path / "checkpoints").mkdir()
-    runs = Runs(tuple(run for spec in study.runs() if (run := open_run(folder.run(spec).path)) is not None))
+    runs = Runs(
+        tuple(run for spec in study.runs() if (run := open_run(folder.run(spec).path)) is not None)
+    )
     finals: dict[tuple[str, str], dict[str, list[float]]] = {}
     for (agent, game, twin), group in runs.groups().items():
         finals.setdefault((game, twin), {})[agent] = [run.value("eval_final") for run in group]
     cells, note = select_cells(runs, finals, study.baseline)
     assert {agent for agent, _, _ in cells} == {"mlp", "lru"}
-    assert {game for _, game, _ in cells} == {"SkittlesEasy-v0", "CartPoleEasy-v0", "NavigatorEasy-v0"}
+    assert {game for _, game, _ in cells} == {
+        "SkittlesEasy-v0",
+        "CartPoleEasy-v0",
+        "NavigatorEasy-v0",
+    }
     assert all(len(paths) == 3 for paths in cells.values())
-    assert "Shown: mlp and lru on" in note and "out of 3 agents and 5 games" in note and "first 3 of 4 seeds" in note
+    assert (
+        "Shown: mlp and lru on" in note
+        and "out of 3 agents and 5 games" in note
+        and "first 3 of 4 seeds" in note
+    )
 
 
 def test_representatives_without_a_control_are_the_best_agent() -> None:
-    finals = {("A", "full"): {"lru": [0.1], "gru": [0.4]}, ("B", "full"): {"lru": [0.2], "gru": [0.3]}}
+    finals = {
+        ("A", "full"): {"lru": [0.1], "gru": [0.4]},
+        ("B", "full"): {"lru": [0.2], "gru": [0.3]},
+    }
     assert representatives(finals, "mlp") == (["gru"], ["A", "B"])
     both = {
         ("A", "partial"): {"pqn-mlp": [0.3], "pqn-lru": [0.1]},
@@ -88,17 +122,29 @@ def test_representatives_without_a_control_are_the_best_agent() -> None:
     assert representatives(both, "mlp") == (["pqn-mlp", "pqn-lru"], ["B", "A"])
 
 
-def test_columns_of_the_page_are_those_steps_that_their_headings_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    delays, flip = np.array(panels.NOISE["delays"]), np.tile([1.0, 0.5, 0.25, 0.0, 0.0, np.nan], (4, 1, 1))
-    found = Contamination(np.array([0.3]), delays, flip, flip, flip * np.nan, np.zeros((4, 2), np.int64), 0.0, 0, "q")
+def test_columns_of_the_page_are_those_steps_that_their_headings_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    delays, flip = (
+        np.array(panels.NOISE["delays"]),
+        np.tile([1.0, 0.5, 0.25, 0.0, 0.0, np.nan], (4, 1, 1)),
+    )
+    found = Contamination(
+        np.array([0.3]), delays, flip, flip, flip * np.nan, np.zeros((4, 2), np.int64), 0.0, 0, "q"
+    )
     label = Label(AgentKey("pqn", "lru"), GAMES[0], "full", 0, Path("run"), "lru")
     monkeypatch.setattr(panels, "measure_run", lambda *words: (label, found))
-    dense = RecallDensity(np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q")
+    dense = RecallDensity(
+        np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q"
+    )
     with drawing("light"):
         (row,) = panels.contamination_section({label.task: [label.path]}, ["lru"], None)["rows"]
         monkeypatch.setattr(panels, "measure_run", lambda *words: (label, dense))
         (past,) = panels.recall_section({label.task: [label.path]}, ["lru"], None)["rows"]
-    assert (row["at_once"], row["one"], row["later"]) == (1, 0.5, 0.1875) and (row["seeds"], row["points"]) == (1, 4)
+    assert (row["at_once"], row["one"], row["later"]) == (1, 0.5, 0.1875) and (
+        row["seeds"],
+        row["points"],
+    ) == (1, 4)
     assert [past[name] for name in ("older", "first", "last")] == pytest.approx([0.3, 0.1, 0.4])
 
 
@@ -135,13 +181,21 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[str, int, int]] = []
-    page = report(trained, skip=("saliency", "references"), progress=lambda *step: told.append(step)).read_text()
+    page = report(
+        trained, skip=("saliency", "references"), progress=lambda *step: told.append(step)
+    ).read_text()
     check(page)
     assert ("recall density, mlp on SignpostEasy-v0", 16, 16) in told
-    assert ("contamination, lru on SignpostEasy-v0", panels.NOISE["starts"], panels.NOISE["starts"]) in told
+    assert (
+        "contamination, lru on SignpostEasy-v0",
+        panels.NOISE["starts"],
+        panels.NOISE["starts"],
+    ) in told
     recall = page[page.index('id="recall"') : page.index('id="contamination"')]
     rows = [row.split("<td>")[1:] for row in recall.split("<tr>")[2:]]
-    assert rows[1][3].startswith("100.0 %") and rows[1][4].startswith("0.0 %")  # no memory: all on the last frame
+    assert rows[1][3].startswith("100.0 %") and rows[1][4].startswith(
+        "0.0 %"
+    )  # no memory: all on the last frame
     assert not rows[0][3].startswith("100.0 %")
     noise = page[page.index('id="contamination"') : page.index('id="repeat"')]
     free = [row.split("<td>")[1:] for row in noise.split("<tr>")[2:]][1]
@@ -154,10 +208,20 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
 def test_each_analysis_can_be_skipped_from_the_command_line(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ask = ["report", str(trained), "--out", str(tmp_path / "r.html"), "--skip", "saliency", "references"]
+    ask = [
+        "report",
+        str(trained),
+        "--out",
+        str(tmp_path / "r.html"),
+        "--skip",
+        "saliency",
+        "references",
+    ]
     assert cli.main([*ask, "recall"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
-    assert 'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
+    assert (
+        'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
+    )
     assert cli.main([*ask, "contamination"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
     assert 'id="contamination"' not in page and 'id="recall"' in page

@@ -1,4 +1,6 @@
-"""Which folders count as runs: through links, below any name, each real folder once, and in the order of a study."""
+"""Which folders count as runs: through links, below any name, each real folder once, and in the
+order of a study.
+"""
 
 import os
 from pathlib import Path
@@ -32,7 +34,9 @@ def test_runs_behind_links_are_found(tmp_path: Path) -> None:
     whole = tmp_path / "whole"
     whole.symlink_to(tmp_path / "disk")
     assert seeds_of(whole) == [0, 1, 2]
-    (here / "all").symlink_to(whole)  # a link to a link to a folder of runs, two of which were met already
+    (here / "all").symlink_to(
+        whole
+    )  # a link to a link to a folder of runs, two of which were met already
     assert seeds_of(here) == [0, 1, 2, 7]
 
 
@@ -42,7 +46,9 @@ def test_each_real_folder_is_one_run_however_many_links_lead_to_it(tmp_path: Pat
     (tmp_path / "s" / "b-link").symlink_to(run)
     (found,) = find_runs([tmp_path / "s"]).runs
     assert found.path == run
-    assert seeds_of(tmp_path / "s", run, tmp_path / "s" / "a-link", tmp_path / "s" / ".." / "s") == [0]
+    assert seeds_of(
+        tmp_path / "s", run, tmp_path / "s" / "a-link", tmp_path / "s" / ".." / "s"
+    ) == [0]
 
 
 def test_links_to_parents_end_and_lead_nowhere_else(tmp_path: Path) -> None:
@@ -64,7 +70,9 @@ def test_folders_are_looked_into_to_a_bounded_depth(tmp_path: Path) -> None:
     assert seeds_of(tmp_path) == [0]
 
 
-def test_a_link_that_leads_nowhere_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_link_that_leads_nowhere_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write(tmp_path / "s" / "0", "lru", "full", 0, 0.5)
     (tmp_path / "s" / "1").symlink_to(tmp_path / "unplugged" / "1")
     notes = find_runs([tmp_path / "s"]).notes
@@ -73,7 +81,9 @@ def test_a_link_that_leads_nowhere_is_said(tmp_path: Path, capsys: pytest.Captur
     assert notes[0] in capsys.readouterr().out
 
 
-def test_a_folder_that_may_not_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_may_not_be_read_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path / "0", "lru", "full", 0, 0.5)
     closed = write(tmp_path / "closed" / "1", "lru", "full", 1, 0.5).parent
     scandir = os.scandir
@@ -87,7 +97,9 @@ def test_a_folder_that_may_not_be_read_is_said(tmp_path: Path, monkeypatch: pyte
     assert find_runs([tmp_path]).notes == [f"left out, Permission denied: {closed}"]
 
 
-@pytest.mark.parametrize("name", ["checkpoints", "checkpoints/checkpoints", "replay", "my/checkpoints/of/2026"])
+@pytest.mark.parametrize(
+    "name", ["checkpoints", "checkpoints/checkpoints", "replay", "my/checkpoints/of/2026"]
+)
 def test_runs_below_a_folder_of_any_name_are_found(name: str, tmp_path: Path) -> None:
     root = tmp_path / name
     run = write(root / "one", "lru", "full", 0, 0.5)
@@ -116,7 +128,10 @@ def test_a_study_whose_runs_are_links_is_no_study_that_lost_its_runs(tmp_path: P
 
 def test_the_interval_is_the_same_by_whatever_name_the_runs_are_given(tmp_path: Path) -> None:
     study = small_study(
-        name="order", games=["TetrisEasy", "CartPoleEasy"], memories=["mlp", "mingru"], seeds=[2, 10, 1, 0]
+        name="order",
+        games=["TetrisEasy", "CartPoleEasy"],
+        memories=["mlp", "mingru"],
+        seeds=[2, 10, 1, 0],
     )
     folder = write_study(tmp_path / "s", study, spread=0.05)
     runs = sorted((folder.root / "runs").iterdir())
@@ -124,12 +139,23 @@ def test_the_interval_is_the_same_by_whatever_name_the_runs_are_given(tmp_path: 
     for run in runs:
         (tmp_path / "links" / run.name).symlink_to(run)
     by_study = gap_and_bias(folder.root, draws=200)
-    for given in (folder.root / "runs", runs, runs[::-1], tmp_path / "links", folder.root / "results.csv"):
+    for given in (
+        folder.root / "runs",
+        runs,
+        runs[::-1],
+        tmp_path / "links",
+        folder.root / "results.csv",
+    ):
         table = gap_and_bias(given, draws=200)
         for row in by_study.rows:
             assert table.row(row.agent).gap == row.gap and table.row(row.agent).bias == row.bias
-            assert table.row(row.agent).mdp_iqm == row.mdp_iqm and table.row(row.agent).coverage == row.coverage
-        assert table.difference("gap", "mingru", "mlp") == by_study.difference("gap", "mingru", "mlp")
+            assert (
+                table.row(row.agent).mdp_iqm == row.mdp_iqm
+                and table.row(row.agent).coverage == row.coverage
+            )
+        assert table.difference("gap", "mingru", "mlp") == by_study.difference(
+            "gap", "mingru", "mlp"
+        )
         assert set(table.without) == set(by_study.without)
     by_folder = gap_and_bias(folder.root / "runs", draws=200)
     assert [row.agent for row in by_folder.rows] == [row.agent for row in by_study.rows]

@@ -1,4 +1,6 @@
-"""Saliency beside the laws of `tests/tools/analysis/test_laws.py`: maps, chunks, single steps, and what is refused."""
+"""Saliency beside the laws of `tests/tools/analysis/test_laws.py`: maps, chunks, single steps, and
+what is refused.
+"""
 
 from typing import Any
 
@@ -25,12 +27,18 @@ def test_a_linear_model_has_the_closed_form(rho: float, steps: int, chunk: int) 
     wanted = {
         "l1": (gradient.abs().sum((0, 3)), gradient.abs().sum(), decay),
         "l2sq": (gradient.square().sum((0, 3)), gradient.square().sum(), decay**2),
-        "l2": (gradient.square().sum(3).sqrt().sum(0), gradient.square().sum((1, 2, 3)).sqrt().sum(), decay),
+        "l2": (
+            gradient.square().sum(3).sqrt().sum(0),
+            gradient.square().sum((1, 2, 3)).sqrt().sum(),
+            decay,
+        ),
     }
     for norm, (per_pixel, total, factor) in wanted.items():
         found = saliency(linear_policy(rho), frames(steps), norm=norm, chunk=chunk, dtype=F64)
         np.testing.assert_allclose(found.per_frame, (factor * total).numpy(), rtol=1e-9)
-        np.testing.assert_allclose(found.maps, (factor[:, None, None] * per_pixel).numpy(), rtol=1e-5)
+        np.testing.assert_allclose(
+            found.maps, (factor[:, None, None] * per_pixel).numpy(), rtol=1e-5
+        )
 
 
 def test_shares_follow_the_geometric_series_and_nothing_leaks_over_a_start_flag() -> None:
@@ -45,7 +53,9 @@ def test_shares_follow_the_geometric_series_and_nothing_leaks_over_a_start_flag(
 
 def test_any_step_can_be_explained_and_later_frames_do_not_matter() -> None:
     whole, cut = frames(7), frames(7)[:4]
-    early, same = (saliency(linear_policy(0.8), o, n=n, dtype=F64) for o, n in ((whole, 3), (cut, -1)))
+    early, same = (
+        saliency(linear_policy(0.8), o, n=n, dtype=F64) for o, n in ((whole, 3), (cut, -1))
+    )
     assert early.n == same.n == 3 and early.maps.shape == (4, SIZE, SIZE)
     np.testing.assert_array_equal(early.maps, same.maps)
 
@@ -63,7 +73,9 @@ def test_actions_and_starts_reach_the_memory_as_they_do_end_to_end(name: str) ->
     out, _ = remember(net.encode(leaf)[None], actions[None], starts[None], net.initial_state(1))
     gradients = [torch.autograd.grad(value, leaf, retain_graph=True)[0] for value in out[0, -1]]
     wanted = torch.stack(gradients).square().sum((0, 4))
-    found = saliency(Policy(net.encode, remember, net.initial_state), o, actions, starts, chunk=2, dtype=F64)
+    found = saliency(
+        Policy(net.encode, remember, net.initial_state), o, actions, starts, chunk=2, dtype=F64
+    )
     np.testing.assert_allclose(found.maps, wanted.numpy(), rtol=1e-5, atol=1e-18)
     np.testing.assert_allclose(found.per_frame, wanted.sum((1, 2)).numpy(), rtol=1e-9, atol=1e-18)
     assert not found.maps[:2].any() and found.per_frame[-1] > 0
@@ -79,7 +91,9 @@ def test_of_several_episodes_the_first_that_is_long_enough_is_explained_else_the
     config = preset("smoke", env="MineSweeperEasy", observability="partial", memory="gru")
     agent = Agent(config, build_network(config).eval())
     each = [episode_saliency(agent, seed=seed, max_steps=9) for seed in range(3)]
-    assert all(one.maps.shape == one.frames.shape[:3] and len(one.action) == one.n + 1 for one in each)
+    assert all(
+        one.maps.shape == one.frames.shape[:3] and len(one.action) == one.n + 1 for one in each
+    )
     longest = episode_saliency(agent, max_steps=9, show=99, tries=3)
     assert longest.n == max(one.n for one in each)
     first = episode_saliency(agent, max_steps=9, show=1, tries=3)

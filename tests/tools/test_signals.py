@@ -1,4 +1,6 @@
-"""Signals that stop a command: one line, exit code 130, no half file; from the first import to the last flush."""
+"""Signals that stop a command: one line, exit code 130, no half file; from the first import to the
+last flush.
+"""
 
 import os
 import random
@@ -73,7 +75,9 @@ def start(words: Sequence[str], folder: Path) -> "subprocess.Popen[str]":
     """A command in a process of its own."""
     pipe = subprocess.PIPE
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
-    return subprocess.Popen([*PROGRAM, *words], stdout=pipe, stderr=pipe, text=True, cwd=folder, env=environment)
+    return subprocess.Popen(
+        [*PROGRAM, *words], stdout=pipe, stderr=pipe, text=True, cwd=folder, env=environment
+    )
 
 
 def wait_for_handlers(process: "subprocess.Popen[str]") -> None:
@@ -137,7 +141,10 @@ def test_a_second_ctrl_c_ends_at_once_even_while_c_computes(tmp_path: Path) -> N
     process.send_signal(signal.SIGINT)
     code, _, err = ended(process)
     assert code == 130
-    assert err == "arcade-torch: stopped at once; no file is half written; the same command starts again\n"
+    assert (
+        err
+        == "arcade-torch: stopped at once; no file is half written; the same command starts again\n"
+    )
 
 
 def test_a_signal_after_the_work_changes_nothing_of_its_result(tmp_path: Path) -> None:

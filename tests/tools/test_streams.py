@@ -40,13 +40,27 @@ def shell(line: str, folder: Path, **environment: str) -> "subprocess.CompletedP
         pytest.param("python -m arcade_torch.tools lost 2>&-", 2, b"", b"", marks=slow),
         (f"python {LIST} | head -1", 0, b"environments", b""),
         pytest.param("python -m arcade_torch.tools --help | true", 0, b"", b"", marks=slow),
-        ("python -m arcade_torch.tools play CartPoleEasy --terminal <&- >&-", 2, b"", b"standard input and standard"),
+        (
+            "python -m arcade_torch.tools play CartPoleEasy --terminal <&- >&-",
+            2,
+            b"",
+            b"standard input and standard",
+        ),
         pytest.param(f"python -OO {LIST}", 0, b"CartPoleEasy-v0", b"", marks=slow),
-        pytest.param(f"python -O -bOO -W ignore -X dev=0 {LIST}", 0, b"CartPoleEasy-v0", b"", marks=slow),
-        ("python -OO -m arcade_torch.tools bench train --help", 0, b"usage: arcade-torch bench train", b""),
+        pytest.param(
+            f"python -O -bOO -W ignore -X dev=0 {LIST}", 0, b"CartPoleEasy-v0", b"", marks=slow
+        ),
+        (
+            "python -OO -m arcade_torch.tools bench train --help",
+            0,
+            b"usage: arcade-torch bench train",
+            b"",
+        ),
     ],
 )
-def test_a_command_works_with_strange_streams(line: str, code: int, out: bytes, err: bytes, tmp_path: Path) -> None:
+def test_a_command_works_with_strange_streams(
+    line: str, code: int, out: bytes, err: bytes, tmp_path: Path
+) -> None:
     result = shell(line, tmp_path)
     assert result.returncode == code, result
     assert out in result.stdout and err in result.stderr
@@ -68,7 +82,9 @@ def test_a_full_disk_under_standard_output_is_one_line(words: str, tmp_path: Pat
     result = shell(f"python -m arcade_torch.tools {words} >/dev/full", tmp_path)
     assert result.returncode == 1
     said = result.stderr.decode().splitlines()
-    assert said[-1].startswith("arcade-torch: could not write to standard output: No space left on device")
+    assert said[-1].startswith(
+        "arcade-torch: could not write to standard output: No space left on device"
+    )
     assert "Traceback" not in result.stderr.decode()
 
 
@@ -83,7 +99,11 @@ LOCALES: dict[str, Mapping[str, str]] = {
 
 
 @pytest.mark.parametrize(
-    "locale", ["ascii files too", *(pytest.param(name, marks=slow) for name in LOCALES if name != "ascii files too")]
+    "locale",
+    [
+        "ascii files too",
+        *(pytest.param(name, marks=slow) for name in LOCALES if name != "ascii files too"),
+    ],
 )
 @pytest.mark.parametrize("name", ["μνήμη".encode(), b"no text \xff\xfe"], ids=["greek", "bytes"])
 def test_every_locale_meets_every_name(locale: str, name: bytes, tmp_path: Path) -> None:
@@ -101,34 +121,56 @@ def test_every_locale_meets_every_name(locale: str, name: bytes, tmp_path: Path)
     "platform", ["cuda", *(pytest.param(name, marks=slow) for name in ("rocm", "tpu", "nonsense"))]
 )
 @pytest.mark.parametrize(
-    "words", ["list sheet CartPoleEasy --steps 0", pytest.param("record CartPoleEasy --out x.gif", marks=slow)]
+    "words",
+    [
+        "list sheet CartPoleEasy --steps 0",
+        pytest.param("record CartPoleEasy --out x.gif", marks=slow),
+    ],
 )
 def test_a_platform_that_jax_has_not_is_one_line(platform: str, words: str, tmp_path: Path) -> None:
     result = shell(f"python -m arcade_torch.tools {words}", tmp_path, JAX_PLATFORMS=platform)
     said = result.stderr.decode()
     assert result.returncode == 1 and said.count("\n") == 1, said
-    assert said.startswith(f"arcade-torch: JAX_PLATFORMS is '{platform}', but JAX has no such device here"), said
+    assert said.startswith(
+        f"arcade-torch: JAX_PLATFORMS is '{platform}', but JAX has no such device here"
+    ), said
     assert not list(tmp_path.iterdir())
 
 
 def test_make_says_in_one_line_that_jax_has_no_such_platform(tmp_path: Path) -> None:
     result = shell(
-        "python -c 'import arcade_torch; arcade_torch.make(\"CartPoleEasy\")'", tmp_path, JAX_PLATFORMS="cuda"
+        "python -c 'import arcade_torch; arcade_torch.make(\"CartPoleEasy\")'",
+        tmp_path,
+        JAX_PLATFORMS="cuda",
     )
     last = result.stderr.decode().splitlines()[-1]
-    assert last.startswith("ValueError: JAX_PLATFORMS is 'cuda', but JAX has no such device here"), last
+    assert last.startswith(
+        "ValueError: JAX_PLATFORMS is 'cuda', but JAX has no such device here"
+    ), last
 
 
 def test_play_names_the_stream_that_is_no_terminal(tmp_path: Path) -> None:
     master, slave = pty.openpty()
     words = [sys.executable, "-m", "arcade_torch.tools", "play", "CartPoleEasy", "--terminal"]
     pipe = subprocess.PIPE
-    for stdin, stdout, names in ((slave, pipe, "standard output is"), (subprocess.DEVNULL, slave, "standard input is")):
-        result = subprocess.run(words, stdin=stdin, stdout=stdout, stderr=pipe, cwd=ROOT, timeout=LIMIT_S, check=False)
+    for stdin, stdout, names in (
+        (slave, pipe, "standard output is"),
+        (subprocess.DEVNULL, slave, "standard input is"),
+    ):
+        result = subprocess.run(
+            words, stdin=stdin, stdout=stdout, stderr=pipe, cwd=ROOT, timeout=LIMIT_S, check=False
+        )
         assert result.returncode == 2 and f"{names} redirected" in result.stderr.decode()
     environment = {**os.environ, "TERM": "dumb"}
     result = subprocess.run(
-        words, stdin=slave, stdout=slave, stderr=pipe, cwd=ROOT, timeout=LIMIT_S, env=environment, check=False
+        words,
+        stdin=slave,
+        stdout=slave,
+        stderr=pipe,
+        cwd=ROOT,
+        timeout=LIMIT_S,
+        env=environment,
+        check=False,
     )
     assert result.returncode == 2 and "TERM is dumb" in result.stderr.decode()
     assert not select.select([master], [], [], 0)[0]

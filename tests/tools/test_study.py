@@ -1,4 +1,6 @@
-"""Studies: the grid, the engines, and going on after failures and interruptions; runs are fabricated."""
+"""Studies: the grid, the engines, and going on after failures and interruptions; runs are
+fabricated.
+"""
 
 import io
 import json
@@ -20,7 +22,14 @@ from arcade_torch.tools.studies import engines
 from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
-from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, show_progress, shown, study
+from arcade_torch.tools.studies.runner import (
+    DiskFullError,
+    make_engine,
+    planned,
+    show_progress,
+    shown,
+    study,
+)
 from tests.tools.fabricated import small_study, write_run, write_study
 
 
@@ -28,7 +37,11 @@ class Fabricator:
     """An engine that fabricates runs; may fail some, and may be interrupted after some."""
 
     def __init__(self, what: Study, fail: str = "", stop_after: int = 99) -> None:
-        self.runs, self.fail, self.stop_after = {run.name: run for run in what.runs()}, fail, stop_after
+        self.runs, self.fail, self.stop_after = (
+            {run.name: run for run in what.runs()},
+            fail,
+            stop_after,
+        )
         self.done: list[str] = []
 
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
@@ -58,7 +71,9 @@ def test_the_grid_holds_every_cell_once_under_a_name_of_its_own() -> None:
 
 def test_growing_the_grid_keeps_the_names() -> None:
     names = {run.name for run in small_study().runs()}
-    assert names < {run.name for run in small_study(seeds=3, memories=["mingru", "mlp", "gru"]).runs()}
+    assert names < {
+        run.name for run in small_study(seeds=3, memories=["mingru", "mlp", "gru"]).runs()
+    }
 
 
 def test_a_study_survives_being_written_and_read() -> None:
@@ -66,7 +81,9 @@ def test_a_study_survives_being_written_and_read() -> None:
     assert Study.from_dict(json.loads(json.dumps(what.to_dict()))) == what
 
 
-def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(tmp_path: Path) -> None:
+def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(
+    tmp_path: Path,
+) -> None:
     file = tmp_path / "one.toml"
     file.write_text(
         textwrap.dedent("""
@@ -85,7 +102,12 @@ def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(
     what = Study.load(file)
     assert what.name == "one" and what.seeds == (0, 1)
     config = what.config(what.runs()[0])
-    assert (config.env, config.observability, config.memory, config.seed) == ("CartPoleEasy", "full", "mlp", 0)
+    assert (config.env, config.observability, config.memory, config.seed) == (
+        "CartPoleEasy",
+        "full",
+        "mlp",
+        0,
+    )
     assert (config.total_frames, config.eval_every, config.threads) == (4096, 512, 1)
     assert config.pqn.learning_rate == 1e-3 and config.env_options == {"wind": True}
 
@@ -153,7 +175,9 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     assert os.listdir(tmp_path / "other") == ["thesis.tex"]
 
 
-def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(tmp_path: Path) -> None:
+def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(
+    tmp_path: Path,
+) -> None:
     what, root = small_study(), tmp_path / "s"
     write_study(root, what)
     with pytest.raises(FileExistsError, match="total_frames = 2048, not 4096"):
@@ -179,8 +203,14 @@ def change_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None
         (lambda config: config["pqn"].update(lam=0.123), r"pqn.lam \(0.123 != 0.65\)"),
         (lambda config: config.update(amp=True), "amp"),
         (lambda config: config.update(env_options={"mine_reward": -1}), "env_options.mine_reward"),
-        (lambda config: config["pqn"].pop("lam"), r"pqn.lam \(0.95 != 0.65\)"),  # from before there was that field
-        (lambda config: config.update(no_longer=1), r"no_longer \(1 != None\)"),  # a field that is gone
+        (
+            lambda config: config["pqn"].pop("lam"),
+            r"pqn.lam \(0.95 != 0.65\)",
+        ),  # from before there was that field
+        (
+            lambda config: config.update(no_longer=1),
+            r"no_longer \(1 != None\)",
+        ),  # a field that is gone
     ],
 )
 def test_a_finished_run_that_was_made_with_other_settings_is_refused(
@@ -190,19 +220,28 @@ def test_a_finished_run_that_was_made_with_other_settings_is_refused(
     folder = write_study(tmp_path / "s", what)
     change_config(folder.run(what.runs()[2]).path, change)
     before = (folder.root / "study.json").read_bytes()
-    with pytest.raises(FileExistsError, match=f"{what.runs()[2].name} has other settings, .*{message}"):
-        carry_out(small_study(settings={"pqn": {"lam": 0.65}}, seeds=3), folder.root, Fabricator(what))
+    with pytest.raises(
+        FileExistsError, match=f"{what.runs()[2].name} has other settings, .*{message}"
+    ):
+        carry_out(
+            small_study(settings={"pqn": {"lam": 0.65}}, seeds=3), folder.root, Fabricator(what)
+        )
     assert (folder.root / "study.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        lambda config: config.update(device="cuda:1", threads=4, compile=True, cuda_graphs=True, logger="wandb"),
+        lambda config: config.update(
+            device="cuda:1", threads=4, compile=True, cuda_graphs=True, logger="wandb"
+        ),
         lambda config: config.update(eval_every=512, eval_episodes=7, checkpoint_every=0),
         lambda config: config.update(env="MineSweeperEasy-v0"),  # as `train` pins it
         lambda config: config["ppo"].update(clip=0.7),  # another algorithm's
-        lambda config: (config["pqn"].pop("bootstrap"), config.pop("amp")),  # from before there were these fields
+        lambda config: (
+            config["pqn"].pop("bootstrap"),
+            config.pop("amp"),
+        ),  # from before there were these fields
     ],
 )
 def test_what_does_not_change_a_result_lets_a_study_go_on(
@@ -230,7 +269,9 @@ def test_two_shards_may_begin_at_once(tmp_path: Path, monkeypatch: pytest.Monkey
     assert StudyFolder(root).load() == what and not other
 
 
-def test_versions_of_the_first_runs_stay_on_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_of_the_first_runs_stay_on_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = StudyFolder(tmp_path / "s")
     folder.claim(small_study(), "first")
     before = folder.record()["versions"]
@@ -251,7 +292,11 @@ def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
     return found
 
 
-RUN_CONFIG = (sys.executable, "-c", "import pathlib, sys; exec(pathlib.Path(sys.argv[3]).read_text())")
+RUN_CONFIG = (
+    sys.executable,
+    "-c",
+    "import pathlib, sys; exec(pathlib.Path(sys.argv[3]).read_text())",
+)
 
 
 def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_path: Path) -> None:
@@ -267,7 +312,9 @@ def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_pa
 def test_one_episode_has_no_deviation(tmp_path: Path) -> None:
     folder = write_study(tmp_path / "s", small_study())
     file = folder.run(small_study().runs()[0]).path / "eval.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"returns": [0.5], "lengths": [3], "mean": 0.5}))
+    file.write_text(
+        json.dumps(json.loads(file.read_text()) | {"returns": [0.5], "lengths": [3], "mean": 0.5})
+    )
     folder.write_results(small_study())
     row = read_csv(folder.root / "results.csv")[0]
     assert (row["eval_mean"], row["eval_std"], row["eval_n"]) == ("0.5", "", "1")
@@ -275,7 +322,11 @@ def test_one_episode_has_no_deviation(tmp_path: Path) -> None:
 
 def test_sizes_are_an_axis_of_their_own_that_the_memory_free_agent_does_not_have() -> None:
     what = small_study(sizes=["1x64", "2x128"], seeds=1)
-    assert [run.agent for run in what.runs() if run.observability == "full"] == ["mingru 1x64", "mingru 2x128", "mlp"]
+    assert [run.agent for run in what.runs() if run.observability == "full"] == [
+        "mingru 1x64",
+        "mingru 2x128",
+        "mlp",
+    ]
     run = what.runs()[2]
     assert run.name == "MineSweeperEasy__full__mingru-2x128__pqn__seed0"
     assert what.config(run).network_options == {"layers": 2, "hidden_size": 128}
@@ -305,7 +356,9 @@ def test_a_damaged_record_of_the_study_is_written_anew(tmp_path: Path) -> None:
 def test_a_study_killed_while_it_wrote_its_first_file_is_begun_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The half file was called otherwise than the folder expected, and the folder was refused as somebody else's."""
+    """The half file was called otherwise than the folder expected, and the folder was refused as
+    somebody else's.
+    """
     what, root = small_study(), tmp_path / "s"
 
     def interrupted(*paths: Path) -> None:
@@ -332,7 +385,11 @@ def test_worker_processes_run_side_by_side_and_report_how_they_ended(tmp_path: P
         (here / "NAME").touch()
         while len(list(here.glob("up*"))) < 2: time.sleep(0.02)
     """
-    texts = [wait.replace("NAME", "up0"), wait.replace("NAME", "up1"), "raise SystemExit('broken: no disk')"]
+    texts = [
+        wait.replace("NAME", "up0"),
+        wait.replace("NAME", "up1"),
+        "raise SystemExit('broken: no disk')",
+    ]
     results = {result.name: result for result in python_engine().run(jobs(tmp_path, *texts))}
     assert [results[f"job{i}"].error for i in range(3)] == ["", "", "broken: no disk"]
 
@@ -343,7 +400,9 @@ def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin")
-def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_worker_has_a_core_of_its_own_and_one_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cores = available_cores()[:2]
     monkeypatch.setattr(engines, "available_cores", lambda: cores)
     text = f"""
@@ -358,7 +417,9 @@ def test_each_worker_has_a_core_of_its_own_and_one_thread(tmp_path: Path, monkey
     """
     count = len(cores)
     text = text.replace("COUNT", str(count))
-    assert all(result.error == "" for result in python_engine(count).run(jobs(tmp_path, *[text] * count)))
+    assert all(
+        result.error == "" for result in python_engine(count).run(jobs(tmp_path, *[text] * count))
+    )
     assert len(list(tmp_path.glob("core-*-1"))) == count
 
 
@@ -368,7 +429,9 @@ def test_only_a_study_that_takes_all_cores_gives_each_run_its_own(
     """Two studies of one worker each were both pinned to the first core."""
     pinned: list[set[int]] = []
     monkeypatch.setattr(engines, "available_cores", lambda: [3, 7])
-    monkeypatch.setattr(os, "sched_setaffinity", lambda process, cores: pinned.append(cores), raising=False)
+    monkeypatch.setattr(
+        os, "sched_setaffinity", lambda process, cores: pinned.append(cores), raising=False
+    )
     for workers, wanted in ((1, [{3, 7}] * 2), (3, [{3, 7}] * 2), (2, [{3}, {7}]), (0, [{3}, {7}])):
         list(Processes(workers, program=("true",), poll_s=0.01).run(jobs(tmp_path, "", "")))
         assert pinned == wanted
@@ -416,7 +479,8 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
     inner = (
         "import time, pathlib, signal, sys\n"
         "from arcade_torch.tools.studies.engines import watch_parent\n"
-        f"signal.signal(signal.SIGTERM, lambda *_: (pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
+        "signal.signal(signal.SIGTERM, lambda *_: "
+        f"(pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
         "watch_parent(every_s=0.05)\n"
         f"pathlib.Path({str(tmp_path / 'up')!r}).touch()\n"
         "time.sleep(120)\n"
@@ -427,7 +491,9 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
         f"subprocess.Popen([sys.executable, '-c', {inner!r}])\n"
         "time.sleep(120)\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", outer], cwd=Path(__file__).resolve().parents[2])
+    process = subprocess.Popen(
+        [sys.executable, "-c", outer], cwd=Path(__file__).resolve().parents[2]
+    )
     deadline = time.monotonic() + 100
     while not (tmp_path / "up").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -447,7 +513,11 @@ def test_inline_runs_one_after_the_other_and_survives_exceptions(
 
     monkeypatch.setattr(Job, "train", train)
     parts = jobs(tmp_path, "", "", "")
-    assert [result.error for result in Inline().run(parts)] == ["", "RuntimeError: broken badly", ""]
+    assert [result.error for result in Inline().run(parts)] == [
+        "",
+        "RuntimeError: broken badly",
+        "",
+    ]
     assert "in train\n" in parts[1].log.read_text() and not parts[0].log.exists()
 
 
@@ -496,22 +566,37 @@ def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
 
 
 def test_numbers_of_a_learner_are_given_to_its_own_runs_only() -> None:
-    what = small_study(algorithms=("pqn", "ppo"), settings={"pqn": {"gamma": 0.9}, "ppo": {"clip": 0.1}})
+    what = small_study(
+        algorithms=("pqn", "ppo"), settings={"pqn": {"gamma": 0.9}, "ppo": {"clip": 0.1}}
+    )
     for run in what.runs():
         config, usual = what.config(run), small_study().config(run)
-        assert (config.pqn.gamma == 0.9, config.ppo.clip == 0.1) == (run.algorithm == "pqn", run.algorithm == "ppo")
+        assert (config.pqn.gamma == 0.9, config.ppo.clip == 0.1) == (
+            run.algorithm == "pqn",
+            run.algorithm == "ppo",
+        )
         assert config.learner != usual.learner
 
 
 def test_options_of_a_preset_stay_where_a_study_gives_others() -> None:
-    what = small_study(preset="reference", sizes=["1x64"], total_frames=10**6, settings={"env_options": {"noise": 1}})
+    what = small_study(
+        preset="reference",
+        sizes=["1x64"],
+        total_frames=10**6,
+        settings={"env_options": {"noise": 1}},
+    )
     config = what.config(what.runs()[0])
     assert config.network_options == {"skip": "none", "layers": 1, "hidden_size": 64}
     assert config.env_options == {"noise": 1}
 
 
-def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    for settings, message in (({"gama": 1}, "unknown field 'gama'"), ({"pqn": {"lam": 7}}, "pqn.lam")):
+def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(
+    tmp_path: Path,
+) -> None:
+    for settings, message in (
+        ({"gama": 1}, "unknown field 'gama'"),
+        ({"pqn": {"lam": 7}}, "pqn.lam"),
+    ):
         with pytest.raises(ValueError, match=message):
             study(small_study(settings=settings), tmp_path / "s", "inline")
     assert not (tmp_path / "s").exists()
@@ -520,9 +605,13 @@ def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(tmp
 def test_shards_share_the_runs_out_and_each_knows_the_results_of_all(tmp_path: Path) -> None:
     what, root = small_study(), tmp_path / "s"
     parts = [Fabricator(what) for _ in range(3)]
-    results = [study(what, root, e, stream=io.StringIO(), shard=f"{i + 1}/3") for i, e in enumerate(parts)]
+    results = [
+        study(what, root, e, stream=io.StringIO(), shard=f"{i + 1}/3") for i, e in enumerate(parts)
+    ]
     assert [result.finished for result in results] == [3, 6, 8]
-    assert sorted(name for part in parts for name in part.done) == sorted(run.name for run in what.runs())
+    assert sorted(name for part in parts for name in part.done) == sorted(
+        run.name for run in what.runs()
+    )
     for wrong in ("0/3", "4/3", "3", "a/b", "1/0"):
         with pytest.raises(ValueError, match="a shard is written 3/10, the third of ten"):
             planned(what, wrong)

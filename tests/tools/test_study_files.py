@@ -1,4 +1,6 @@
-"""Files of a study and of an analysis that somebody else made: nothing is waited for, nothing outside is written."""
+"""Files of a study and of an analysis that somebody else made: nothing is waited for, nothing
+outside is written.
+"""
 
 import os
 from pathlib import Path
@@ -14,7 +16,9 @@ from arcade_torch.tools.studies.grid import MOST_BYTES, Study
 
 
 def job(folder: Path) -> Job:
-    return Job("run", folder / "configs" / "run.json", folder / "runs" / "run", folder / "logs" / "run.log")
+    return Job(
+        "run", folder / "configs" / "run.json", folder / "runs" / "run", folder / "logs" / "run.log"
+    )
 
 
 @pytest.mark.timeout(20)
@@ -52,7 +56,9 @@ class Returned:
         return "", "", self.files
 
 
-@pytest.mark.parametrize("name", ["../evil", "../../evil", "a/../../evil", "{outside}/evil", "", ".", "a\0b"])
+@pytest.mark.parametrize(
+    "name", ["../evil", "../../evil", "a/../../evil", "{outside}/evil", "", ".", "a\0b"]
+)
 def test_files_that_travel_back_stay_in_the_folder_of_their_run(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "study"
     returned: Any = Returned({"eval.json": b"{}", name.format(outside=tmp_path): b"x"})
@@ -73,7 +79,9 @@ def test_files_do_not_travel_back_through_a_link(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(30)
 def test_only_regular_files_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pipe in the folder of a run, and a link to a file of the machine, are left where they are."""
+    """A pipe in the folder of a run, and a link to a file of the machine, are left where they
+    are.
+    """
     monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path))
     secret = tmp_path / "secret"
     secret.write_text("mine")

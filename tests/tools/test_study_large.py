@@ -67,7 +67,9 @@ def test_a_study_reads_each_run_a_few_times_however_many_there_are(
     what = small_study(seeds=seeds)
     study(what, tmp_path / "s", Fabricator(what, stop_after=10**6), stream=io.StringIO())
     assert reads["eval.json"] <= 6 * len(what.runs())
-    assert [row["status"] for row in read_csv(tmp_path / "s" / "results.csv")] == ["finished"] * len(what.runs())
+    assert [row["status"] for row in read_csv(tmp_path / "s" / "results.csv")] == [
+        "finished"
+    ] * len(what.runs())
 
 
 def test_the_table_is_whole_when_a_study_is_interrupted(tmp_path: Path) -> None:
@@ -109,19 +111,27 @@ def test_work_takes_its_share_of_the_time_however_long_it_is() -> None:
 
 
 def test_configs_of_many_seeds_are_those_of_each_alone() -> None:
-    what = small_study(algorithms=["pqn", "ppo"], sizes=["1x64"], seeds=3, settings={"pqn": {"gamma": 0.9}})
+    what = small_study(
+        algorithms=["pqn", "ppo"], sizes=["1x64"], seeds=3, settings={"pqn": {"gamma": 0.9}}
+    )
     configs = what.configs(what.runs())
     assert configs == {run: what.config(run) for run in what.runs()}
     with pytest.raises(ValueError, match="seed must be in"):
         small_study(seeds=[0, 2**31]).configs(small_study(seeds=[0, 2**31]).runs())
 
 
-def test_a_dry_run_of_ten_thousand_seeds_ends_soon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_of_ten_thousand_seeds_ends_soon(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "many.toml"
-    file.write_text('games = "CartPoleEasy"\nmemories = ["mingru", "mlp"]\nseeds = 10000\npreset = "smoke"\n')
+    file.write_text(
+        'games = "CartPoleEasy"\nmemories = ["mingru", "mlp"]\nseeds = 10000\npreset = "smoke"\n'
+    )
     start_s = time.perf_counter()
     assert cli.main(["study", str(file), "--dry-run"]) == 0
-    assert time.perf_counter() - start_s < 20  # 4 s on a core of 2026; one config at a time takes 20 and more
+    assert (
+        time.perf_counter() - start_s < 20
+    )  # 4 s on a core of 2026; one config at a time takes 20 and more
     said = capsys.readouterr()
     assert said.out.count("\n") == 40_000 and "40,000 runs" in said.err
 

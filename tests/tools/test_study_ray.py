@@ -1,4 +1,6 @@
-"""Runs on a Ray cluster: what the engine makes of lost workers and foreign disks, and the real thing."""
+"""Runs on a Ray cluster: what the engine makes of lost workers and foreign disks, and the real
+thing.
+"""
 
 import io
 import os
@@ -64,7 +66,9 @@ def some_jobs(tmp_path: Path, count: int = 3) -> list[Job]:
     found = []
     for name in (f"run{index}" for index in range(count)):
         (tmp_path / f"{name}.json").write_text(f'{{"name": "{name}"}}')
-        found.append(Job(name, tmp_path / f"{name}.json", tmp_path / "runs" / name, tmp_path / f"{name}.log"))
+        found.append(
+            Job(name, tmp_path / f"{name}.json", tmp_path / "runs" / name, tmp_path / f"{name}.log")
+        )
     return found
 
 
@@ -81,7 +85,9 @@ def test_ray_places_all_runs_itself_and_workers_limits_them(tmp_path: Path) -> N
     assert asked == {"num_cpus": 2, "num_gpus": 0, "max_retries": 7, "max_calls": 1}
 
 
-def test_a_failed_run_leaves_its_reason_and_traceback_and_a_lost_worker_is_named(tmp_path: Path) -> None:
+def test_a_failed_run_leaves_its_reason_and_traceback_and_a_lost_worker_is_named(
+    tmp_path: Path,
+) -> None:
     def do(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         if job.name == "run0":
             raise RayError("the machine\nis gone")
@@ -120,7 +126,12 @@ def test_a_cluster_that_is_gone_is_said_to_be_gone_and_results_are_kept(tmp_path
 @pytest.fixture
 def _small_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def train(job: Job) -> None:
-        names = ("eval.json", "checkpoints/frames-1/weights.safetensors", "checkpoints/frames-1/trainer.pt", "lock")
+        names = (
+            "eval.json",
+            "checkpoints/frames-1/weights.safetensors",
+            "checkpoints/frames-1/trainer.pt",
+            "lock",
+        )
         for name in (*names, "replay/x"):
             (job.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (job.folder / name).write_text(str(job.config.read_bytes()))
@@ -153,7 +164,9 @@ def test_where_the_disk_is_not_shared_the_small_files_travel_back(tmp_path: Path
 def test_a_failed_run_leaves_its_checkpoints_where_it_was_carried_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without the trainer's state they came home as checkpoints that no attempt could go on from."""
+    """Without the trainer's state they came home as checkpoints that no attempt could go on
+    from.
+    """
     whole = Job.train
 
     def fails(job: Job) -> None:
@@ -164,7 +177,9 @@ def test_a_failed_run_leaves_its_checkpoints_where_it_was_carried_out(
 
     monkeypatch.setattr(Job, "train", fails)
     (job,) = some_jobs(tmp_path, 1)
-    error, _, files = carry_out(job._replace(config=tmp_path / "nowhere.json"), job.config.read_bytes())
+    error, _, files = carry_out(
+        job._replace(config=tmp_path / "nowhere.json"), job.config.read_bytes()
+    )
     assert error == "RuntimeError: a bad day" and list(files) == ["metrics.csv"]
     assert len(list((tmp_path / "far").rglob("trainer.pt"))) == 1  # another attempt there goes on
 
@@ -185,13 +200,19 @@ def test_a_study_on_a_cluster_of_its_own_equals_one_in_this_process_and_listens_
         return wait(*args, **options)
 
     engine = Ray()
-    engine.module = SimpleNamespace(**{name: getattr(ray, name) for name in dir(ray)} | {"wait": spy})
+    engine.module = SimpleNamespace(
+        **{name: getattr(ray, name) for name in dir(ray)} | {"wait": spy}
+    )
     results = study(what, tmp_path / "ray", engine, stream=io.StringIO())
     assert results.finished == 2 and not ray.is_initialized()
     assert study(what, tmp_path / "inline", "inline", stream=io.StringIO()).finished == 2
-    assert (tmp_path / "ray/results.csv").read_bytes() == (tmp_path / "inline/results.csv").read_bytes()
+    assert (tmp_path / "ray/results.csv").read_bytes() == (
+        tmp_path / "inline/results.csv"
+    ).read_bytes()
     if Path("/proc/net/tcp").exists():
-        assert len(listening) > 3 and all(is_loopback(address) for address in listening), set(listening)
+        assert len(listening) > 3 and all(is_loopback(address) for address in listening), set(
+            listening
+        )
 
 
 def is_loopback(address: str) -> bool:

@@ -1,4 +1,6 @@
-"""What a study's own report would refuse is refused before anything runs; a report that fails can be written again."""
+"""What a study's own report would refuse is refused before anything runs; a report that fails can
+be written again.
+"""
 
 import codecs
 import os
@@ -21,14 +23,32 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"games": ["SignpostEasy", "SignpostEasy-v0"]}, "SignpostEasy, SignpostEasy-v0 are one game"),
-        ({"games": ["NoisyCartPoleEasy", "NoisyPoleEasy"]}, "NoisyCartPoleEasy, NoisyPoleEasy are one game"),
+        (
+            {"games": ["SignpostEasy", "SignpostEasy-v0"]},
+            "SignpostEasy, SignpostEasy-v0 are one game",
+        ),
+        (
+            {"games": ["NoisyCartPoleEasy", "NoisyPoleEasy"]},
+            "NoisyCartPoleEasy, NoisyPoleEasy are one game",
+        ),
         ({"games": ["NoisyCartPoleEasy-v0", "TetrisEasy", "NoisyPoleEasy-v0"]}, "are one game"),
-        ({"memories": ["mlp", "fart", "linear_transformer"]}, "fart, linear_transformer are one memory model"),
-        ({"baseline": "gru"}, "baseline = 'gru' is none of the agents that this study trains, mingru, mlp"),
+        (
+            {"memories": ["mlp", "fart", "linear_transformer"]},
+            "fart, linear_transformer are one memory model",
+        ),
+        (
+            {"baseline": "gru"},
+            "baseline = 'gru' is none of the agents that this study trains, mingru, mlp",
+        ),
         ({"baseline": ""}, "baseline = '' is none"),
-        ({"baseline": "pqn-mlp"}, "baseline = 'pqn-mlp' is none of the agents that this study trains"),
-        ({"baseline": "ppo-gru", "algorithms": ["pqn", "ppo"]}, "this study trains, pqn-mingru, pqn-mlp, ppo-mingru"),
+        (
+            {"baseline": "pqn-mlp"},
+            "baseline = 'pqn-mlp' is none of the agents that this study trains",
+        ),
+        (
+            {"baseline": "ppo-gru", "algorithms": ["pqn", "ppo"]},
+            "this study trains, pqn-mingru, pqn-mlp, ppo-mingru",
+        ),
         ({"memories": ["mlp", "mlp"]}, "memories names something twice"),
         ({"seeds": [0, 1, 1.0]}, "seeds names something twice"),
         ({"observability": ["full", "full"]}, "observability names something twice"),
@@ -63,16 +83,23 @@ def test_ready_made_studies_are_planned() -> None:
         assert planned(study_preset(name), "1/50")
 
 
-def test_a_baseline_that_a_file_asks_for_is_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_baseline_that_a_file_asks_for_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "one.toml"
     file.write_text(TOML.replace('"mlp", ', "") + 'baseline = "mlp"\n')
     assert cli.main(["study", str(file), "--out", str(tmp_path / "s")]) == 2
     said = capsys.readouterr().err
-    assert "baseline = 'mlp' is none of the agents that this study trains, lru" in said and said.count("\n") == 1
+    assert (
+        "baseline = 'mlp' is none of the agents that this study trains, lru" in said
+        and said.count("\n") == 1
+    )
     assert not (tmp_path / "s").exists()
 
 
-def test_a_finished_run_that_the_report_could_not_read_is_refused_at_the_start(tmp_path: Path) -> None:
+def test_a_finished_run_that_the_report_could_not_read_is_refused_at_the_start(
+    tmp_path: Path,
+) -> None:
     folder = write_study(tmp_path / "s", small_study())
     run = folder.run(small_study().runs()[1]).path
     change_config(run, lambda config: config.update(memory=""))
@@ -102,7 +129,9 @@ def test_a_study_in_another_encoding_is_refused_in_one_line(
     assert "other.toml is not TOML" in said and said.count("\n") == 1
 
 
-def test_what_is_no_regular_file_is_no_study(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_regular_file_is_no_study(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     large = tmp_path / "large.toml"
     with large.open("wb") as stream:
@@ -113,9 +142,15 @@ def test_what_is_no_regular_file_is_no_study(tmp_path: Path, capsys: pytest.Capt
         assert ("not a regular file" in said or "bytes" in said) and said.count("\n") == 1
 
 
-@pytest.mark.parametrize(("error", "code"), [(ValueError("out of paper"), 1), (OSError(5, "Input/output error"), 1)])
+@pytest.mark.parametrize(
+    ("error", "code"), [(ValueError("out of paper"), 1), (OSError(5, "Input/output error"), 1)]
+)
 def test_a_report_that_fails_says_how_to_write_it_again(
-    error: Exception, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fails(*args: object, **how: object) -> None:
         raise error
@@ -124,7 +159,9 @@ def test_a_report_that_fails_says_how_to_write_it_again(
     monkeypatch.setattr(command, "make_engine", lambda *words: Fabricator(what))
     monkeypatch.setattr(Inline, "run", None)
     file = tmp_path / "toy.toml"
-    file.write_text('games = "MineSweeperEasy"\nmemories = ["mingru", "mlp"]\nseeds = 2\npreset = "smoke"\n')
+    file.write_text(
+        'games = "MineSweeperEasy"\nmemories = ["mingru", "mlp"]\nseeds = 2\npreset = "smoke"\n'
+    )
     file.write_text(file.read_text() + "total_frames = 2048\n")
     root = tmp_path / "s"
     with monkeypatch.context() as broken:
@@ -132,7 +169,10 @@ def test_a_report_that_fails_says_how_to_write_it_again(
         assert cli.main(["study", str(file), "--out", str(root)]) == code
     said = capsys.readouterr()
     assert "8 of 8 runs finished" in said.out
-    assert f"the runs are kept, their report failed; write it again with: arcade-torch report {root}" in said.err
+    assert (
+        f"the runs are kept, their report failed; write it again with: arcade-torch report {root}"
+        in said.err
+    )
     skip = ["--skip", "saliency", "recall", "contamination", "references"]
     assert cli.main(["report", str(root), *skip]) == 0
     assert (root / "report.html").exists()

@@ -40,7 +40,9 @@ def assert_harmless(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", OBEYED)
-def test_what_a_terminal_would_obey_is_written_out(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_terminal_would_obey_is_written_out(
+    text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert_harmless(printable(text))
     assert printable(text) != text and printable(printable(text)) == printable(text)
     say(text)
@@ -67,9 +69,13 @@ def test_markup_is_shown_and_not_carried_out(text: str, capsys: pytest.CaptureFi
     assert stream.getvalue().count(text) == 3
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+x", "-x", "@SUM(A1)", '=HYPERLINK("x")', "\t=1", "\r=1", "--", "+"])
+@pytest.mark.parametrize(
+    "text", ["=1+1", "+x", "-x", "@SUM(A1)", '=HYPERLINK("x")', "\t=1", "\r=1", "--", "+"]
+)
 def test_no_cell_of_a_table_is_a_formula(text: str) -> None:
-    rows = list(csv.reader(io.StringIO(csv_text([{"agent": text, text: 1}, {"agent": Path(text)}]))))
+    rows = list(
+        csv.reader(io.StringIO(csv_text([{"agent": text, text: 1}, {"agent": Path(text)}])))
+    )
     assert len(rows) == 3
     for cell in (rows[0][1], rows[1][0], rows[2][0]):
         assert cell[0] not in "=+-@\t\r\n", cell

@@ -1,4 +1,6 @@
-"""Windows of experience: they end where the ending action was chosen, and replaying them gives what was acted."""
+"""Windows of experience: they end where the ending action was chosen, and replaying them gives what
+was acted.
+"""
 
 from typing import Any
 
@@ -23,9 +25,13 @@ class Scripted:
         self.actions = actions
 
     def initial_state(self, batch_size: int) -> TensorDict:
-        return TensorDict({"count": torch.zeros(batch_size, dtype=torch.int64)}, batch_size=[batch_size])
+        return TensorDict(
+            {"count": torch.zeros(batch_size, dtype=torch.int64)}, batch_size=[batch_size]
+        )
 
-    def act(self, obs: Any, state: TensorDict) -> tuple[torch.Tensor, dict[str, torch.Tensor], TensorDict]:
+    def act(
+        self, obs: Any, state: TensorDict
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor], TensorDict]:
         count = state["count"]
         action = torch.tensor([self.actions[int(count) % len(self.actions)]])
         return action, {}, TensorDict({"count": count + 1}, batch_size=[1])
@@ -75,7 +81,9 @@ def test_the_end_of_an_episode_can_be_kept_alone_with_the_state_before_it(env: A
 def test_the_saliency_of_a_kept_end_is_that_of_the_whole_episode(env: Any, agent: Agent) -> None:
     whole = greedy_window(agent, env, seed=3, max_steps=12)
     (end,), _ = play(agent, env, seed=3, keep=4, max_steps=12, first=[whole.n - 3])
-    full, part = (saliency(agent, w.frames, w.last_action, w.is_init, w.state) for w in (whole, end))
+    full, part = (
+        saliency(agent, w.frames, w.last_action, w.is_init, w.state) for w in (whole, end)
+    )
     np.testing.assert_allclose(part.output, full.output, atol=1e-5)
     np.testing.assert_allclose(part.maps, full.maps[-4:], rtol=1e-3, atol=1e-6 * full.maps.max())
 
@@ -84,7 +92,9 @@ def test_replaying_a_window_gives_the_values_that_were_acted_on(env: Any, agent:
     window = greedy_window(agent, env, seed=1, max_steps=12)
     with torch.no_grad():
         features = agent.network.encode(window.frames[None])
-        q, _ = agent.network.remember(features, window.last_action[None], window.is_init[None], agent.initial_state(1))
+        q, _ = agent.network.remember(
+            features, window.last_action[None], window.is_init[None], agent.initial_state(1)
+        )
     assert torch.equal(q[0].argmax(-1), window.action)
     found = saliency(agent, window.frames, window.last_action, window.is_init, window.state)
     np.testing.assert_allclose(
@@ -93,5 +103,7 @@ def test_replaying_a_window_gives_the_values_that_were_acted_on(env: Any, agent:
 
 
 def test_a_batch_of_several_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"the batch size of env must be \[1\], for one episode; got \[2\]"):
+    with pytest.raises(
+        ValueError, match=r"the batch size of env must be \[1\], for one episode; got \[2\]"
+    ):
         greedy_window(Scripted([0]), arcade_torch.make(GAME, num_envs=2))

@@ -34,7 +34,8 @@ def mean_over_tasks(cells: Sequence[Array]) -> Array:
 
 
 def iqm(cells: Sequence[Array]) -> Array:
-    """Interquartile mean: the mean of the middle half of all runs of all tasks; [..., n_seeds] a task to [...].
+    """Interquartile mean: the mean of the middle half of all runs of all tasks; [..., n_seeds] a
+    task to [...].
 
     Source: Agarwal et al. (2021), arXiv 2108.13264.
     """
@@ -43,8 +44,12 @@ def iqm(cells: Sequence[Array]) -> Array:
     return np.asarray(runs[..., cut : runs.shape[-1] - cut].mean(axis=-1))
 
 
-def percentile_interval(value: Any, draws: Array, confidence: float, known: bool = True) -> Interval:
-    """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, or if not ``known``."""
+def percentile_interval(
+    value: Any, draws: Array, confidence: float, known: bool = True
+) -> Interval:
+    """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, or
+    if not ``known``.
+    """
     if not known or not len(draws):
         return Interval(float(value), float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
@@ -52,7 +57,9 @@ def percentile_interval(value: Any, draws: Array, confidence: float, known: bool
 
 
 class Pooled(NamedTuple):
-    """Values of every seed [n_seeds, ...], their mean and the ends of its percentile interval, each [...]."""
+    """Values of every seed [n_seeds, ...], their mean and the ends of its percentile interval, each
+    [...].
+    """
 
     seeds: Array
     mean: Array
@@ -60,14 +67,18 @@ class Pooled(NamedTuple):
     high: Array
 
 
-def pooled(values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0) -> Pooled:
+def pooled(
+    values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0
+) -> Pooled:
     """Pool the arrays of some seeds, cell by cell.
 
-    NaN is a seed without a value. The ends are NaN where fewer than two seeds have one, the mean where none has.
+    NaN is a seed without a value. The ends are NaN where fewer than two seeds have one, the mean
+    where none has.
     """
 
     def cell(seeds: Array) -> Array:
-        known = np.sort(seeds[np.isfinite(seeds)])  # the same interval in whatever order the seeds come
+        # the same interval in whatever order the seeds come
+        known = np.sort(seeds[np.isfinite(seeds)])
         if known.size < 2:
             return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
         drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
@@ -86,11 +97,13 @@ def measured_coverage(
     draws: int = 500,
     seed: int = 0,
 ) -> float:
-    """Share of simulated studies whose interval for Gap holds the true Gap, with a standard error of about 0.01.
+    """Share of simulated studies whose interval for Gap holds the true Gap, with a standard error
+    of about 0.01.
 
-    Scores are standard Gaussian in the simulation, the same spread in every task, of which ``mdp_seeds`` and
-    ``pomdp_seeds`` have the numbers of seeds. With few seeds the share is well below the nominal confidence; a report
-    says so beside its intervals. Large studies are simulated less often, so that this takes about a second.
+    Scores are standard Gaussian in the simulation, the same spread in every task, of which
+    ``mdp_seeds`` and ``pomdp_seeds`` have the numbers of seeds. With few seeds the share is well
+    below the nominal confidence; a report says so beside its intervals. Large studies are simulated
+    less often, so that this takes about a second.
     """
     rng = np.random.default_rng(seed)
     cost = draws * sum(mdp_seeds + pomdp_seeds)
@@ -100,7 +113,11 @@ def measured_coverage(
         for count in np.minimum(counts, 200):  # more hardly change the share, but take gigabytes
             scores = rng.standard_normal((simulations, count))
             picks = rng.integers(count, size=(simulations, draws * count))
-            means = np.take_along_axis(scores, picks, axis=1).reshape(simulations, draws, count).mean(axis=2)
+            means = (
+                np.take_along_axis(scores, picks, axis=1)
+                .reshape(simulations, draws, count)
+                .mean(axis=2)
+            )
             gaps += sign * means / len(counts)
     ends = np.quantile(gaps, [(1 - confidence) / 2, (1 + confidence) / 2], axis=1)
     return float(np.mean((ends[0] <= 0) & (ends[1] >= 0)))

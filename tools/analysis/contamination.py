@@ -1,15 +1,17 @@
 """State contamination: what one disturbed past observation does to the decisions after it.
 
-A greedy trajectory is recorded; frame j is replaced by itself plus noise (on the [0, 1] scale of pixels), the memory
-replays it, and k steps later the outputs are compared with those of the undisturbed replay. A memory-free agent is
-untouched for k >= 1; noise on the decision's own frame (k = 0) is the ceiling. ``shuffle`` permutes early frames
-instead, each of which stays a frame that training has seen.
+A greedy trajectory is recorded; frame j is replaced by itself plus noise (on the [0, 1] scale of
+pixels), the memory replays it, and k steps later the outputs are compared with those of the
+undisturbed replay. A memory-free agent is untouched for k >= 1; noise on the decision's own frame
+(k = 0) is the ceiling. ``shuffle`` permutes early frames instead, each of which stays a frame that
+training has seen.
 
-By default the recorded actions and start flags are replayed (teacher forcing), so that nothing but the observation
-reaches the memory; with ``feedback`` the previous action is the replay's own, as in the published code.
+By default the recorded actions and start flags are replayed (teacher forcing), so that nothing but
+the observation reaches the memory; with ``feedback`` the previous action is the replay's own, as in
+the published code.
 
-Source: POPGym Arcade (ICML 2026), recurrent state contamination. Its code adds noise of standard deviation 1 to pixels
-in 0..255, which is sigma = 1/255 here.
+Source: POPGym Arcade (ICML 2026), recurrent state contamination. Its code adds noise of standard
+deviation 1 to pixels in 0..255, which is sigma = 1/255 here.
 """
 
 from collections.abc import Sequence
@@ -25,14 +27,23 @@ from arcade_torch.agents.config import require
 from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.tools.analysis.bootstrap import Array
 from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_windows, play, resolve_agent
+from arcade_torch.tools.analysis.windows import (
+    MAX_STEPS,
+    Twin,
+    Window,
+    greedy_windows,
+    play,
+    resolve_agent,
+)
 
 Ints = NDArray[np.int64]
 
 SIGMAS = (0.1, 0.3, 1.0)  # on the [0, 1] scale of pixels
 DELAYS = (0, 1, 2, 5, 10, 20, 50, 100)  # steps
 POINTS_AN_EPISODE = 4
-FIRST, LAST = 1, 10  # a shuffle permutes the frames behind the first of these, up to the last
+# a shuffle permutes the frames behind the first of these, up to the last
+FIRST = 1
+LAST = 10
 WHITE = 255.0  # pixel value that stands for 1
 
 
@@ -43,7 +54,8 @@ class Contamination:
     sigmas: Array  # float64 [S]; one NaN for shuffled frames
     delays: Ints  # int64 [K], steps from the disturbance (its last frame) to the decision
     flip: Array  # float64 [P, S, K], 1 where the best action changed
-    change: Array  # float64 [P, S, K], ``||A' - A||_inf / (max A - min A)`` with A the outputs minus their mean
+    # float64 [P, S, K], ``||A' - A||_inf / (max A - min A)`` with A the outputs minus their mean
+    change: Array
     kl: Array  # float64 [P, S, K], KL(pi || pi') in nats for policies; NaN for Q-values
     points: Ints  # int64 [P, 2], trajectory and index of the disturbed frame
     clean_error: float  # largest difference that replacing a frame by itself made to any output
@@ -80,15 +92,18 @@ def contamination(
     """Noise on one past observation, for a grid of strengths and delays.
 
     Args:
-        agent: as for `recall_density`, and so are ``env``, ``observability``, ``cap`` and ``target``.
+        agent: as for `recall_density`, and so are ``env``, ``observability``, ``cap`` and
+            ``target``.
         sigmas: standard deviations of Gaussian noise on the [0, 1] scale; all share the same draw.
         delays: steps from the disturbed frame to the decision.
-        starts: disturbed frames P, at most four an episode, drawn uniformly from the frames before its last.
+        starts: disturbed frames P, at most four an episode, drawn uniformly from the frames before
+            its last.
         clip: keep noisy pixels in their range (the published code does not).
         feedback: let the replay choose the previous actions itself.
-        shuffle: permute frames 2 to 10 in place of adding noise, once a trajectory; actions and start flags stay in
-            their order, delays count from frame 10, ``sigmas`` becomes one NaN. On a POMDP another order may rightly
-            change what the agent believes: draw conclusions on MDPs only.
+        shuffle: permute frames 2 to 10 in place of adding noise, once a trajectory; actions and
+            start flags stay in their order, delays count from frame 10, ``sigmas`` becomes one NaN.
+            On a POMDP another order may rightly change what the agent believes: draw conclusions on
+            MDPs only.
         seed: of episodes, start points and noise.
         progress: called with (start points done, starts).
 
@@ -103,12 +118,21 @@ def contamination(
     require(starts >= 1, "starts", starts, "at least 1")
     player, env = resolve_agent(agent, env, observability)
     if (what := resolve(player, target)) == "value":
-        raise ValueError("contamination compares actions: target must be q, logits or probs, not value")
-    strengths, steps = np.array([np.nan] if shuffle else sigmas, np.float64), np.unique(np.array(delays, np.int64))
+        raise ValueError(
+            "contamination compares actions: target must be q, logits or probs, not value"
+        )
+    strengths = np.array([np.nan] if shuffle else sigmas, np.float64)
+    steps = np.unique(np.array(delays, np.int64))
     per_window, shortest = (1, LAST + 1) if shuffle else (POINTS_AN_EPISODE, 2)
-    policy, parts, points = policy_of(player), list[tuple[Array, ...]](), list[tuple[int, int]]()
-    skipped, error, rng = 0, 0.0, np.random.default_rng([seed, 1])
-    windows = greedy_windows(player, env, episodes=4 * -(-starts // per_window) + 16, seed=seed, cap=cap)
+    policy = policy_of(player)
+    parts = list[tuple[Array, ...]]()
+    points = list[tuple[int, int]]()
+    skipped = 0
+    error = 0.0
+    rng = np.random.default_rng([seed, 1])
+    windows = greedy_windows(
+        player, env, episodes=4 * -(-starts // per_window) + 16, seed=seed, cap=cap
+    )
     with policy.evaluating():
         for number, w in enumerate(windows):
             if w.n + 1 < shortest:
@@ -117,17 +141,29 @@ def contamination(
             clean = policy.features(w.frames)
             if shuffle:
                 order = shuffle_order(w.n + 1, FIRST, LAST, rng)
-                versions, places, changed = clean[torch.as_tensor(order)][None], np.array([LAST]), FIRST
+                versions = clean[torch.as_tensor(order)][None]
+                places = np.array([LAST])
+                changed = FIRST
             else:
-                places = np.sort(rng.choice(w.n, min(per_window, starts - len(points), w.n), replace=False))
-                noisy = policy.features(disturbed_frames(w.frames, places, strengths, clip, int(rng.integers(2**62))))
-                versions, changed = clean.repeat(len(noisy), 1, 1), int(places.min())
+                places = np.sort(
+                    rng.choice(w.n, min(per_window, starts - len(points), w.n), replace=False)
+                )
+                noisy = policy.features(
+                    disturbed_frames(w.frames, places, strengths, clip, int(rng.integers(2**62)))
+                )
+                versions = clean.repeat(len(noisy), 1, 1)
+                changed = int(places.min())
                 versions[torch.arange(len(noisy)), places.repeat(len(strengths))] = noisy
-            # What the machinery itself does: a frame in the middle is replaced by itself, encoded alone.
-            again, middle = clean.clone(), w.n // 2
+            # What the machinery itself does: a frame in the middle is replaced by itself, encoded
+            # alone.
+            again = clean.clone()
+            middle = w.n // 2
             again[middle] = policy.features(w.frames[middle : middle + 1])[0]
             raw = replayed(policy, w, torch.cat([clean[None], versions]), changed, feedback)
-            error = max(error, float((replayed(policy, w, again[None], changed, feedback) - raw[:1]).abs().max()))
+            error = max(
+                error,
+                float((replayed(policy, w, again[None], changed, feedback) - raw[:1]).abs().max()),
+            )
             parts.append(_compare(player, what, raw, places[:, None, None] + steps))
             points += [(number, int(place)) for place in places]
             if progress is not None:
@@ -138,15 +174,24 @@ def contamination(
         wanted = f"{shortest} frames are needed, and {steps[0]} steps after the disturbed one"
         raise ValueError(f"none of {skipped + len(parts)} episodes was long enough: {wanted}")
     flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Contamination(strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what)
+    return Contamination(
+        strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what
+    )
 
 
 def _compare(model: Any, what: str, raw: Tensor, decisions: Ints) -> tuple[Array, ...]:
-    """Flip, relative change and KL of rows 1... against row 0 at steps [points, 1, K], each [points, S, K]."""
+    """Flip, relative change and KL of rows 1... against row 0 at steps [points, 1, K], each
+    [points, S, K].
+    """
     rows = torch.arange(1, len(raw)).reshape(len(decisions), -1, 1)
-    known, steps = torch.as_tensor(decisions < raw.shape[1]), torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
-    pairs, scalars = (raw[0, steps], raw[rows, steps]), outputs(model, what)
-    a, b = (values - values.mean(-1, keepdim=True) for values in (scalars(out).double().cpu() for out in pairs))
+    known = torch.as_tensor(decisions < raw.shape[1])
+    steps = torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
+    pairs = (raw[0, steps], raw[rows, steps])
+    scalars = outputs(model, what)
+    a, b = (
+        values - values.mean(-1, keepdim=True)
+        for values in (scalars(out).double().cpu() for out in pairs)
+    )
     spread = a.amax(-1) - a.amin(-1)
     change = torch.where(spread > 0, (b - a).abs().amax(-1) / spread, torch.nan)
     flip = (a.argmax(-1) != b.argmax(-1)).double()
@@ -159,12 +204,16 @@ def _compare(model: Any, what: str, raw: Tensor, decisions: Ints) -> tuple[Array
 
 @dataclass(frozen=True)
 class Example:
-    """One decision: what an agent saw before it, as it was (row 0) and disturbed, and what it made of it."""
+    """One decision: what an agent saw before it, as it was (row 0) and disturbed, and what it made
+    of it.
+    """
 
-    frames: NDArray[np.uint8]  # [R, T, H, W, 3], noise cut to the range of pixels; the decision is taken on the last
+    # [R, T, H, W, 3], noise cut to the range of pixels; the decision is taken on the last
+    frames: NDArray[np.uint8]
     order: Ints  # [R, T], the step of the trajectory at which each frame was seen
     hits: Ints  # [R], index of the noisy frame, -1 in rows without one
-    values: Array  # float64 [R, A], outputs on the last frame minus their mean; of probabilities as they are
+    # float64 [R, A], outputs on the last frame minus their mean; of probabilities as they are
+    values: Array
     target: str  # which outputs
     sigma: float  # standard deviation of the noise
 
@@ -183,26 +232,34 @@ def contamination_example(
     observability: Twin | None = None,
     target: Target = "auto",
 ) -> Example:
-    """The paper's picture: the beginning of one episode, undisturbed and disturbed, and the decision at its end.
+    """The paper's picture: the beginning of one episode, undisturbed and disturbed, and the
+    decision at its end.
 
-    The decision comes ``horizon`` steps after the start, with ``shuffle`` after frame 10. Noise of strength ``sigma``
-    hits the first frame after the start, one in the middle, or the last before the decision, a row each. Everything
-    else is as for `contamination`; a ``ValueError`` if ``horizon`` is below 2, or no episode was long enough.
+    The decision comes ``horizon`` steps after the start, with ``shuffle`` after frame 10. Noise of
+    strength ``sigma`` hits the first frame after the start, one in the middle, or the last before
+    the decision, a row each. Everything else is as for `contamination`; a ``ValueError`` if
+    ``horizon`` is below 2, or no episode was long enough.
     """
     require(horizon >= 2, "horizon", horizon, "at least 2")
     player, env = resolve_agent(agent, env, observability)
-    policy, what, n = policy_of(player), resolve(player, target), horizon + LAST * shuffle
+    policy = policy_of(player)
+    what = resolve(player, target)
+    n = horizon + LAST * shuffle
     windows, _ = play(player, env, seed=held_out_seed(seed), keep=n + 1, max_steps=n + 1)
     w = next((window for window in windows if window.n == n), None)
     if w is None:
-        raise ValueError(f"none of {len(windows)} episodes was long enough: {n + 1} frames are needed")
+        raise ValueError(
+            f"none of {len(windows)} episodes was long enough: {n + 1} frames are needed"
+        )
     hits = np.array([-1] if shuffle else np.unique(np.linspace(1, n - 1, 3, dtype=np.int64)))
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
     versions = w.frames[torch.as_tensor(order)].float()
     if not shuffle:
-        versions[range(1, len(order)), hits] = disturbed_frames(w.frames, hits, np.array([sigma]), clip, seed)
+        versions[range(1, len(order)), hits] = disturbed_frames(
+            w.frames, hits, np.array([sigma]), clip, seed
+        )
     with policy.evaluating():
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
@@ -213,7 +270,9 @@ def contamination_example(
 
 
 def disturbed_frames(frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int) -> Tensor:
-    """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame share its draw."""
+    """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame
+    share its draw.
+    """
     generator = torch.Generator().manual_seed(seed)
     chosen = frames[torch.as_tensor(places)].to(torch.float32)
     noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
@@ -234,19 +293,28 @@ def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -
 
 
 @torch.no_grad()
-def replayed(policy: Policy, window: Window, features: Tensor, changed: int, feedback: bool) -> Tensor:
-    """What the memory says at every step of several versions of a trajectory that differ from frame ``changed`` on."""
-    count, begin = features.shape[0], changed + 1
+def replayed(
+    policy: Policy, window: Window, features: Tensor, changed: int, feedback: bool
+) -> Tensor:
+    """What the memory says at every step of several versions of a trajectory that differ from frame
+    ``changed`` on.
+    """
+    count = features.shape[0]
+    begin = changed + 1
     state: Any = policy.initial_state(1) if window.state is None else window.state
     if state is not None:
         state = state.expand(count, *state.shape[1:]).clone()
-    actions, starts = window.last_action.expand(count, -1), window.is_init.bool().expand(count, -1)
+    actions = window.last_action.expand(count, -1)
+    starts = window.is_init.bool().expand(count, -1)
     if not feedback:
         return policy.remember(features, actions, starts, state)[0]
-    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions lead there.
+    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions
+    # lead there.
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
     parts = [out]
     for t in range(begin, features.shape[1]):
-        out, state = policy.remember(features[:, t : t + 1], policy.greedy(out[:, -1:]), starts[:, t : t + 1], state)
+        out, state = policy.remember(
+            features[:, t : t + 1], policy.greedy(out[:, -1:]), starts[:, t : t + 1], state
+        )
         parts.append(out)
     return torch.cat(parts, 1)

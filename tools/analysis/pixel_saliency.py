@@ -2,13 +2,13 @@
 
 ``S(o_t) = sum_a || d Q(s_n, a) / d o_t ||^2``, the norm taken over colour channels at each pixel.
 
-Computed in two stages of ``torch.autograd``, as the encoder works frame by frame: memory and head are differentiated
-with respect to the features, which gives the Jacobian J [outputs, frames, features]; then J is multiplied with the
-Jacobian of the encoder, some frames at a time. Memory use is that of one chunk; frames whose rows of J are exactly zero
-are skipped.
+Computed in two stages of ``torch.autograd``, as the encoder works frame by frame: memory and head
+are differentiated with respect to the features, which gives the Jacobian J [outputs, frames,
+features]; then J is multiplied with the Jacobian of the encoder, some frames at a time. Memory use
+is that of one chunk; frames whose rows of J are exactly zero are skipped.
 
-Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation differentiates the sum over actions
-instead (``reduce="sum", norm="l1"``, divided by 3).
+Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation differentiates the
+sum over actions instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
 from dataclasses import dataclass
@@ -31,8 +31,10 @@ Norm = Literal["l2sq", "l2", "l1"]
 class Saliency:
     """What `saliency` found."""
 
-    maps: NDArray[np.float32]  # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame
-    per_frame: NDArray[np.float64]  # [n + 1], of each frame the sum over actions of the norm over all pixels, channels
+    # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame
+    maps: NDArray[np.float32]
+    # [n + 1], of each frame the sum over actions of the norm over all pixels, channels
+    per_frame: NDArray[np.float64]
     output: NDArray[np.float32]  # [A], what was differentiated, at step n
     n: int  # index of the step whose decision is explained
     target: str  # which output
@@ -60,17 +62,20 @@ def saliency(
     """Gradient of the outputs at step n with respect to every frame up to n.
 
     Args:
-        model: an agent, a network with ``encode``, ``remember`` and ``initial_state``, a `Policy`, or a pair
-            ``(encode, remember)``; see `policy_of`.
+        model: an agent, a network with ``encode``, ``remember`` and ``initial_state``, a `Policy`,
+            or a pair ``(encode, remember)``; see `policy_of`.
         frames: uint8 or float [T, H, W, C], values 0 to 255: what the agent saw, oldest first.
         last_action: int64 [T], the action that led to each frame; zeros by default.
         is_init: bool [T] or [T, 1], whether a frame opens an episode; all false by default.
-        state: recurrent state before the first frame, batch of one; the model's initial state by default.
+        state: recurrent state before the first frame, batch of one; the model's initial state by
+            default.
         n: index of the step to explain, negative from the end.
-        reduce: ``per_action`` (the paper: norms of single actions, summed) or ``sum`` (norm of the gradient of the sum
-            over actions, in which opposite effects cancel).
-        norm: ``l2sq``, ``l2`` or ``l1``, over the channels of a pixel for ``maps``, over the frame for ``per_frame``.
-        target: what is differentiated, see `outputs`: Q-values or, for a policy, action probabilities by default.
+        reduce: ``per_action`` (the paper: norms of single actions, summed) or ``sum`` (norm of the
+            gradient of the sum over actions, in which opposite effects cancel).
+        norm: ``l2sq``, ``l2`` or ``l1``, over the channels of a pixel for ``maps``, over the frame
+            for ``per_frame``.
+        target: what is differentiated, see `outputs`: Q-values or, for a policy, action
+            probabilities by default.
         chunk: frames pushed through the encoder at once; bounds memory.
         dtype: of frames and gradients, float32 or float64 (the model's parameters must match).
 
@@ -82,7 +87,9 @@ def saliency(
         TypeError: ``model`` has none of the forms above.
     """
     if (reduce, resolve(model, target)) == ("sum", "probs"):
-        raise ValueError("the sum of all probabilities is always 1: take reduce per_action, or target logits")
+        raise ValueError(
+            "the sum of all probabilities is always 1: take reduce per_action, or target logits"
+        )
     for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
         require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
     require(chunk >= 1, "chunk", chunk, "at least 1")
@@ -90,18 +97,30 @@ def saliency(
     total = frames.shape[0]
     require(-total <= n < total, "n", n, f"inside a window of {total} frames")
     zeros = torch.zeros(total, dtype=torch.int64, device=frames.device)
-    actions, starts = (zeros if given is None else given.reshape(-1) for given in (last_action, is_init))
+    actions, starts = (
+        zeros if given is None else given.reshape(-1) for given in (last_action, is_init)
+    )
     for name, given in (("last_action", actions), ("is_init", starts)):
-        require(len(given) == total, f"the length of {name}", len(given), f"that of frames, {total}")
-    steps, policy, scalars = n % total + 1, policy_of(model), outputs(model, target)
+        require(
+            len(given) == total, f"the length of {name}", len(given), f"that of frames, {total}"
+        )
+    steps = n % total + 1
+    policy = policy_of(model)
+    scalars = outputs(model, target)
     with policy.evaluating(), torch.enable_grad():
         leaf = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
         before = policy.initial_state(1) if state is None else state
-        out, _ = policy.remember(leaf[None], actions[None, :steps], starts[None, :steps].bool(), before)
+        out, _ = policy.remember(
+            leaf[None], actions[None, :steps], starts[None, :steps].bool(), before
+        )
         values = scalars(out[:, -1])[0]
         jacobian = _jacobian(values, leaf, reduce)
         maps, sums = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
-    arrays = maps.float().cpu().numpy(), sums.double().cpu().numpy(), values.detach().float().cpu().numpy()
+    arrays = (
+        maps.float().cpu().numpy(),
+        sums.double().cpu().numpy(),
+        values.detach().float().cpu().numpy(),
+    )
     return Saliency(*arrays, steps - 1, resolve(model, target))
 
 
@@ -110,21 +129,30 @@ def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
     rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
     if not values.requires_grad:
         return leaf.new_zeros(len(rows), *leaf.shape)
-    each = [torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True) for row in rows]
+    each = [
+        torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True)
+        for row in rows
+    ]
     return torch.stack([gradient for (gradient,) in each])
 
 
 def _frame_norms(
     policy: Policy, frames: Tensor, jacobian: Tensor, norm: Norm, chunk: int, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
-    """Norms of the gradients by the frames, summed over the outputs: of pixels [T, H, W], and of whole frames [T]."""
-    per_pixel, per_frame = (jacobian.new_zeros(shape, dtype=dtype) for shape in (frames.shape[:3], len(frames)))
+    """Norms of the gradients by the frames, summed over the outputs: of pixels [T, H, W], and of
+    whole frames [T].
+    """
+    per_pixel, per_frame = (
+        jacobian.new_zeros(shape, dtype=dtype) for shape in (frames.shape[:3], len(frames))
+    )
     reached = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
     for index in reached.split(chunk):
         part = frames[index].to(dtype).requires_grad_()
         features = policy.encode(part)
         for row in jacobian[:, index].to(features):
-            (gradient,) = torch.autograd.grad(features, part, row, retain_graph=True, materialize_grads=True)
+            (gradient,) = torch.autograd.grad(
+                features, part, row, retain_graph=True, materialize_grads=True
+            )
             pixels = gradient.abs().sum(-1) if norm == "l1" else gradient.square().sum(-1)
             total = pixels.sum((1, 2))
             per_frame[index] += total.sqrt() if norm == "l2" else total
@@ -153,14 +181,18 @@ def episode_saliency(
     target: Target = "auto",
     progress: Progress | None = None,
 ) -> EpisodeSaliency:
-    """Saliency of the last decision of a greedy episode in the agent's own game, cut after ``max_steps``.
+    """Saliency of the last decision of a greedy episode in the agent's own game, cut after
+    ``max_steps``.
 
-    At most ``tries`` episodes are played, from ``seed`` on, until one has the ``show`` frames that are wanted; else the
-    longest counts. All else is as for `greedy_window` and `saliency`; ``progress`` is called once, with (1, 1).
+    At most ``tries`` episodes are played, from ``seed`` on, until one has the ``show`` frames that
+    are wanted; else the longest counts. All else is as for `greedy_window` and `saliency`;
+    ``progress`` is called once, with (1, 1).
     """
     windows: list[Window] = []
     for at in range(seed, seed + tries):
-        windows.append(greedy_window(agent, seed=at, observability=observability, max_steps=max_steps))
+        windows.append(
+            greedy_window(agent, seed=at, observability=observability, max_steps=max_steps)
+        )
         if windows[-1].n + 1 >= show:
             break
     w = max(windows, key=lambda window: window.n)
@@ -168,4 +200,6 @@ def episode_saliency(
     found = saliency(agent, *seen, reduce=reduce, norm=norm, target=target)
     if progress is not None:
         progress(1, 1)
-    return EpisodeSaliency(**vars(found), frames=w.frames.cpu().numpy(), action=w.action.cpu().numpy())
+    return EpisodeSaliency(
+        **vars(found), frames=w.frames.cpu().numpy(), action=w.action.cpu().numpy()
+    )

@@ -1,14 +1,14 @@
 """What the analyses ask of a policy: two functions, and which of its outputs is meant.
 
-Saliency, recall density and contamination work on anything that can be cut in two: ``encode`` looks at single frames,
-``remember`` is everything behind it. Agents and networks of this package have both as methods; wrap any other module
-in a `Policy`.
+Saliency, recall density and contamination work on anything that can be cut in two: ``encode`` looks
+at single frames, ``remember`` is everything behind it. Agents and networks of this package have
+both as methods; wrap any other module in a `Policy`.
 
 Example:
     >>> encoder, head = torch.nn.Linear(12, 4), torch.nn.Linear(4, 5)
     >>> policy = Policy(
     ...     encode=lambda frames: encoder(frames.flatten(-3) / 255),
-    ...     remember=lambda features, last_action, is_init, state: (head(features.cumsum(1)), state),
+    ...     remember=lambda features, action, is_init, state: (head(features.cumsum(1)), state),
     ... )
     >>> policy.encode(torch.zeros(7, 2, 2, 3)).shape
     torch.Size([7, 4])
@@ -38,16 +38,17 @@ def read_plain(out: Tensor, what: str) -> Tensor:
 class Policy:
     """A policy in two functions.
 
-    ``encode`` turns frames, float or uint8 0..255 [N, H, W, C], into features [N, E], each frame on its own.
-    ``remember`` is ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T], state) -> (out [B, T, A],
-    state)``, causal in time; ``initial_state`` gives, for a batch size, the state before the first frame: a TensorDict
-    [B], a tensor [B, ...] or None.
+    ``encode`` turns frames, float or uint8 0..255 [N, H, W, C], into features [N, E], each frame on
+    its own. ``remember`` is ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T],
+    state) -> (out [B, T, A], state)``, causal in time; ``initial_state`` gives, for a batch size,
+    the state before the first frame: a TensorDict [B], a tensor [B, ...] or None.
     """
 
     encode: Callable[[Tensor], Tensor]
     remember: Callable[[Tensor, Tensor, Tensor, Any], tuple[Tensor, Any]]
     initial_state: Callable[[int], Any] = lambda batch_size: None
-    read: Callable[[Tensor, str], Tensor] = read_plain  # what its outputs mean: (out, one of TARGETS) -> [..., A or 1]
+    # what its outputs mean: (out, one of TARGETS) -> [..., A or 1]
+    read: Callable[[Tensor, str], Tensor] = read_plain
     offers: tuple[str, ...] = TARGETS  # which of `TARGETS` its outputs can be read as
     module: nn.Module | None = None  # put into evaluation mode while an analysis runs
 
@@ -60,11 +61,15 @@ class Policy:
         """Greedy actions for a batch of observations, as an agent gives them."""
         steps = obs["pixels"].shape[0], 1
         features = self.encode(obs["pixels"]).unsqueeze(1)
-        out, state = self.remember(features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state)
+        out, state = self.remember(
+            features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state
+        )
         return self.greedy(out[:, 0]), {}, state
 
     @torch.no_grad()
-    def features(self, frames: Tensor, chunk: int = 16, dtype: torch.dtype = torch.float32) -> Tensor:
+    def features(
+        self, frames: Tensor, chunk: int = 16, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         """Features [T, E] of frames [T, H, W, C] without a graph, ``chunk`` frames at a time."""
         return torch.cat([self.encode(part.to(dtype)) for part in frames.split(chunk)])
 
@@ -84,8 +89,8 @@ def policy_of(model: Any) -> Policy:
     """The two functions of whatever an analysis was given.
 
     Args:
-        model: an agent with an attribute ``network``, a network with ``encode``, ``remember`` and ``initial_state``, a
-            `Policy`, or a pair ``(encode, remember)``.
+        model: an agent with an attribute ``network``, a network with ``encode``, ``remember`` and
+            ``initial_state``, a `Policy`, or a pair ``(encode, remember)``.
 
     Raises:
         TypeError: ``model`` has none of these forms.
@@ -99,13 +104,16 @@ def policy_of(model: Any) -> Policy:
         module = network if isinstance(network, nn.Module) else None
         read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
         offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
-        return Policy(network.encode, network.remember, network.initial_state, read, tuple(offers), module)
+        return Policy(
+            network.encode, network.remember, network.initial_state, read, tuple(offers), module
+        )
     forms = "an agent, a network with encode and remember, a Policy or a pair (encode, remember)"
     raise TypeError(f"model must be {forms}, got {type(model).__name__}")
 
 
 def resolve(model: Any, what: str) -> str:
-    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action probabilities.
+    """The output that is meant: ``auto`` is Q-values or, for a policy without them, action
+    probabilities.
 
     Raises:
         ValueError: ``what`` is none of `TARGETS`, or this model does not offer it.
@@ -116,14 +124,18 @@ def resolve(model: Any, what: str) -> str:
     if what == "auto":
         return next(name for name in ("q", "probs", *names) if name in names)
     if what not in names:
-        raise ValueError(f"this agent offers {', '.join(names)}, not {what!r}: choose one of these as target")
+        raise ValueError(
+            f"this agent offers {', '.join(names)}, not {what!r}: choose one of these as target"
+        )
     return what
 
 
 def outputs(model: Any, what: str = "auto") -> Callable[[Tensor], Tensor]:
-    """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns, [..., R].
+    """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns,
+    [..., R].
 
     ``what`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
     """
-    policy, name = policy_of(model), resolve(model, what)
+    policy = policy_of(model)
+    name = resolve(model, what)
     return lambda out: policy.read(out, name)

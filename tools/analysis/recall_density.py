@@ -1,12 +1,13 @@
 """Recall density: how the gradient of a decision is spread over the past of its episode.
 
-For a trajectory o_0 ... o_n let ``g_t = sum_a || d Q(s_n, a) / d o_t ||_1`` and ``delta_t = g_t / sum_i g_i``. The
-density is the mean of delta over trajectories, in bins of normalised time (`binned`) or sampled at points as in the
-paper. On an MDP an ideal agent has all mass on the last frame. The last action is no pixel: what is remembered through
-it does not show.
+For a trajectory o_0 ... o_n let ``g_t = sum_a || d Q(s_n, a) / d o_t ||_1`` and ``delta_t = g_t /
+sum_i g_i``. The density is the mean of delta over trajectories, in bins of normalised time
+(`binned`) or sampled at points as in the paper. On an MDP an ideal agent has all mass on the last
+frame. The last action is no pixel: what is remembered through it does not show.
 
-Source: POPGym Arcade (ICML 2026), recall density. Differs from its published code in the time axis (own length of
-each trajectory), in whole episodes instead of ten steps, and in gradients of single actions instead of their sum.
+Source: POPGym Arcade (ICML 2026), recall density. Differs from its published code in the time axis
+(own length of each trajectory), in whole episodes instead of ten steps, and in gradients of single
+actions instead of their sum.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,16 +20,26 @@ from numpy.typing import NDArray
 from arcade_torch.tools.analysis.bootstrap import Array
 from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, saliency
 from arcade_torch.tools.analysis.policy import Progress, Target, resolve
-from arcade_torch.tools.analysis.windows import MAX_STEPS, MIN_STEPS, End, Twin, Window, greedy_windows, resolve_agent
+from arcade_torch.tools.analysis.windows import (
+    MAX_STEPS,
+    MIN_STEPS,
+    End,
+    Twin,
+    Window,
+    greedy_windows,
+    resolve_agent,
+)
 
 
 @dataclass(frozen=True)
 class RecallDensity:
     """Recall density of one checkpoint."""
 
-    deltas: Array  # float64, delta of every frame, oldest first, one trajectory after the other; each sums to 1
+    # float64, delta of every frame, oldest first, one trajectory after the other; each sums to 1
+    deltas: Array
     lengths: NDArray[np.int64]  # [m], frames of each trajectory
-    ended: NDArray[np.bool_]  # [m], whether the trajectory ends with the decision that ended its episode
+    # [m], whether the trajectory ends with the decision that ended its episode
+    ended: NDArray[np.bool_]
     dropped: int  # trajectories left out because they have fewer than three frames
     silent: int  # trajectories left out because all their gradients vanish
     target: str  # what was differentiated
@@ -36,7 +47,9 @@ class RecallDensity:
     @property
     def shares(self) -> tuple[Array, ...]:
         """One float64 [n_i + 1] a trajectory."""
-        return tuple(np.split(self.deltas, np.cumsum(self.lengths)[:-1])) if self.lengths.size else ()
+        return (
+            tuple(np.split(self.deltas, np.cumsum(self.lengths)[:-1])) if self.lengths.size else ()
+        )
 
     def mass(self, bins: int) -> Array:
         """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1."""
@@ -53,7 +66,10 @@ class RecallDensity:
     def _mean(self, of: Callable[[Array], Array]) -> Array:
         """Mean over trajectories."""
         if not self.lengths.size:
-            why = f"{self.dropped} had fewer than {MIN_STEPS} frames, {self.silent} no gradient at all"
+            why = (
+                f"{self.dropped} had fewer than {MIN_STEPS} frames, {self.silent} no gradient at "
+                "all"
+            )
             raise ValueError(f"no trajectory is left: {why}; play more episodes")
         return np.asarray(np.mean([of(share) for share in self.shares], axis=0))
 
@@ -75,16 +91,18 @@ def recall_density(
     """Recall density of an agent over whole greedy episodes.
 
     Args:
-        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, any `Policy` or network.
-        env: ``ArcadeEnv`` whose episodes are played side by side; by default 16 of the agent's own game.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, any `Policy`
+            or network.
+        env: ``ArcadeEnv`` whose episodes are played side by side; by default 16 of the agent's own
+            game.
         episodes: number of trajectories.
         seed: of the episodes; training never sees them.
         observability: another twin than the one trained on (without ``env``).
-        end: ``last``: n is the last frame before the terminating action, which is no typical decision (a failure may be
-            imminent); ``random``: n is drawn uniformly from index 2 on.
+        end: ``last``: n is the last frame before the terminating action, which is no typical
+            decision (a failure may be imminent); ``random``: n is drawn uniformly from index 2 on.
         cap: longest trajectory; longer episodes give a window of that length with a random end.
-        norm: over all pixels and channels, as for `saliency`, and so are ``reduce`` and ``target``; ``l1`` is the
-            paper's.
+        norm: over all pixels and channels, as for `saliency`, and so are ``reduce`` and ``target``;
+            ``l1`` is the paper's.
         progress: called with (trajectories done, episodes).
 
     Returns:
@@ -96,7 +114,9 @@ def recall_density(
     player, env = resolve_agent(agent, env, observability)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     done = (lambda count: progress(count, episodes)) if progress is not None else None
-    return density_of_windows(player, windows, norm=norm, reduce=reduce, target=target, progress=done)
+    return density_of_windows(
+        player, windows, norm=norm, reduce=reduce, target=target, progress=done
+    )
 
 
 def density_of_windows(
@@ -110,10 +130,13 @@ def density_of_windows(
 ) -> RecallDensity:
     """Recall density over windows of experience of your own; the last frame of each is explained.
 
-    A start flag inside a window leaves exactly nothing on the frames before it; ``progress`` is called with the number
-    of windows done. Everything else is as for `recall_density`.
+    A start flag inside a window leaves exactly nothing on the frames before it; ``progress`` is
+    called with the number of windows done. Everything else is as for `recall_density`.
     """
-    shares, ended, dropped, silent = [np.zeros(0)], [], 0, 0
+    shares = [np.zeros(0)]
+    ended = []
+    dropped = 0
+    silent = 0
     for count, w in enumerate(windows, start=1):
         if w.n + 1 < MIN_STEPS:
             dropped += 1
@@ -127,15 +150,19 @@ def density_of_windows(
                 silent += 1
         if progress is not None:
             progress(count)
-    lengths, what = np.array([share.size for share in shares[1:]], dtype=np.int64), resolve(model, target)
-    return RecallDensity(np.concatenate(shares), lengths, np.array(ended, dtype=np.bool_), dropped, silent, what)
+    lengths = np.array([share.size for share in shares[1:]], dtype=np.int64)
+    what = resolve(model, target)
+    return RecallDensity(
+        np.concatenate(shares), lengths, np.array(ended, dtype=np.bool_), dropped, silent, what
+    )
 
 
 def binned(shares: Array, bins: int) -> Array:
     """Mass in equal parts of a trajectory.
 
-    Step t of N owns the interval [t/N, (t+1)/N) and bin b of B owns [b/B, (b+1)/B); the mass of a step is split by the
-    overlap of the intervals. Every trajectory therefore keeps its whole mass, whatever its length.
+    Step t of N owns the interval [t/N, (t+1)/N) and bin b of B owns [b/B, (b+1)/B); the mass of a
+    step is split by the overlap of the intervals. Every trajectory therefore keeps its whole mass,
+    whatever its length.
 
     Raises:
         ValueError: there is no step or no bin.
@@ -147,7 +174,9 @@ def binned(shares: Array, bins: int) -> Array:
     if bins < 1 or shares.size < 1:
         raise ValueError(f"need at least one bin and one step, got {bins} and {shares.size}")
     steps = np.arange(shares.size + 1) / shares.size
-    return np.diff(np.interp(np.arange(bins + 1) / bins, steps, np.concatenate([[0.0], np.cumsum(shares)])))
+    return np.diff(
+        np.interp(np.arange(bins + 1) / bins, steps, np.concatenate([[0.0], np.cumsum(shares)]))
+    )
 
 
 def point_sampled(shares: Array, taus: Array) -> Array:
@@ -161,6 +190,9 @@ def point_sampled(shares: Array, taus: Array) -> Array:
 def no_memory(lengths: Sequence[int], bins: int) -> Array:
     """Reference line: only the last frame of each trajectory counts.
 
-    A trajectory with fewer steps than bins spreads its last frame over several of them, as it does its other frames.
+    A trajectory with fewer steps than bins spreads its last frame over several of them, as it does
+    its other frames.
     """
-    return np.asarray(np.mean([binned(np.eye(1, length, length - 1)[0], bins) for length in lengths], axis=0))
+    return np.asarray(
+        np.mean([binned(np.eye(1, length, length - 1)[0], bins) for length in lengths], axis=0)
+    )

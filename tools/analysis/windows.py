@@ -1,4 +1,6 @@
-"""Windows of experience to analyse: greedy episodes up to the decision that ended them, or to one before it."""
+"""Windows of experience to analyse: greedy episodes up to the decision that ended them, or to one
+before it.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +19,8 @@ from arcade_torch.agents.evaluation import held_out_seed, make_eval_env
 from arcade_torch.tools.analysis.policy import policy_of
 
 MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
-MIN_STEPS = 3  # a shorter trajectory says nothing about memory: recall density leaves it out and counts it
+# a shorter trajectory says nothing about memory: recall density leaves it out and counts it
+MIN_STEPS = 3
 SIDE_BY_SIDE = 16  # episodes played at once where the caller brings no environments
 
 End = Literal["last", "random"]
@@ -26,15 +29,19 @@ Twin = Literal["full", "partial"]
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive steps of one episode; on the last frame the decision was taken that is looked at."""
+    """Consecutive steps of one episode; on the last frame the decision was taken that is looked
+    at.
+    """
 
     frames: Tensor  # uint8 [T, S, S, 3]
     last_action: Tensor  # int64 [T], the action that led to each frame
-    is_init: Tensor  # bool [T], true at index 0 at most, and only if the window begins with the episode
+    # bool [T], true at index 0 at most, and only if the window begins with the episode
+    is_init: Tensor
     action: Tensor  # int64 [T], the action chosen on each frame
     reward: Tensor  # float32 [T], what it earned
     state: Any  # recurrent state before the first frame, batch of one
-    ended: bool  # whether the action at the last frame ended the episode (else the window ends earlier)
+    # whether the action at the last frame ended the episode (else the window ends earlier)
+    ended: bool
     seed: int  # of the batch of episodes
     row: int = 0  # which episode of that batch
 
@@ -47,12 +54,20 @@ class Window:
         """The same window ending with step ``n``."""
         if n == self.n:
             return self
-        cut = {name: getattr(self, name)[: n + 1] for name in ("frames", "last_action", "is_init", "action", "reward")}
+        cut = {
+            name: getattr(self, name)[: n + 1]
+            for name in ("frames", "last_action", "is_init", "action", "reward")
+        }
         return replace(self, **cut, ended=False)
 
 
 def greedy_window(
-    agent: Any, env: Any = None, *, seed: int = 0, observability: Twin | None = None, max_steps: int = MAX_STEPS
+    agent: Any,
+    env: Any = None,
+    *,
+    seed: int = 0,
+    observability: Twin | None = None,
+    max_steps: int = MAX_STEPS,
 ) -> Window:
     """Play one greedy episode and return what the agent saw.
 
@@ -71,7 +86,12 @@ def greedy_window(
     """
     seed = held_out_seed(seed) if env is None else seed
     player, env = resolve_agent(agent, env, observability, num_envs=1)
-    require(tuple(env.batch_size) == (1,), "the batch size of env", list(env.batch_size), "[1], for one episode")
+    require(
+        tuple(env.batch_size) == (1,),
+        "the batch size of env",
+        list(env.batch_size),
+        "[1], for one episode",
+    )
     require(max_steps >= 1, "max_steps", max_steps, "at least 1")
     (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps)
     return window
@@ -80,17 +100,21 @@ def greedy_window(
 def greedy_windows(
     agent: Any, env: Any, *, episodes: int, seed: int = 0, end: End = "last", cap: int = MAX_STEPS
 ) -> Iterator[Window]:
-    """Play greedy episodes side by side, one window each; a batch of episodes is in memory at a time.
+    """Play greedy episodes side by side, one window each; a batch of episodes is in memory at a
+    time.
 
     Args:
-        agent: has ``act(obs, state) -> (action, extras, state)`` and ``initial_state(batch_size)``, and acts greedily.
-        env: ``ArcadeEnv`` of any batch size N. Batch b plays with a seed made of ``seed`` and b, so another N plays
-            other episodes.
+        agent: has ``act(obs, state) -> (action, extras, state)`` and ``initial_state(batch_size)``,
+            and acts greedily.
+        env: ``ArcadeEnv`` of any batch size N. Batch b plays with a seed made of ``seed`` and b, so
+            another N plays other episodes.
         episodes: number of windows.
         seed: of the episodes and of the random ends; of held-out environments, as in an evaluation.
-        end: ``last``: the window ends with the frame on which the ending action was chosen; ``random``: with a frame
-            drawn uniformly from index 2 on. An episode longer than ``cap`` ends at a random frame in either case.
-        cap: longest window: the last so many frames before its end, with the recurrent state before them.
+        end: ``last``: the window ends with the frame on which the ending action was chosen;
+            ``random``: with a frame drawn uniformly from index 2 on. An episode longer than ``cap``
+                ends at a random frame in either case.
+        cap: longest window: the last so many frames before its end, with the recurrent state before
+            them.
 
     Raises:
         ValueError: a number is below 1, or ``end`` is unknown.
@@ -100,11 +124,13 @@ def greedy_windows(
     require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
     size = int(env.batch_size[0])
     for group in range(-(-episodes // size)):
-        rng, drawn = np.random.default_rng([seed, group]), np.random.SeedSequence([seed, group]).generate_state(1)
+        rng = np.random.default_rng([seed, group])
+        drawn = np.random.SeedSequence([seed, group]).generate_state(1)
         batch_seed = held_out_seed(int(drawn[0]) % SEED_LIMIT)
         windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
         ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
-        if (late := ends >= cap).any():  # these windows begin later than what was kept: play the very same again
+        # these windows begin later than what was kept: play the very same again
+        if (late := ends >= cap).any():
             del windows
             first = np.where(late, ends - cap + 1, 0).tolist()
             windows, _ = play(agent, env, seed=batch_seed, keep=cap, first=first)
@@ -122,21 +148,31 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
 
 @torch.no_grad()
 def play(
-    agent: Any, env: Any, *, seed: int, keep: int, max_steps: int | None = None, first: Sequence[int] | None = None
+    agent: Any,
+    env: Any,
+    *,
+    seed: int,
+    keep: int,
+    max_steps: int | None = None,
+    first: Sequence[int] | None = None,
 ) -> tuple[list[Window], NDArray[np.int64]]:
     """Play the first episode of every env of a batch greedily.
 
-    From frame ``first`` on (0 by default; one for every env) ``keep`` frames of each episode are kept; episodes are cut
-    after ``max_steps``, never by default. Returns a window of each episode, and all lengths int64 [N].
+    From frame ``first`` on (0 by default; one for every env) ``keep`` frames of each episode are
+    kept; episodes are cut after ``max_steps``, never by default. Returns a window of each episode,
+    and all lengths int64 [N].
     """
     size = int(env.batch_size[0])
     starts = torch.as_tensor([0] * size if first is None else first)
-    lengths, ended = torch.zeros(size, dtype=torch.int64), torch.zeros(size, dtype=torch.bool)
+    lengths = torch.zeros(size, dtype=torch.int64)
+    ended = torch.zeros(size, dtype=torch.bool)
     env.set_seed(seed)
-    obs, state = env.reset(), agent.initial_state(size)
+    obs = env.reset()
+    state = agent.initial_state(size)
     kept: TensorDictBase | None = None
     states: list[Any] = [None] * size
-    playing, t = torch.ones(size, dtype=torch.bool), 0
+    playing = torch.ones(size, dtype=torch.bool)
+    t = 0
     while playing.any() and (max_steps is None or t < max_steps):
         for row in (playing & (starts == t)).nonzero().flatten().tolist():
             states[row] = None if state is None else state[row : row + 1].clone()
@@ -146,7 +182,9 @@ def play(
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         seen.set("reward", step.get(("next", "reward")))
         if kept is None:  # untouched memory is never really taken
-            kept = seen.apply(lambda x: x.new_empty(size, keep, *x.shape[1:]), batch_size=[size, keep])
+            kept = seen.apply(
+                lambda x: x.new_empty(size, keep, *x.shape[1:]), batch_size=[size, keep]
+            )
         kept[rows, t - starts[rows]] = seen[rows]
         lengths += playing
         ended |= playing & step.get(("next", "done")).reshape(-1).cpu()
@@ -156,33 +194,50 @@ def play(
     windows = []
     for row, (begin, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
         steps = max(0, min(keep, length - begin))
-        seen = {name: value if name == "pixels" else value.reshape(-1) for name, value in kept[row, :steps].items()}
+        seen = {
+            name: value if name == "pixels" else value.reshape(-1)
+            for name, value in kept[row, :steps].items()
+        }
         whole = bool(ended[row]) and begin + steps == length
-        windows.append(Window(seen.pop("pixels"), **seen, state=states[row], ended=whole, seed=seed, row=row))
+        windows.append(
+            Window(seen.pop("pixels"), **seen, state=states[row], ended=whole, seed=seed, row=row)
+        )
     return windows, lengths.numpy()
 
 
 def resolve_agent(
     agent: Any, env: Any = None, observability: Twin | None = None, num_envs: int = SIDE_BY_SIDE
 ) -> tuple[Any, Any]:
-    """Something that acts, and environments for it: by default of its own game, on the twin that is named.
+    """Something that acts, and environments for it: by default of its own game, on the twin that is
+    named.
 
-    ``agent`` is an agent, the path of its run folder or checkpoint, or with ``env`` given anything that acts as an
-    agent does or that `policy_of` takes. Without ``env`` there are ``num_envs``, on the device of the agent's network.
+    ``agent`` is an agent, the path of its run folder or checkpoint, or with ``env`` given anything
+    that acts as an agent does or that `policy_of` takes. Without ``env`` there are ``num_envs``, on
+    the device of the agent's network.
 
     Raises:
         ValueError: there is no environment for it, or more than one.
     """
     agent = load(agent) if isinstance(agent, str | Path) else agent
-    player = agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
+    player = (
+        agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
+    )
     if env is not None:
         if observability is not None:
-            raise ValueError("observability belongs to the environments: leave it out, or leave env out")
+            raise ValueError(
+                "observability belongs to the environments: leave it out, or leave env out"
+            )
         return player, env
     if not hasattr(agent, "config"):
-        raise ValueError(f"{type(agent).__name__} does not say which game it plays: hand over env as well")
+        raise ValueError(
+            f"{type(agent).__name__} does not say which game it plays: hand over env as well"
+        )
     twin = observability or agent.config.observability
     if twin not in get_args(Twin):
-        raise ValueError(f"this agent was trained on {twin} twins: name one of them, full or partial")
+        raise ValueError(
+            f"this agent was trained on {twin} twins: name one of them, full or partial"
+        )
     device = str(next(agent.network.parameters()).device)
-    return player, make_eval_env(replace(agent.config, device=device, cuda_graphs=False), num_envs, twin)
+    return player, make_eval_env(
+        replace(agent.config, device=device, cuda_graphs=False), num_envs, twin
+    )

@@ -1,7 +1,9 @@
-"""Frames per second of the games: bare compiled step, bridge, collector, against what the machine can write.
+"""Frames per second of the games: bare compiled step, bridge, collector, against what the machine
+can write.
 
-Every frame is consumed. Frames are results of the compiled call, so they must be written; then a checksum outside it
-reads every byte. The checksum has a clock of its own: rates are given without it and with it.
+Every frame is consumed. Frames are results of the compiled call, so they must be written; then a
+checksum outside it reads every byte. The checksum has a clock of its own: rates are given without
+it and with it.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,9 +33,9 @@ LARGEST_BATCH = 2**20
 class Options(BenchOptions):
     """Frames per second of games at several batch sizes, every frame consumed by a checksum.
 
-    Measured are the compiled step with auto-reset (step+draw; step: without drawing), ArcadeEnv.step_and_maybe_reset
-    (env), ArcadeCollector.collect with random actions, every frame stored once as in training (collector), and a plain
-    fill and a plain copy of the same bytes.
+    Measured are the compiled step with auto-reset (step+draw; step: without drawing),
+    ArcadeEnv.step_and_maybe_reset (env), ArcadeCollector.collect with random actions, every frame
+    stored once as in training (collector), and a plain fill and a plain copy of the same bytes.
     Beside frames/s stand GB/s and the share of that fill and that copy in the same run.
 
     Example: arcade-torch bench envs --games MineSweeperEasy --batches 16 128 --out runs/bench.csv
@@ -57,11 +59,21 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
         log(f"{game}, {size} px, {count} envs")
         measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
         found = interleaved(measures, options.seconds, options.repeats)
-        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {"step": 0.0}
+        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {
+            "step": 0.0
+        }
         for name, result in found.items():
-            row: dict[str, Any] = {"game": game, "obs_size": size, "num_envs": count, "measure": name}
+            row: dict[str, Any] = {
+                "game": game,
+                "obs_size": size,
+                "num_envs": count,
+                "measure": name,
+            }
             row |= {"frames": result.units, "frames_per_s": result.rate}
-            row |= {"frames_per_s_with_check": median(result.rates_with_check), "gb_per_s": drawn[name]}
+            row |= {
+                "frames_per_s_with_check": median(result.rates_with_check),
+                "gb_per_s": drawn[name],
+            }
             row |= {f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}
             yield "envs", row | {"checksum": result.checksum}
 
@@ -78,7 +90,8 @@ def _bare(game: str, size: int, count: int) -> dict[str, Measure]:
     partial = jnp.arange(count) % 2 == 1
     state = {name: batched.init(env_keys(0, count), partial) for name in ("step+draw", "step")}
     rng = np.random.default_rng(0)
-    actions = cycle([jnp.asarray(rng.integers(0, 5, count), jnp.int32) for _ in range(64)])  # made outside the clock
+    # made outside the clock
+    actions = cycle([jnp.asarray(rng.integers(0, 5, count), jnp.int32) for _ in range(64)])
 
     @jax.jit
     def step(batch: Any, action: Any) -> Any:
@@ -96,11 +109,15 @@ def _bare(game: str, size: int, count: int) -> dict[str, Measure]:
     def read_rewards(reward: Any) -> int:
         return int(np.asarray(reward).view(np.int32).astype(np.int64).sum())
 
-    return {"step+draw": Measure(draw_work, read_all, count), "step": Measure(step_work, read_rewards, count)}
+    return {
+        "step+draw": Measure(draw_work, read_all, count),
+        "step": Measure(step_work, read_rewards, count),
+    }
 
 
 def window_steps(size: int, count: int) -> int:
-    """Steps in a collector's window: 32, or as many powers of two as `WINDOW_BYTES` hold, but at least 4.
+    """Steps in a collector's window: 32, or as many powers of two as `WINDOW_BYTES` hold, but at
+    least 4.
 
     Example:
         >>> window_steps(128, 16), window_steps(128, 128), window_steps(128, 512)
@@ -114,9 +131,13 @@ def _bridge(game: str, size: int, count: int) -> dict[str, Measure]:
     """The TorchRL environment and our collector."""
     env, other = (arcade_torch.make(game, num_envs=count, obs_size=size) for _ in range(2))
     steps = window_steps(size, count)
-    collector = arcade_torch.ArcadeCollector(other, None, frames_per_batch=count * steps, final_frames="truncated")
+    collector = arcade_torch.ArcadeCollector(
+        other, None, frames_per_batch=count * steps, final_frames="truncated"
+    )
     generator = torch.Generator().manual_seed(0)
-    actions = cycle([torch.randint(5, (count,), generator=generator).to(env.device) for _ in range(64)])
+    actions = cycle(
+        [torch.randint(5, (count,), generator=generator).to(env.device) for _ in range(64)]
+    )
     now = [env.reset()]
 
     def env_work() -> Any:

@@ -1,7 +1,7 @@
 """What all benchmarks share: measures in turns with every result consumed, and kinds of operation.
 
-Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is torch's, which waits for
-the device.
+Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is
+torch's, which waits for the device.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,10 +26,13 @@ class Measure:
 
 @dataclass
 class Measured:
-    """What one measure did over all repeats: units a second of each, and all units made and consumed."""
+    """What one measure did over all repeats: units a second of each, and all units made and
+    consumed.
+    """
 
     rates: list[float] = field(default_factory=list)
-    rates_with_check: list[float] = field(default_factory=list)  # with the check of the results inside the clock
+    # with the check of the results inside the clock
+    rates_with_check: list[float] = field(default_factory=list)
     units: int = 0
     checksum: int = 0  # over everything that was made, modulo 2**64
 
@@ -47,21 +50,28 @@ class Measured:
 def interleaved(
     measures: Mapping[str, Measure], seconds: float, repeats: int, warm_ups: int = 3
 ) -> dict[str, Measured]:
-    """Time several things in turns, each so many seconds (or one ``work``) a turn, after warm-ups outside the clock."""
+    """Time several things in turns, each so many seconds (or one ``work``) a turn, after warm-ups
+    outside the clock.
+    """
     for measure in measures.values():
         for _ in range(warm_ups):
             measure.check(measure.work())
     found = {name: Measured() for name in measures}
     for _ in range(repeats):
         for name, measure in measures.items():
-            into, units, working, checking = found[name], 0, 0.0, 0.0
+            into = found[name]
+            units = 0
+            working = 0.0
+            checking = 0.0
             while units == 0 or working + checking < seconds:
                 start = timer()
                 result = measure.work()
                 middle = timer()
                 into.checksum = (into.checksum + measure.check(result)) % 2**64
                 end = timer()
-                working, checking, units = working + middle - start, checking + end - middle, units + measure.units
+                working = working + middle - start
+                checking = checking + end - middle
+                units = units + measure.units
             into.units += units
             into.rates.append(units / working)
             into.rates_with_check.append(units / (working + checking))
@@ -74,14 +84,22 @@ KINDS = {
     "recurrence": ("linear_scan", "matrix_scan"),
     "matrix products": ("addmm", "::mm", "bmm", "matmul"),
     "activations": ("leaky_relu",),
-    "copies and casts": ("copy", "aten::cat", "clone", "index_select", "aten::fill_", "aten::zero_"),
+    "copies and casts": (
+        "copy",
+        "aten::cat",
+        "clone",
+        "index_select",
+        "aten::fill_",
+        "aten::zero_",
+    ),
 }
 """Kinds of operation, by parts of their names; the rest is elementwise work."""
 REST = "the rest"
 
 
 def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
-    """Shares of the kinds of operation in the time of some work, by torch's profiler: CUDA kernels where there are any.
+    """Shares of the kinds of operation in the time of some work, by torch's profiler: CUDA kernels
+    where there are any.
 
     On a CPU the profiler's own memory makes copies look a little dearer than they are.
     """
@@ -92,7 +110,10 @@ def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
     on_card = sum(event.self_device_time_total for event in events)
     seconds = dict.fromkeys([*KINDS, REST], 0.0)
     for event in events:
-        kind = next((kind for kind, names in KINDS.items() if any(name in event.key for name in names)), REST)
+        kind = next(
+            (kind for kind, names in KINDS.items() if any(name in event.key for name in names)),
+            REST,
+        )
         seconds[kind] += event.self_device_time_total if on_card else event.self_cpu_time_total
     total = sum(seconds.values())
     return {kind: value / total for kind, value in seconds.items()}

@@ -1,4 +1,6 @@
-"""Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone; saliency; costs."""
+"""Memory models over whole sequences beside their own loops and ``torch.nn.GRU``; the scans alone;
+saliency; costs.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +13,15 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from arcade_torch.models import fast_weights, linear_scan, lru, make_memory, matrix_scan_loop, memory_names, mingru
+from arcade_torch.models import (
+    fast_weights,
+    linear_scan,
+    lru,
+    make_memory,
+    matrix_scan_loop,
+    memory_names,
+    mingru,
+)
 from arcade_torch.models.scan import back_end
 from arcade_torch.models.scan_triton import runs_triton
 from arcade_torch.tools.bench.harness import Measure, interleaved
@@ -21,14 +31,19 @@ from arcade_torch.tools.options import at_least
 
 TORCH_GRU = "torch.nn.GRU"
 """It knows no starts and ignores them."""
-LOOP, COPY = "loop over unbind", "copy of as many bytes"
-FORWARD_TENSORS, BACKWARD_TENSORS = 3, 5
+LOOP = "loop over unbind"
+COPY = "copy of as many bytes"
+FORWARD_TENSORS = 3
+BACKWARD_TENSORS = 5
 """Tensors [B, T, H] a scan has to read or write: a, b, h; and a, h, the gradients of h, a and b."""
 RESETS = 0.02
 """Share of the steps that open an episode."""
 QUEUED = 10
-"""Passes on a card between two looks at the clock, so that the device is timed and not the launches."""
-ACTING_ENVS, MINIBATCH_STEPS = 16, 132
+"""Passes on a card between two looks at the clock, so that the device is timed and not the
+launches.
+"""
+ACTING_ENVS = 16
+MINIBATCH_STEPS = 132
 """The paper's envs, and the steps of its minibatch of them all: 128 and 4 before them."""
 
 Run = Callable[..., Tensor]
@@ -36,13 +51,20 @@ Key = TypeVar("Key")
 T = TypeVar("T")
 
 
-def unbind_loop(a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None) -> Tensor:
-    """The loop that is fastest under autograd; the function of ``linear_scan`` for one state ``h0`` or none.
+def unbind_loop(
+    a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None
+) -> Tensor:
+    """The loop that is fastest under autograd; the function of ``linear_scan`` for one state ``h0``
+    or none.
 
     Indexing ``b[:, t]`` instead makes the backward pass quadratic in T.
     """
     h = b.new_zeros(b[:, 0].shape) if h0 is None else h0
-    begins = [None] * b.shape[1] if start is None else start.reshape(*start.shape, *[1] * (b.ndim - 2)).unbind(1)
+    begins = (
+        [None] * b.shape[1]
+        if start is None
+        else start.reshape(*start.shape, *[1] * (b.ndim - 2)).unbind(1)
+    )
     states = []
     for a_t, b_t, begins_t in zip(a.expand(b.shape).unbind(1), b.unbind(1), begins, strict=True):
         h = torch.addcmul(b_t, a_t, h if begins_t is None else h.masked_fill(begins_t, 0))
@@ -58,17 +80,21 @@ def _matrix_loop(*args: Any) -> tuple[Tensor, Tensor]:
 LOOPS: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "lru": (lru, "linear_scan", unbind_loop),
     "mingru": (mingru, "linear_scan", unbind_loop),
-    **{name: (fast_weights, "matrix_scan", _matrix_loop) for name in ("linear_transformer", "gdn", "ttt")},
+    **{
+        name: (fast_weights, "matrix_scan", _matrix_loop)
+        for name in ("linear_transformer", "gdn", "ttt")
+    },
 }
 """Models that scan, and the plain loop over time in place of their scan: module, name, loop."""
 
 
 @dataclass
 class Options(BenchOptions):
-    """Time of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; and of saliency.
+    """Time of the memory models, each scan beside its own loop and torch.nn.GRU; of the scans; and
+    of saliency.
 
-    Measures take turns; the best turn counts. The scans stand beside a copy of the bytes that they have to read and
-    write, the least that any form of them could take.
+    Measures take turns; the best turn counts. The scans stand beside a copy of the bytes that they
+    have to read and write, the least that any form of them could take.
 
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
@@ -87,18 +113,30 @@ class Options(BenchOptions):
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the tables ``models``, ``scans`` and ``saliency``."""
-    batch, size = options.batch, options.size
+    batch = options.batch
+    size = options.size
     at_least(options, steps=1, layers=1, size=1, batch=1, frames=1, threads=1, repeats=1)
-    if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
-        raise ValueError(f"device must be cpu, or cuda where torch finds a card, got {options.device!r}")
-    device, how = torch.device(options.device), (options.seconds, options.repeats)
+    if options.device != "cpu" and not (
+        options.device.startswith("cuda") and torch.cuda.is_available()
+    ):
+        raise ValueError(
+            f"device must be cpu, or cuda where torch finds a card, got {options.device!r}"
+        )
+    device = torch.device(options.device)
+    how = (options.seconds, options.repeats)
     with torch_threads(options.threads):
         for steps, layers in product(options.steps, options.layers):
             log(f"memory models, T = {steps}, layers: {layers}")
             compared = forms(options.memories or memory_names(), layers, size, device)
-            inputs = torch.randn(batch, steps, size, device=device), torch.rand(batch, steps, device=device) < RESETS
+            inputs = (
+                torch.randn(batch, steps, size, device=device),
+                torch.rand(batch, steps, device=device) < RESETS,
+            )
             for (model, form), found in time_passes(compared, _learn, inputs, *how).items():
-                yield "models", {"model": model, "form": form, "layers": layers, "steps": steps} | found
+                yield (
+                    "models",
+                    {"model": model, "form": form, "layers": layers, "steps": steps} | found,
+                )
         for steps in options.steps:
             log(f"scans, T = {steps}")
             yield from (("scans", row) for row in bench_scans(batch, steps, size, device, *how))
@@ -109,7 +147,8 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
 def forms(
     names: Sequence[str], layers: int, size: int, device: torch.device | str = "cpu"
 ) -> dict[tuple[str, str], Run]:
-    """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T]) to y.
+    """What is compared: (model, "scan", "loop", "torch" or "own") -> (x [B, T, H], is_init [B, T])
+    to y.
 
     A model is a number of cells one above the other and nothing between, as in ``torch.nn.GRU``.
     """
@@ -144,8 +183,11 @@ def time_passes(
     repeats: int,
     around: Callable[[Key, Callable[[], object]], Callable[[], object]] = lambda key, work: work,
 ) -> dict[Key, dict[str, float]]:
-    """Best milliseconds of the forward pass alone and of both passes, measured in turns, each inside ``around``."""
-    leaves, measures = [x.clone().requires_grad_(x.dtype != torch.bool) for x in inputs], dict[str, Measure]()
+    """Best milliseconds of the forward pass alone and of both passes, measured in turns, each
+    inside ``around``.
+    """
+    leaves = [x.clone().requires_grad_(x.dtype != torch.bool) for x in inputs]
+    measures = dict[str, Measure]()
 
     def both(run: Run) -> None:
         for leaf in leaves:
@@ -153,10 +195,16 @@ def time_passes(
         backward(run(*leaves))
 
     for key, run in runs.items():
-        for part, work in (("forward", torch.no_grad()(partial(run, *inputs))), ("both", partial(both, run))):
+        for part, work in (
+            ("forward", torch.no_grad()(partial(run, *inputs))),
+            ("both", partial(both, run)),
+        ):
             measures[f"{key} {part}"] = _repeated(around(key, work), inputs[0].device)
     found = interleaved(measures, seconds, repeats, warm_ups=1)
-    return {key: {f"{part}_ms": found[f"{key} {part}"].best_ms for part in ("forward", "both")} for key in runs}
+    return {
+        key: {f"{part}_ms": found[f"{key} {part}"].best_ms for part in ("forward", "both")}
+        for key in runs
+    }
 
 
 def _learn(y: Tensor) -> None:
@@ -164,7 +212,9 @@ def _learn(y: Tensor) -> None:
 
 
 def scan_forms(device: torch.device) -> tuple[str, ...]:
-    """Ways to solve h_t = a_t h_{t-1} + b_t: the back ends for the device, and a loop under autograd."""
+    """Ways to solve h_t = a_t h_{t-1} + b_t: the back ends for the device, and a loop under
+    autograd.
+    """
     if device.type != "cuda":
         return "serial", "doubling", LOOP
     return (*(["triton"] if runs_triton(torch.empty(0, device=device)) else []), "doubling", LOOP)
@@ -178,43 +228,69 @@ def solve(form: str, work: Callable[[], T]) -> Callable[[], T]:
 def bench_scans(
     batch: int, steps: int, size: int, device: torch.device, seconds: float, repeats: int
 ) -> Iterator[dict[str, Any]]:
-    """Every form in turns, one row each, real and complex, from zeros, starts folded in as a_t = 0; then a copy."""
+    """Every form in turns, one row each, real and complex, from zeros, starts folded in as a_t = 0;
+    then a copy.
+    """
     doubles = {torch.float32: torch.float64, torch.complex64: torch.complex128}
     for numbers, (dtype, exact) in zip(("real", "complex"), doubles.items(), strict=True):
         a, b = (torch.randn(batch, steps, size, dtype=dtype, device=device) for _ in "ab")
         a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, steps, size, device=device)
         a[torch.rand(batch, steps, device=device) < RESETS] = 0
-        compared: dict[str, Run] = {name: unbind_loop if name == LOOP else linear_scan for name in scan_forms(device)}
-        backward, right = partial(Tensor.backward, gradient=torch.randn_like(b)), linear_scan(a.to(exact), b.to(exact))
+        compared: dict[str, Run] = {
+            name: unbind_loop if name == LOOP else linear_scan for name in scan_forms(device)
+        }
+        backward = partial(Tensor.backward, gradient=torch.randn_like(b))
+        right = linear_scan(a.to(exact), b.to(exact))
         times = time_passes(compared, backward, (a, b), seconds, repeats, solve)
         for name, form in compared.items():
             error = float((solve(name, partial(form, a, b))() - right).abs().max())
-            yield {"form": name, "steps": steps, "numbers": numbers} | times[name] | {"error": error}
-        one, both = (tensors * b.numel() // 2 for tensors in (FORWARD_TENSORS, FORWARD_TENSORS + BACKWARD_TENSORS))
-        source, target = (torch.zeros(both, dtype=dtype, device=device) for _ in "st")  # a copy reads and writes
-        copies = {"forward_ms": partial(target[:one].copy_, source[:one]), "both_ms": partial(target.copy_, source)}
-        found = interleaved({name: _repeated(copy, device) for name, copy in copies.items()}, seconds, repeats)
+            yield (
+                {"form": name, "steps": steps, "numbers": numbers} | times[name] | {"error": error}
+            )
+        one, both = (
+            tensors * b.numel() // 2
+            for tensors in (FORWARD_TENSORS, FORWARD_TENSORS + BACKWARD_TENSORS)
+        )
+        # a copy reads and writes
+        source, target = (torch.zeros(both, dtype=dtype, device=device) for _ in "st")
+        copies = {
+            "forward_ms": partial(target[:one].copy_, source[:one]),
+            "both_ms": partial(target.copy_, source),
+        }
+        found = interleaved(
+            {name: _repeated(copy, device) for name, copy in copies.items()}, seconds, repeats
+        )
         least = {name: measured.best_ms for name, measured in found.items()}
         yield {"form": COPY, "steps": steps, "numbers": numbers} | least | {"error": 0.0}
 
 
-def bench_saliency(frames: int, device: torch.device, seconds: float, repeats: int) -> list[dict[str, Any]]:
-    """Maps of one decision on the small network with LRU: two stages against the whole network action by action."""
+def bench_saliency(
+    frames: int, device: torch.device, seconds: float, repeats: int
+) -> list[dict[str, Any]]:
+    """Maps of one decision on the small network with LRU: two stages against the whole network
+    action by action.
+    """
     from arcade_torch.agents import preset
     from arcade_torch.agents.policy import build_network
     from arcade_torch.tools.analysis.pixel_saliency import saliency
 
     network: Any = build_network(preset("small", memory="lru", device=str(device))).eval()
     seen = torch.randint(0, 256, (frames, 128, 128, 3), dtype=torch.uint8, device=device)
-    actions, starts = torch.randint(0, 5, (frames,), device=device), torch.arange(frames, device=device) == 0
+    actions = torch.randint(0, 5, (frames,), device=device)
+    starts = torch.arange(frames, device=device) == 0
 
     def whole() -> None:
         x = seen.float().requires_grad_()
-        q, _ = network.remember(network.encode(x)[None], actions[None], starts[None], network.initial_state(1))
+        q, _ = network.remember(
+            network.encode(x)[None], actions[None], starts[None], network.initial_state(1)
+        )
         for value in q[0, -1]:
             torch.autograd.grad(value, x, retain_graph=True)[0].square().sum(-1)
 
-    ways = {"two stages": Measure(partial(saliency, network, seen, actions, starts)), "whole network": Measure(whole)}
+    ways = {
+        "two stages": Measure(partial(saliency, network, seen, actions, starts)),
+        "whole network": Measure(whole),
+    }
     found = interleaved(ways, seconds, repeats, warm_ups=1)
     return [{"way": way, "frames": frames, "both_ms": found[way].best_ms} for way in ways]
 
@@ -226,7 +302,9 @@ class MemoryCost(NamedTuple):
     state_numbers: int  # numbers in the recurrent state of one env
     state_bytes: int
     products: int
-    """Multiply-adds in matrix products of one acting step (forward, one env); elementwise work is left out."""
+    """Multiply-adds in matrix products of one acting step (forward, one env); elementwise work is
+    left out.
+    """
 
 
 def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
@@ -234,17 +312,22 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
     state = memory.initial_state(1)  # type: ignore[operator]
     leaves = list(state.values(True, True))
     like = next(memory.parameters())
-    x, is_init = like.new_zeros(1, 1, input_size), torch.zeros(1, 1, dtype=torch.bool, device=like.device)
+    x = like.new_zeros(1, 1, input_size)
+    is_init = torch.zeros(1, 1, dtype=torch.bool, device=like.device)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         memory(x, state, is_init)
     state_size = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
-    return MemoryCost(sum(p.numel() for p in memory.parameters()), *state_size, counter.get_total_flops() // 2)
+    return MemoryCost(
+        sum(p.numel() for p in memory.parameters()), *state_size, counter.get_total_flops() // 2
+    )
 
 
 def time_memories(
     names: Sequence[str], size: int, *, seconds: float = 0.3, repeats: int = 3
 ) -> dict[str, tuple[float, float]]:
-    """Microseconds of one cell for one step of one env, on one thread: acting (16 envs), learning (16 x 132 steps)."""
+    """Microseconds of one cell for one step of one env, on one thread: acting (16 envs), learning
+    (16 x 132 steps).
+    """
     cells = {}
     for name in names:
         memory = make_memory(name, size, size)
@@ -253,8 +336,15 @@ def time_memories(
     found = []
     with torch_threads(1):
         for steps in (1, MINIBATCH_STEPS):
-            inputs = (torch.randn(ACTING_ENVS, steps, size), torch.rand(ACTING_ENVS, steps) < RESETS)
+            inputs = (
+                torch.randn(ACTING_ENVS, steps, size),
+                torch.rand(ACTING_ENVS, steps) < RESETS,
+            )
             found.append(time_passes(cells, _learn, inputs, seconds, repeats))
     acting, learning = found
-    act, learn = 1e3 / ACTING_ENVS, 1e3 / (ACTING_ENVS * MINIBATCH_STEPS)
-    return {name: (act * acting[name]["forward_ms"], learn * learning[name]["both_ms"]) for name in names}
+    act = 1e3 / ACTING_ENVS
+    learn = 1e3 / (ACTING_ENVS * MINIBATCH_STEPS)
+    return {
+        name: (act * acting[name]["forward_ms"], learn * learning[name]["both_ms"])
+        for name in names
+    }

@@ -1,12 +1,15 @@
-"""Delayed recall: see one of four symbols, wait among distractors, name it when asked. Plain supervised learning.
+"""Delayed recall: see one of four symbols, wait among distractors, name it when asked. Plain
+supervised learning.
 
-Every step shows one token, one-hot: 0 to 3 are the symbols, 4 to 7 distractors, 8 asks. An episode shows a symbol at
-its first step, then ``delay`` distractors, then asks. A quarter of the episodes end before, at any step, and the next
-one begins: windows hold starts in the middle. Only answers are scored; who remembers nothing gets one in four right.
+Every step shows one token, one-hot: 0 to 3 are the symbols, 4 to 7 distractors, 8 asks. An episode
+shows a symbol at its first step, then ``delay`` distractors, then asks. A quarter of the episodes
+end before, at any step, and the next one begins: windows hold starts in the middle. Only answers
+are scored; who remembers nothing gets one in four right.
 
 One setting serves every model at every delay: a memory block of one cell with its default options
-(`arcade_torch.models.MemoryBlock`) between the tokens and four logits, Adam. The curriculum: while training, half of
-the episodes wait for ``delay`` steps and the others for 1 to ``delay``, drawn evenly. Tests have the full delay alone.
+(`arcade_torch.models.MemoryBlock`) between the tokens and four logits, Adam. The curriculum: while
+training, half of the episodes wait for ``delay`` steps and the others for 1 to ``delay``, drawn
+evenly. Tests have the full delay alone.
 """
 
 import time
@@ -26,26 +29,35 @@ from arcade_torch.tools.files import markdown_table, measured_rows, write_betwee
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
 
-SYMBOLS, DISTRACTORS = 4, 4
+SYMBOLS = 4
+DISTRACTORS = 4
 ASK = SYMBOLS + DISTRACTORS
 TOKENS = ASK + 1
 CUT = 0.25
 """Share of the episodes that end before they ask."""
 UNLABELLED = -100  # what cross_entropy leaves out
-SEQUENCES, LEARNING_RATE, MAX_NORM, CHECK_EVERY = 32, 3e-3, 1.0, 25
+SEQUENCES = 32
+LEARNING_RATE = 3e-3
+MAX_NORM = 1.0
+CHECK_EVERY = 25
 """Of a batch; of Adam; of the gradient; steps between two looks at whether it is solved."""
 SOLVED = 0.99
-FIRST_LOOK, ANSWERS = 200, 2000
-"""Answers in the test that decides whether the final one is worth its time, and in the final one, at least."""
-BEGIN, END = "<!-- recall -->", "<!-- end of recall -->"
+FIRST_LOOK = 200
+ANSWERS = 2000
+"""Answers in the test that decides whether the final one is worth its time, and in the final one,
+at least.
+"""
+BEGIN = "<!-- recall -->"
+END = "<!-- end of recall -->"
 
 
 @dataclass
 class Options(BenchOptions):
     """Delayed recall: see one of four symbols, wait among distractors, name it when asked.
 
-    Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget is spent; chance is
-    25 %. Keeps a CSV file that it goes on with after an interruption, and can write the table into a Markdown page.
+    Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget
+    is spent; chance is 25 %. Keeps a CSV file that it goes on with after an interruption, and can
+    write the table into a Markdown page.
 
     Example: arcade-torch bench recall lru attention --delays 8 32 --out recall.csv
     """
@@ -79,7 +91,8 @@ class Recall(NamedTuple):
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Rows of the table ``recall``; those that the file holds already are not measured again."""
     at_least(options, seconds=0.01, hidden_size=1, delays=1, seed=0)
-    sizes, asked = (options.hidden_size, options.seed), []
+    sizes = (options.hidden_size, options.seed)
+    asked = []
 
     def measure(memory: str, delay: int, hidden_size: int, seed: int) -> Recall:
         log(f"{memory}, delay {delay}")
@@ -106,15 +119,19 @@ def windows(rng: np.random.Generator, rows: int, delay: int, *, mixed: bool = Fa
     """Draw sequences of 2 (delay + 2) steps, episode after episode."""
     length = 2 * (delay + 2)
     tokens = SYMBOLS + rng.integers(DISTRACTORS, size=(rows, length))
-    starts, answers = np.zeros((rows, length), bool), np.full((rows, length), UNLABELLED)
-    begin, row = np.zeros(rows, int), np.arange(rows)
+    starts = np.zeros((rows, length), bool)
+    answers = np.full((rows, length), UNLABELLED)
+    begin = np.zeros(rows, int)
+    row = np.arange(rows)
     while (begin < length).any():
-        symbol, wait = rng.integers(SYMBOLS, size=rows), np.full(rows, delay)
+        symbol = rng.integers(SYMBOLS, size=rows)
+        wait = np.full(rows, delay)
         if mixed:
             wait = np.where(rng.random(rows) < 0.5, wait, rng.integers(1, delay + 1, size=rows))
         cut = rng.random(rows) < CUT
         asked = begin + wait + 1
-        inside, asks = begin < length, ~cut & (asked < length)
+        inside = begin < length
+        asks = ~cut & (asked < length)
         tokens[row[inside], begin[inside]] = symbol[inside]
         starts[row[inside], begin[inside]] = True
         tokens[row[asks], asked[asks]] = ASK
@@ -132,7 +149,9 @@ class Reader(nn.Module):
         self.head = nn.Linear(hidden_size, SYMBOLS)
 
     def forward(self, batch: Windows) -> tuple[Tensor, Tensor]:
-        """Where a symbol is asked for: logits of the four, float [answers, 4], and the right one, int64 [answers]."""
+        """Where a symbol is asked for: logits of the four, float [answers, 4], and the right one,
+        int64 [answers].
+        """
         x = nn.functional.one_hot(batch.tokens, TOKENS).to(self.head.weight.dtype)
         y, _ = self.block(x, self.block.initial_state(len(x)), batch.is_init)
         asked = batch.answers != UNLABELLED
@@ -140,14 +159,22 @@ class Reader(nn.Module):
 
 
 def train(
-    memory: str, delay: int, hidden_size: int = 64, seconds: float = 60.0, seed: int = 0, answers: int = ANSWERS
+    memory: str,
+    delay: int,
+    hidden_size: int = 64,
+    seconds: float = 60.0,
+    seed: int = 0,
+    answers: int = ANSWERS,
 ) -> Recall:
     """Train one model until it is right or the budget is spent, then test it on fresh data."""
     torch.manual_seed(seed)
     data, tests = (np.random.default_rng([seed, delay, part]) for part in range(2))
     reader = Reader(memory, hidden_size)
     optimizer = torch.optim.Adam(reader.parameters(), LEARNING_RATE)
-    steps, spent, right, answered = 0, 0.0, 0.0, 0
+    steps = 0
+    spent = 0.0
+    right = 0.0
+    answered = 0
     while right < SOLVED and spent < seconds:
         began = time.process_time()
         for _ in range(CHECK_EVERY):
@@ -156,7 +183,8 @@ def train(
             loss.backward()
             nn.utils.clip_grad_norm_(reader.parameters(), MAX_NORM)
             optimizer.step()
-        steps, spent = steps + CHECK_EVERY, spent + time.process_time() - began
+        steps = steps + CHECK_EVERY
+        spent = spent + time.process_time() - began
         if accuracy(reader, tests, delay, FIRST_LOOK)[0] >= SOLVED or spent >= seconds:
             right, answered = accuracy(reader, tests, delay, answers)
     parameters = sum(p.numel() for p in reader.parameters())
@@ -166,8 +194,12 @@ def train(
 
 
 @torch.no_grad()
-def accuracy(reader: Reader, rng: np.random.Generator, delay: int, answers: int) -> tuple[float, int]:
-    """Share of right answers to ``answers`` fresh questions or a few more, and how many they were."""
+def accuracy(
+    reader: Reader, rng: np.random.Generator, delay: int, answers: int
+) -> tuple[float, int]:
+    """Share of right answers to ``answers`` fresh questions or a few more, and how many they
+    were.
+    """
     right = asked = 0
     while asked < answers:
         logits, wanted = reader(windows(rng, 128, delay))
@@ -178,12 +210,17 @@ def accuracy(reader: Reader, rng: np.random.Generator, delay: int, answers: int)
 
 def markdown(rows: Sequence[Recall]) -> str:
     """The rows as a Markdown table: a line a model, a column a delay."""
-    lines, delays = [], sorted({row.delay for row in rows})
+    lines = []
+    delays = sorted({row.delay for row in rows})
     for model, one in {row.model: row for row in rows}.items():
         cells = dict.fromkeys(delays, "")
         for row in (row for row in rows if row.model == model):
             effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
             solved = "" if row.accuracy >= SOLVED else "not solved: "
             cells[row.delay] = f"{100 * row.accuracy:.1f} % ({solved}{effort})"
-        lines.append([f"`{model}`", *cells.values(), f"{one.parameters:,}", f"{one.state_numbers:,}"])
-    return markdown_table(["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines)
+        lines.append(
+            [f"`{model}`", *cells.values(), f"{one.parameters:,}", f"{one.state_numbers:,}"]
+        )
+    return markdown_table(
+        ["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines
+    )

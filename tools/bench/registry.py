@@ -1,9 +1,11 @@
-"""The benchmarks by name, the file that holds their tables, its page, and the comparison of two such files.
+"""The benchmarks by name, the file that holds their tables, its page, and the comparison of two
+such files.
 
 ::
 
     {"format": 1, "machine": {...}, "size": "quick",
-     "tables": {"envs": {"rows": [{"game": ..., "num_envs": 128, "frames_per_s": 22000.0}, ...]}, ...}}
+     "tables": {"envs": {"rows": [{"game": ..., "num_envs": 128, "frames_per_s": 22000.0}, ...]},
+     ...}}
 """
 
 import math
@@ -24,14 +26,22 @@ BENCHES = {
     "memory": "time of the memory models, of the scans behind them, and of saliency",
     "recall": "delayed recall: which model remembers one symbol for how long",
 }
-"""Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`) and ``run(options, log)``, which
-yields ``(table, row)``."""
+"""Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`) and
+``run(options, log)``, which yields ``(table, row)``."""
 SIZES: dict[str, dict[str, dict[str, Any]]] = {
     "tiny": {
         "envs": {"games": ("SignpostEasy",), "batches": (2,), "seconds": 0.01, "repeats": 1},
         "train": {"networks": ("small",), "memories": ("mlp",), "grad_steps": 1, "repeats": 1},
-        "memory": {"memories": ("gru",), "steps": (8,), "layers": (1,), "size": 8, "batch": 2, "frames": 4,
-                   "seconds": 0.01, "repeats": 1},
+        "memory": {
+            "memories": ("gru",),
+            "steps": (8,),
+            "layers": (1,),
+            "size": 8,
+            "batch": 2,
+            "frames": 4,
+            "seconds": 0.01,
+            "repeats": 1,
+        },
         "recall": {"memories": ("gru",), "delays": (2,), "seconds": 0.5},
     },
     "quick": {
@@ -41,7 +51,7 @@ SIZES: dict[str, dict[str, dict[str, Any]]] = {
         "recall": {"memories": ("lru", "mingru", "gru"), "delays": (8,), "seconds": 10.0},
     },
     "full": {"envs": {"sizes": (128, 256)}},
-}  # fmt: skip
+}
 """Size of ``bench all`` -> the options of each benchmark that differ from its own."""
 
 
@@ -51,12 +61,17 @@ class BenchOptions:
 
     resumable: ClassVar[bool] = False
     out: Path | None = None
-    """File for the numbers, .json or .csv (of several tables one file each, its name added); overwritten."""
-    keep_memory: bool = False  # Have the C library keep freed memory, as train does and a loop of your own does not.
+    """File for the numbers, .json or .csv (of several tables one file each, its name added);
+    overwritten.
+    """
+    # Have the C library keep freed memory, as train does and a loop of your own does not.
+    keep_memory: bool = False
 
 
 class Kind(NamedTuple):
-    """A table: what it measures, columns that say what a row is about, measured columns and their units."""
+    """A table: what it measures, columns that say what a row is about, measured columns and their
+    units.
+    """
 
     title: str
     key: tuple[str, ...]
@@ -66,16 +81,29 @@ class Kind(NamedTuple):
 MORE_IS_BETTER = ("frames/s", "share")
 _TIMES = {"forward_ms": "ms", "both_ms": "ms"}
 TABLES: dict[str, Kind] = {
-    "envs": Kind("Environments: frames per second, every frame consumed",
-                 ("game", "obs_size", "num_envs", "measure"), {"frames_per_s": "frames/s"}),
-    "train": Kind("Training with PQN: frames per second", ("network", "memory", "form", "num_envs", "num_steps"),
-                  dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s")),
-    "models": Kind("Memory models over whole sequences", ("model", "form", "layers", "steps"), _TIMES),
+    "envs": Kind(
+        "Environments: frames per second, every frame consumed",
+        ("game", "obs_size", "num_envs", "measure"),
+        {"frames_per_s": "frames/s"},
+    ),
+    "train": Kind(
+        "Training with PQN: frames per second",
+        ("network", "memory", "form", "num_envs", "num_steps"),
+        dict.fromkeys(("collect_fps", "learn_fps", "train_fps"), "frames/s"),
+    ),
+    "models": Kind(
+        "Memory models over whole sequences", ("model", "form", "layers", "steps"), _TIMES
+    ),
     "scans": Kind("The linear scan in every form", ("form", "steps", "numbers"), _TIMES),
-    "saliency": Kind("Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms"}),
-    "recall": Kind("Delayed recall: right answers, and processor time until they were right",
-                   ("model", "delay", "hidden_size", "seed"), {"accuracy": "share", "seconds": "s"}),
-}  # fmt: skip
+    "saliency": Kind(
+        "Saliency of one decision, small network", ("way", "frames"), {"both_ms": "ms"}
+    ),
+    "recall": Kind(
+        "Delayed recall: right answers, and processor time until they were right",
+        ("model", "delay", "hidden_size", "seed"),
+        {"accuracy": "share", "seconds": "s"},
+    ),
+}
 """What a file may hold; whoever adds a benchmark adds its tables here."""
 
 
@@ -84,8 +112,12 @@ def module_of(name: str) -> Any:
     return import_module(f"arcade_torch.tools.bench.{name}")
 
 
-def measure(benches: Mapping[str, BenchOptions], size: str, log: Callable[[str], None]) -> dict[str, Any]:
-    """Run benchmarks one after another, those that keep freed memory last; the content of a file, four digits."""
+def measure(
+    benches: Mapping[str, BenchOptions], size: str, log: Callable[[str], None]
+) -> dict[str, Any]:
+    """Run benchmarks one after another, those that keep freed memory last; the content of a file,
+    four digits.
+    """
     from arcade_torch.tools.machine import keep_freed_memory, machine
 
     tables: dict[str, Any] = {}
@@ -94,16 +126,25 @@ def measure(benches: Mapping[str, BenchOptions], size: str, log: Callable[[str],
         if name in kept:
             keep_freed_memory()
         for table, row in module_of(name).run(benches[name], log):
-            short = {key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in row.items()}
+            short = {
+                key: float(f"{value:.4g}") if isinstance(value, float) else value
+                for key, value in row.items()
+            }
             tables.setdefault(table, {"rows": []})["rows"].append(short)
     about = machine() | {"keep_memory": ", ".join(kept) or "no"}
     return {"format": FORMAT, "machine": about, "size": size, "tables": tables}
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a file of ``arcade-torch bench all``; a ``ValueError`` if it is none, or a number in it is none."""
+    """Read a file of ``arcade-torch bench all``; a ``ValueError`` if it is none, or a number in it
+    is none.
+    """
     values = read_json(path)
-    if not isinstance(values, dict) or values.get("format") != FORMAT or not isinstance(values.get("tables"), dict):
+    if (
+        not isinstance(values, dict)
+        or values.get("format") != FORMAT
+        or not isinstance(values.get("tables"), dict)
+    ):
         raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
     if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
         raise ValueError(f"{path} does not say on which machine and at what size it was measured")
@@ -120,7 +161,8 @@ def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
     for name, table in results["tables"].items():
         if name not in TABLES:
             raise ValueError(f"unknown table {name!r}; known are {', '.join(TABLES)}")
-        rows, kind = table.get("rows") if isinstance(table, dict) else None, TABLES[name]
+        rows = table.get("rows") if isinstance(table, dict) else None
+        kind = TABLES[name]
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise ValueError(f"table {name} has no list of rows")
         for row in rows:
@@ -129,27 +171,49 @@ def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
             about = " ".join(", ".join(f"{column} {row[column]}" for column in kind.key).split())
             for column in kind.numbers:
                 value = row[column]
-                if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e15:
-                    raise ValueError(f"{name}, {about}: {column} is {value!r}, wanted a number from 0 up")
+                if (
+                    isinstance(value, bool)
+                    or not isinstance(value, int | float)
+                    or not 0 <= value < 1e15
+                ):
+                    raise ValueError(
+                        f"{name}, {about}: {column} is {value!r}, wanted a number from 0 up"
+                    )
                 if (name, about, column) in found:
                     raise ValueError(f"table {name} has two rows for {about}")
                 found[name, about, column] = float(value)
     return found
 
 
-def compare(old: Mapping[str, Any], new: Mapping[str, Any], tolerance: float) -> dict[str, list[str]]:
-    """What became of an old file in a new one: verdict -> a line for each number; a share of tolerance is the same."""
-    before, after = _numbers(old), _numbers(new)
-    found: dict[str, list[str]] = {verdict: [] for verdict in ("same", "worse", "better", "missing", "new")}
+def compare(
+    old: Mapping[str, Any], new: Mapping[str, Any], tolerance: float
+) -> dict[str, list[str]]:
+    """What became of an old file in a new one: verdict -> a line for each number; a share of
+    tolerance is the same.
+    """
+    before = _numbers(old)
+    after = _numbers(new)
+    found: dict[str, list[str]] = {
+        verdict: [] for verdict in ("same", "worse", "better", "missing", "new")
+    }
     for key in before | after:
-        (table, row, column), was, now = key, before.get(key), after.get(key)
-        ratio, unit = 1.0, TABLES[table].numbers[column]
+        (table, row, column) = key
+        was = before.get(key)
+        now = after.get(key)
+        ratio = 1.0
+        unit = TABLES[table].numbers[column]
         if was is None or now is None:
             verdict = "new" if was is None else "missing"
         else:
             good, bad = (now, was) if unit in MORE_IS_BETTER else (was, now)
             ratio = 1.0 if was == now else good / bad if bad else math.inf
-            verdict = "worse" if ratio < 1 - tolerance else "better" if ratio > 1 / (1 - tolerance) else "same"
+            verdict = (
+                "worse"
+                if ratio < 1 - tolerance
+                else "better"
+                if ratio > 1 / (1 - tolerance)
+                else "same"
+            )
         values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (was, now))
         found[verdict].append(f"{table}: {row}: {column} {values} {unit} (x {ratio:.2f})")
     return found

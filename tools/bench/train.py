@@ -1,4 +1,6 @@
-"""Frames per second of training with PQN: collecting, learning, both, and the share of every kind of operation."""
+"""Frames per second of training with PQN: collecting, learning, both, and the share of every kind
+of operation.
+"""
 
 import dataclasses
 import itertools
@@ -16,18 +18,26 @@ from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
 
-FORMS = {"eager": {}, "amp": {"amp": True}, "compiled": {"compile": True}, "graphs": {"cuda_graphs": True}}
+FORMS = {
+    "eager": {},
+    "amp": {"amp": True},
+    "compiled": {"compile": True},
+    "graphs": {"cuda_graphs": True},
+}
 """Ways to run a network, by the settings of a run that ask for them."""
 
 
 @dataclass
 class Options(BenchOptions):
-    """Frames per second of training with PQN: collecting, learning, both, and where the time of learning goes.
+    """Frames per second of training with PQN: collecting, learning, both, and where the time of
+    learning goes.
 
-    The trainer of arcade-torch train is timed with the numbers of the presets of that name: paper has 16 envs x 128
-    steps and 64 gradient steps an update, small 64 x 32 and 32. Freed memory is kept, as there.
+    The trainer of arcade-torch train is timed with the numbers of the presets of that name: paper
+    has 16 envs x 128 steps and 64 gradient steps an update, small 64 x 32 and 32. Freed memory is
+    kept, as there.
 
-    Example: arcade-torch bench train --networks small --memories lru gru --threads 1 --out runs/train.csv
+    Example: arcade-torch bench train --networks small --memories lru gru --threads 1 --out
+    runs/train.csv
     """
 
     networks: tuple[str, ...] = ("paper", "small")  # Presets of network and learner: paper, small.
@@ -35,11 +45,14 @@ class Options(BenchOptions):
     env: str = "MineSweeperEasy"  # The game; its POMDP twin is played.
     device: str = "cpu"  # Torch device of the network.
     forms: tuple[str, ...] = ("eager",)
-    """How networks are run: eager, amp, compiled, graphs (CUDA graphs while acting), or several joined by "+"."""
+    """How networks are run: eager, amp, compiled, graphs (CUDA graphs while acting), or several
+    joined by "+".
+    """
     threads: int = 0  # Torch threads; 0 leaves the setting alone.
     grad_steps: int = 4  # Gradient steps in each timed pass; those of an update are all alike.
     repeats: int = 3  # Passes; the median counts.
-    keep_memory: bool = True  # Have the C library keep freed memory, as train does and a loop of your own does not.
+    # Have the C library keep freed memory, as train does and a loop of your own does not.
+    keep_memory: bool = True
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -61,36 +74,58 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
     """The preset of that name without its random play, run in that form."""
     settings: dict[str, Any] = {}
     for name in form.split("+"):
-        require(name in FORMS, "a form", form, f"{', '.join(FORMS)}, or several of them joined by '+'")
+        require(
+            name in FORMS, "a form", form, f"{', '.join(FORMS)}, or several of them joined by '+'"
+        )
         settings |= FORMS[name]
-    settings |= {"algorithm": "pqn", "env": options.env, "memory": memory, "observability": "partial"}
+    settings |= {
+        "algorithm": "pqn",
+        "env": options.env,
+        "memory": memory,
+        "observability": "partial",
+    }
     config = preset(network, device=options.device, **settings)
     most = config.learner.grad_steps_per_update
     require(
-        options.grad_steps <= most, "--grad-steps", options.grad_steps, f"at most {most} with the {network} network"
+        options.grad_steps <= most,
+        "--grad-steps",
+        options.grad_steps,
+        f"at most {most} with the {network} network",
     )
     return dataclasses.replace(config, pqn=dataclasses.replace(config.pqn, warmup_steps=0))
 
 
 def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
-    config, window = trainer.config.learner, [trainer.collector.collect()]
+    config = trainer.config.learner
+    window = [trainer.collector.collect()]
 
     def collect() -> None:
         window[:] = [trainer.collector.collect()]  # overwrites the window before
 
-    learner, every = trainer.learner, trainer.learner.minibatches
+    learner = trainer.learner
+    every = trainer.learner.minibatches
     learner.__dict__["minibatches"] = lambda rows: itertools.islice(every(rows), options.grad_steps)
 
     def learn() -> None:
         learner.update(window[0], 0)
 
-    frames, every_step = config.frames_per_update, config.grad_steps_per_update
+    frames = config.frames_per_update
+    every_step = config.grad_steps_per_update
     learned = round(frames * options.grad_steps / every_step)  # of an update's frames in a pass
     measures = {"collect": Measure(collect, units=frames), "learn": Measure(learn, units=learned)}
     found = interleaved(measures, seconds=1e-9, repeats=options.repeats, warm_ups=1)
-    collect_fps, learn_fps = found["collect"].rate, found["learn"].rate
-    row: dict[str, Any] = {"network": trainer.config.network, "memory": trainer.config.memory, "form": form}
+    collect_fps = found["collect"].rate
+    learn_fps = found["learn"].rate
+    row: dict[str, Any] = {
+        "network": trainer.config.network,
+        "memory": trainer.config.memory,
+        "form": form,
+    }
     row |= {"parameters": sum(p.numel() for p in trainer.network.parameters())}
     row |= {"num_envs": config.num_envs, "num_steps": config.num_steps, "grad_steps": every_step}
-    row |= {"collect_fps": collect_fps, "learn_fps": learn_fps, "train_fps": 1 / (1 / collect_fps + 1 / learn_fps)}
+    row |= {
+        "collect_fps": collect_fps,
+        "learn_fps": learn_fps,
+        "train_fps": 1 / (1 / collect_fps + 1 / learn_fps),
+    }
     return row | {f"learning: {kind}": value for kind, value in op_breakdown(learn).items()}

@@ -25,7 +25,9 @@ class Bench(Command):
 
     @classmethod
     def parse(cls, words: Sequence[str], prog: str) -> "Bench":
-        """Read the options of one benchmark; what comes before the first flag are the memory models."""
+        """Read the options of one benchmark; what comes before the first flag are the memory
+        models.
+        """
         name = prog.split()[-1]
         if words and not words[0].startswith("-") and name in ("memory", "recall"):
             words = ["--memories", *words]
@@ -33,14 +35,21 @@ class Bench(Command):
 
     def run(self) -> int:
         """Measure, print, save."""
-        out, about = self.options.out, vars(self.options)
+        out = self.options.out
+        about = vars(self.options)
         endings = (".csv",) if self.options.resumable else (".csv", ".json")
-        require(out is None or out.suffix in endings, "--out", str(out), f"a file that ends in {' or '.join(endings)}")
+        require(
+            out is None or out.suffix in endings,
+            "--out",
+            str(out),
+            f"a file that ends in {' or '.join(endings)}",
+        )
         results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():
             title, key, _ = registry.TABLES[name]
-            columns, cells = list(table["rows"][0]), [list(map(format_value, row.values())) for row in table["rows"]]
+            columns = list(table["rows"][0])
+            cells = [list(map(format_value, row.values())) for row in table["rows"]]
             names = next(place for place, column in enumerate(columns) if column not in key)
             Table(title, columns, cells, left=names).show()
         say(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
@@ -66,8 +75,15 @@ class BenchAll(Command):
     """
 
     size: Literal["tiny", "quick", "full"] = "quick"
-    """How much: tiny takes half a minute and proves nothing, quick about ten minutes, full an hour or more."""
-    benches: tuple[Literal["envs", "train", "memory", "recall"], ...] = ("envs", "train", "memory", "recall")
+    """How much: tiny takes half a minute and proves nothing, quick about ten minutes, full an hour
+    or more.
+    """
+    benches: tuple[Literal["envs", "train", "memory", "recall"], ...] = (
+        "envs",
+        "train",
+        "memory",
+        "recall",
+    )
     """Which of them."""
     out: Path = Path("results/bench.json")  # The file; overwritten.
     page: Path | None = None  # Markdown page of the tables; beside the file by default.
@@ -77,7 +93,8 @@ class BenchAll(Command):
         require(self.out.suffix == ".json", "--out", str(self.out), "a file that ends in .json")
         sizes = registry.SIZES[self.size]
         options: dict[str, Any] = {
-            name: registry.module_of(name).Options(**sizes.get(name, {}), out=None) for name in self.benches
+            name: registry.module_of(name).Options(**sizes.get(name, {}), out=None)
+            for name in self.benches
         }
         results = registry.measure(options, self.size, _log)
         say(write_json(self.out, results))
@@ -87,22 +104,30 @@ class BenchAll(Command):
 
 @dataclass
 class BenchCompare(Command):
-    """What became better or worse between two JSON files of bench, number by number; exit code 1 if something is worse.
+    """What became better or worse between two JSON files of bench, number by number; exit code 1 if
+    something is worse.
 
     Example: arcade-torch bench compare results/bench.json runs/bench.json --tolerance 0.2
     """
 
     old: tyro.conf.Positional[Path]  # The file to compare with.
     new: tyro.conf.Positional[Path]  # The file to judge.
-    tolerance: float = 0.2  # Share by which a number may be worse; machines that are not quiet need more.
+    # Share by which a number may be worse; machines that are not quiet need more.
+    tolerance: float = 0.2
 
     def run(self) -> int:
         """Compare and print."""
         require(0 < self.tolerance < 1, "--tolerance", self.tolerance, "between 0 and 1")
-        old, new = registry.read_results(self.old), registry.read_results(self.new)
-        was, now = old["machine"], new["machine"]
+        old = registry.read_results(self.old)
+        new = registry.read_results(self.new)
+        was = old["machine"]
+        now = new["machine"]
         about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
-        differs = [f"{name} {was.get(name)} and {now.get(name)}" for name in about if was.get(name) != now.get(name)]
+        differs = [
+            f"{name} {was.get(name)} and {now.get(name)}"
+            for name in about
+            if was.get(name) != now.get(name)
+        ]
         if differs:
             say(f"not the same machine: {', '.join(differs)}")
         changes = registry.compare(old, new, self.tolerance)
@@ -118,7 +143,9 @@ def _log(text: str) -> None:
 
 
 def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
-    """One JSON file, or a CSV file a table that repeats in every row what is known of the machine."""
+    """One JSON file, or a CSV file a table that repeats in every row what is known of the
+    machine.
+    """
     if out.suffix == ".json":
         return [write_json(out, results)]
     paths = []

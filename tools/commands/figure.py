@@ -1,7 +1,7 @@
 """``arcade-torch figure NAME`` and ``arcade-torch analyze NAME``: two words for one thing.
 
-They differ in where the files go by default: ``figure`` writes into ``figures``, ``analyze`` into the analysis folder
-of the first run.
+They differ in where the files go by default: ``figure`` writes into ``figures``, ``analyze`` into
+the analysis folder of the first run.
 """
 
 import sys
@@ -31,18 +31,32 @@ class Figure(Command):
 
     @classmethod
     def parse(cls, words: Sequence[str], prog: str) -> "Figure":
-        """Read the options of one figure; runs are named with or without ``--runs``, which goes in front."""
+        """Read the options of one figure; runs are named with or without ``--runs``, which goes in
+        front.
+        """
         _, group, name = prog.split()
         entry = FIGURES[name]
-        starts = [0, *(place for place, word in enumerate(words) if word.startswith("--")), len(words)]
-        parts = sorted((words[a:b] for a, b in pairwise(starts)), key=lambda one: not "".join(one).startswith("--runs"))
-        words = [word.removeprefix("--runs=") for part in parts for word in part if word != "--runs"]
+        starts = [
+            0,
+            *(place for place, word in enumerate(words) if word.startswith("--")),
+            len(words),
+        ]
+        parts = sorted(
+            (words[a:b] for a, b in pairwise(starts)),
+            key=lambda one: not "".join(one).startswith("--runs"),
+        )
+        words = [
+            word.removeprefix("--runs=") for part in parts for word in part if word != "--runs"
+        ]
         Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
-        entry.options.__doc__ = f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
+        entry.options.__doc__ = (
+            f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
+        )
         options: Any = parse_options(entry.options, words, prog)
         if group == "analyze" and options.out is None and options.runs and options.runs[0].is_dir():
             first = options.runs[0]
-            run = first.parent.parent if (first / "meta.json").is_file() else first  # of a checkpoint
+            # of a checkpoint
+            run = first.parent.parent if (first / "meta.json").is_file() else first
             options = replace(options, out=run / "analysis")
         return cls(name, options)
 

@@ -21,10 +21,12 @@ BASELINES = Path("baselines.csv")
 
 @dataclass
 class List(Command):
-    """Show the games, the memory models and what they cost, what players earn in the games, or a picture of the games.
+    """Show the games, the memory models and what they cost, what players earn in the games, or a
+    picture of the games.
 
-    list baselines lets the random player and both scripted players play; it keeps a CSV file that it goes on with after
-    an interruption. list sheet draws both twins of every game, or, with --steps, some moments of one episode.
+    list baselines lets the random player and both scripted players play; it keeps a CSV file that
+    it goes on with after an interruption. list sheet draws both twins of every game, or, with
+    --steps, some moments of one episode.
 
     Example: arcade-torch list memories --measure
     """
@@ -33,7 +35,8 @@ class List(Command):
     """What to show; all: envs and memories."""
     games: tyro.conf.Positional[tuple[str, ...]] = ()
     """For baselines and sheet: ids; all, or the ten games of one level, by default."""
-    measure: bool = False  # Also time the memory models on this machine, on one thread (about a minute).
+    # Also time the memory models on this machine, on one thread (about a minute).
+    measure: bool = False
     episodes: int = 1000  # For baselines: of each player in each game, at most.
     seconds: float = 60.0  # For baselines: for each player in each game; what is begun is finished.
     page: Path | None = None  # For baselines: Markdown page that gets the table between its marks.
@@ -51,12 +54,16 @@ class List(Command):
         """What to type after an interruption."""
         if self.what != "baselines":
             return super().resume_hint()
-        return f"finished rows are in {self.out or BASELINES}; the same command goes on with the others"
+        return (
+            f"finished rows are in {self.out or BASELINES}; the same command goes on with the "
+            "others"
+        )
 
     def _baselines(self) -> None:
         at_least(self, episodes=1, seconds=0)
         ids = [resolve_id(name) for name in self.games] or registered_ids()
-        rows, total = [], len(ids) * len(players.PLAYERS)
+        rows = []
+        total = len(ids) * len(players.PLAYERS)
         with Bars() as bars:
             for row in players.measure_all(ids, self.episodes, self.seconds, self.out or BASELINES):
                 rows.append(row)
@@ -79,16 +86,22 @@ class List(Command):
 
     def _envs(self) -> None:
         games = [make(env_id) for env_id in registered_ids()]
-        rows = [(game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games]
+        rows = [
+            (game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games
+        ]
         Table("environments", ("id", "time limit", "return"), rows).show()
-        print("each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, 3]; 5 actions")
+        print(
+            "each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, "
+            "3]; 5 actions"
+        )
 
     def _memories(self) -> None:
         from arcade_torch.models import make_memory, memory_names
         from arcade_torch.models.presets import PRESETS
         from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
-        names, rows = memory_names(), []
+        names = memory_names()
+        rows = []
         for name in names:
             kind = type(make_memory(name, 1, 1))
             says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
@@ -96,16 +109,28 @@ class List(Command):
         Table("memory models", ("name", "what it is"), rows, left=2).show()
         columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
         columns += ["acting us", "learning us", "to the LRU's"] if self.measure else []
-        for of, size in (("the paper's network", PAPER_SIZE), ("the small network", PRESETS["small"].hidden_size)):
+        for of, size in (
+            ("the paper's network", PAPER_SIZE),
+            ("the small network", PRESETS["small"].hidden_size),
+        ):
             times = time_memories(names, size) if self.measure else {}
             costs = []
             for name in names:
-                cost = [f"{number:,}" for number in memory_cost(make_memory(name, size, size), size)]
+                cost = [
+                    f"{number:,}" for number in memory_cost(make_memory(name, size, size), size)
+                ]
                 if self.measure:
                     acting, learning = times[name]
-                    cost += [f"{acting:.1f}", f"{learning:.1f}", f"{learning / times['lru'][1]:.2f}"]
+                    cost += [
+                        f"{acting:.1f}",
+                        f"{learning:.1f}",
+                        f"{learning / times['lru'][1]:.2f}",
+                    ]
                 costs.append([name, *cost])
             Table(f"one cell of {of}, {size} wide", columns, costs).show()
         print("multiply-adds: in matrix products, one step of one env, acting")
         if self.measure:
-            print("us: microseconds for one step of one env; acting: 16 envs; learning: both passes, 16 x 132 steps")
+            print(
+                "us: microseconds for one step of one env; acting: 16 envs; learning: both passes, "
+                "16 x 132 steps"
+            )

@@ -34,16 +34,19 @@ class Shown(Command):
 
 @dataclass(kw_only=True)
 class Play(Shown):
-    """Play a game by hand, in a window or (without pygame or a display, or with --terminal) in the terminal.
+    """Play a game by hand, in a window or (without pygame or a display, or with --terminal) in the
+    terminal.
 
-    Arrows and space are the five actions; one key, one step. P changes between MDP and POMDP, also in mid-episode. R
-    restarts the episode, Enter goes on after an end, Esc quits.
+    Arrows and space are the five actions; one key, one step. P changes between MDP and POMDP, also
+    in mid-episode. R restarts the episode, Enter goes on after an end, Esc quits.
 
     Example: arcade-torch play MineSweeperEasy --partial --episodes 3 --scores human.csv
     """
 
     seed: int | None = None
-    """Of the first episode, each further one has the next; 0 by default, with --scores the first the file lacks."""
+    """Of the first episode, each further one has the next; 0 by default, with --scores the first
+    the file lacks.
+    """
     partial: bool = False  # Begin with the POMDP twin.
     episodes: int = 0  # Stop after so many finished episodes; 0 for never.
     obs_size: Literal[128, 256] = 256  # Side of the frame in pixels.
@@ -74,7 +77,9 @@ class Play(Shown):
             """Write a score, and remember to say it when the screen is the terminal's again."""
             said.append(f"seed {attempt.seed} ({attempt.observability}): {attempt}")
             if self.scores is not None:
-                scores.append_score(self.scores, scores.score_row(attempt, game, options, self.player))
+                scores.append_score(
+                    self.scores, scores.score_row(attempt, game, options, self.player)
+                )
 
         views = {"partial": self.partial, "both": self.both}
         session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
@@ -97,8 +102,8 @@ class Play(Shown):
 class Record(Shown):
     """Record episodes of a player as a GIF or, with the extra video, as an MP4.
 
-    Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP twin), or the run folder
-    of a trained agent.
+    Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP
+    twin), or the run folder of a trained agent.
 
     Example: arcade-torch record MineSweeperEasy --player frames-oracle --both --out sweep.gif
     """
@@ -106,13 +111,16 @@ class Record(Shown):
     out: Path  # File, .gif or .mp4; replaced if it exists.
     player: str = "random"  # random, state-oracle, frames-oracle, or a run folder.
     observability: Literal["full", "partial"] | None = None
-    """Twin that is shown, and that an agent sees; by default its own, partial for the frames-oracle, otherwise full."""
+    """Twin that is shown, and that an agent sees; by default its own, partial for the
+    frames-oracle, otherwise full.
+    """
     seed: int = 0  # Of the first episode, each further one has the next.
     episodes: int = 1  # How many.
     max_steps: int = 1000  # The recording stops when an episode gets longer.
     fps: float = 10.0  # Frames a second.
     obs_size: Literal[128, 256] | None = None  # Side of the frame; the agent's, else 128.
-    rules: Literal["default", "reference"] | None = None  # Rules of the game; the agent's, else default.
+    # Rules of the game; the agent's, else default.
+    rules: Literal["default", "reference"] | None = None
 
     def run(self) -> int:
         """Record."""
@@ -127,21 +135,33 @@ class Record(Shown):
         self.check_scale()
         fastest = recording.FASTEST_FPS[self.out.suffix]
         require(
-            0.01 <= self.fps <= fastest, "--fps", self.fps, f"at least 0.01 and at most {fastest} for {self.out.suffix}"
+            0.01 <= self.fps <= fastest,
+            "--fps",
+            self.fps,
+            f"at least 0.01 and at most {fastest} for {self.out.suffix}",
         )
-        game_id, options = resolve_id(self.game), dict(map(name_and_value, self.env_option))
-        obs_size, rules, partial = self.obs_size or 128, self.rules or "default", self.player == "frames-oracle"
+        game_id = resolve_id(self.game)
+        options = dict(map(name_and_value, self.env_option))
+        obs_size = self.obs_size or 128
+        rules = self.rules or "default"
+        partial = self.player == "frames-oracle"
         agent: Any = None
         if self.player not in recording.SCRIPTED:
             from arcade_torch.agents import load
 
             known = ", ".join(recording.SCRIPTED)
-            require(Path(self.player).is_dir(), "--player", self.player, f"{known}, or a run folder")
+            require(
+                Path(self.player).is_dir(), "--player", self.player, f"{known}, or a run folder"
+            )
             agent = load(self.player)
             config = agent.config
             if self.obs_size not in (None, config.obs_size):
-                raise ValueError(f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}")
-            obs_size, rules, partial = config.obs_size, self.rules or config.rules, config.observability != "full"
+                raise ValueError(
+                    f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}"
+                )
+            obs_size = config.obs_size
+            rules = self.rules or config.rules
+            partial = config.observability != "full"
             if resolve_id(config.env) == game_id:
                 options = {**config.env_options, **options}
             else:
@@ -152,16 +172,21 @@ class Record(Shown):
         def tell(attempt: Any) -> None:
             say(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
 
-        game, views = compiled_game(game_id, obs_size, rules, options), {"partial": partial, "both": self.both}
+        game = compiled_game(game_id, obs_size, rules, options)
+        views = {"partial": partial, "both": self.both}
         session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=tell, **views)
         player = (
-            recording.trained(agent, partial) if agent else recording.scripted(self.player, session.game, self.seed)
+            recording.trained(agent, partial)
+            if agent
+            else recording.scripted(self.player, session.game, self.seed)
         )
         how = {"max_steps": self.max_steps, "hold": max(1, round(self.fps)), "scale": self.scale}
         with Bars() as bars:
 
             def counted() -> Iterator[Any]:
-                for count, frame in enumerate(recording.recorded_frames(session, player, **how), start=1):
+                for count, frame in enumerate(
+                    recording.recorded_frames(session, player, **how), start=1
+                ):
                     bars.update(str(self.out), count, 0, f"frame {count}")
                     yield frame
 

@@ -26,16 +26,25 @@ class Resumable(Command):
         line = command_line([self.word, *self.argv])
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
 
-    def carry_out(self, what: Study, out: Path, engine: Engine, shard: str = "", report: bool = True) -> int:
-        """Run a study, say how each run ended, and write the report; exit code 1 if a run failed."""
+    def carry_out(
+        self, what: Study, out: Path, engine: Engine, shard: str = "", report: bool = True
+    ) -> int:
+        """Run a study, say how each run ended, and write the report; exit code 1 if a run
+        failed.
+        """
         pairs = zip(self.argv, ("", *self.argv), strict=False)
-        argv = [word for word, before in pairs if not word.startswith("--shard") and before != "--shard"]
+        argv = [
+            word for word, before in pairs if not word.startswith("--shard") and before != "--shard"
+        ]
         try:
             result = study(what, out, engine, command=command_line([self.word, *argv]), shard=shard)
         except DiskFullError as error:
             say(f"stopped: {error}; {self.resume_hint()}")
             return 1
-        say(f"{result.finished} of {len(result.rows)} runs finished; table: {result.root / 'results.csv'}")
+        say(
+            f"{result.finished} of {len(result.rows)} runs finished; table: "
+            f"{result.root / 'results.csv'}"
+        )
         for name, reason in result.errors.items():
             say(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
@@ -43,17 +52,22 @@ class Resumable(Command):
                 write_page(result.root)
             except Exception:
                 again = command_line(["report", str(result.root)])
-                print(f"the runs are kept, their report failed; write it again with: {again}", file=sys.stderr)
+                print(
+                    f"the runs are kept, their report failed; write it again with: {again}",
+                    file=sys.stderr,
+                )
                 raise
         return 1 if result.errors else 0
 
 
 @dataclass
 class StudyCommand(Resumable):
-    """Run a grid of trainings described by one TOML file; type the same again to go on after an interruption.
+    """Run a grid of trainings described by one TOML file; type the same again to go on after an
+    interruption.
 
-    The file names games, memories and seeds, and optionally observability, algorithms, preset, total_frames, baseline,
-    sizes, question and a table [settings] with fields of the config that train takes.
+    The file names games, memories and seeds, and optionally observability, algorithms, preset,
+    total_frames, baseline, sizes, question and a table [settings] with fields of the config that
+    train takes.
 
     Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
@@ -68,14 +82,20 @@ class StudyCommand(Resumable):
     workers: int = 0  # Runs at once; 0 for one a core, or for what the Ray cluster has room for.
     ray: Annotated[RayOptions, tyro.conf.arg(name="")] = field(default_factory=RayOptions)
     shard: str = ""
-    """3/10 carries out the third tenth of the runs, for the array jobs of a scheduler; all write into one folder."""
+    """3/10 carries out the third tenth of the runs, for the array jobs of a scheduler; all write
+    into one folder.
+    """
     dry_run: bool = False  # Only print every run with its frames, and the frames of all together.
-    report: bool = True  # Write the HTML report at the end; of shards, the one that finishes the study writes it.
+    # Write the HTML report at the end; of shards, the one that finishes the study writes it.
+    report: bool = True
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""
         if (self.file is None) == (self.preset is None):
-            raise ValueError(f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the two")
+            raise ValueError(
+                f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the "
+                "two"
+            )
         what = study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
         if self.dry_run:
             plan = planned(what, self.shard)
@@ -87,16 +107,20 @@ class StudyCommand(Resumable):
             print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
             return 0
         engine = make_engine(self.engine, self.workers, self.ray)
-        return self.carry_out(what, self.out or Path("runs") / what.name, engine, self.shard, self.report)
+        return self.carry_out(
+            what, self.out or Path("runs") / what.name, engine, self.shard, self.report
+        )
 
 
 @dataclass
 class Demo(Resumable):
-    """Small study of what memory does: two games as MDP and POMDP, with a memory and without, three seeds each.
+    """Small study of what memory does: two games as MDP and POMDP, with a memory and without, three
+    seeds each.
 
-    Ends in one HTML page with learning curves, observability gap, memory bias and saliency. Less than ten minutes on
-    two cores; type the same again to go on after an interruption. One game is a probe, solved with memory and only with
-    it; the other is one of the ten, where a minute of training only begins to show it.
+    Ends in one HTML page with learning curves, observability gap, memory bias and saliency. Less
+    than ten minutes on two cores; type the same again to go on after an interruption. One game is a
+    probe, solved with memory and only with it; the other is one of the ten, where a minute of
+    training only begins to show it.
 
     Example: arcade-torch demo --games BattleShipEasy --frames 700000 --seeds 2 --out runs/ships
     """
@@ -116,16 +140,20 @@ class Demo(Resumable):
 
 @dataclass
 class Report(Command):
-    """Write the HTML page of a study: one file, nothing loaded from elsewhere. Missing analyses are made first.
+    """Write the HTML page of a study: one file, nothing loaded from elsewhere. Missing analyses are
+    made first.
 
     Example: arcade-torch report runs/demo
     """
 
     study: tyro.conf.Positional[Path]  # Folder of the study.
     out: Path | None = None  # The page; report.html in that folder by default.
-    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"  # Score of a run that the headline is based on.
+    # Score of a run that the headline is based on.
+    metric: Literal["eval_final", "train_max_ewm"] = "eval_final"
     skip: tuple[Part, ...] = ()
-    """Parts to leave out: strips, densities, what one noisy frame changes, returns of the random policy and oracles."""
+    """Parts to leave out: strips, densities, what one noisy frame changes, returns of the random
+    policy and oracles.
+    """
 
     def run(self) -> int:
         """Write the page."""

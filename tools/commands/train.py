@@ -20,25 +20,33 @@ from arcade_torch.tools.text import say
 class Train(Command):
     """Train one agent into a run folder: settings, logs, checkpoints, final evaluation.
 
-    Options start from a preset (paper, reference, small, smoke) or from a JSON file; the resolved settings are kept in
-    the folder's config.json. Numbers of the learner are --pqn.*, --ppo.* or --dqn.*, whichever --algorithm names.
+    Options start from a preset (paper, reference, small, smoke) or from a JSON file; the resolved
+    settings are kept in the folder's config.json. Numbers of the learner are --pqn.*, --ppo.* or
+    --dqn.*, whichever --algorithm names.
 
-    Example: arcade-torch train --preset small --env MineSweeperEasy --observability partial --out runs/one
+    Example: arcade-torch train --preset small --env MineSweeperEasy --observability partial --out
+    runs/one
     """
 
     settings: Annotated[TrainConfig, tyro.conf.arg(name="")]
     preset: str = "paper"  # Settings to start from.
     config: Path | None = None
-    """JSON file to start from in the place of a preset: a run's config.json, or one that a study wrote."""
+    """JSON file to start from in the place of a preset: a run's config.json, or one that a study
+    wrote.
+    """
     env_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the game; may be given several times."""
     network_option: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=VALUE, an option of the network; may be given several times."""
-    out: Path | None = None  # Run folder; runs/ENV__OBSERVABILITY__MEMORY__ALGORITHM__seedN by default, as in a study.
+    # Run folder; runs/ENV__OBSERVABILITY__MEMORY__ALGORITHM__seedN by default, as in a study.
+    out: Path | None = None
     resume: bool = False  # Go on with the run in that folder.
-    wait: float = 0.0  # Seconds to wait until another process that trains in that folder has stopped.
+    # Seconds to wait until another process that trains in that folder has stopped.
+    wait: float = 0.0
     videos: Literal["none", "gif", "mp4"] = "none"
-    """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the extra video."""
+    """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the
+    extra video.
+    """
 
     @classmethod
     def parse(cls, argv: Sequence[str], prog: str) -> Any:
@@ -51,13 +59,23 @@ class Train(Command):
             settings = parsed.settings
         else:
             # A preset's numbers depend on these two, and the help shows them.
-            decisive: dict[str, Any] = {name: given[name] for name in ("env", "algorithm") if given.get(name)}
-            parsed = parse_options(cls, argv, prog, cls(preset(given.get("preset", "paper"), **decisive)))
+            decisive: dict[str, Any] = {
+                name: given[name] for name in ("env", "algorithm") if given.get(name)
+            }
+            parsed = parse_options(
+                cls, argv, prog, cls(preset(given.get("preset", "paper"), **decisive))
+            )
             names = {name.partition(".")[0].removeprefix("no_") for name in given}
-            own = {name: getattr(parsed.settings, name) for name in names & {f.name for f in fields(TrainConfig)}}
+            own = {
+                name: getattr(parsed.settings, name)
+                for name in names & {f.name for f in fields(TrainConfig)}
+            }
             settings = preset(parsed.preset, **own)
         options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
-        more = {key: {**getattr(settings, key), **dict(map(name_and_value, pairs))} for key, pairs in options.items()}
+        more = {
+            key: {**getattr(settings, key), **dict(map(name_and_value, pairs))}
+            for key, pairs in options.items()
+        }
         return replace(parsed, settings=replace(settings, **more))
 
     def run(self) -> int:
@@ -72,7 +90,8 @@ class Train(Command):
         at_least(self, wait=0)
         watch_parent()
         keep_freed_memory()
-        run, film = self.settings, None
+        run = self.settings
+        film = None
         spec = RunSpec(run.env, run.observability, run.memory, run.algorithm, run.seed)
         folder = self.out or Path("runs") / spec.name
         if self.videos != "none":
@@ -83,12 +102,17 @@ class Train(Command):
         with Bars(unit="frames", first_line_s=0.0) as bars:
 
             def show(row: Any) -> None:
-                bars.update(str(folder), int(row["frames"]), int(row["total_frames"]), standing(row))
+                bars.update(
+                    str(folder), int(row["frames"]), int(row["total_frames"]), standing(row)
+                )
 
             result = train(run, folder, self.resume, show, film)
         if result.evaluation is None:
             raise KeyboardInterrupt
-        say(f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} episodes")
+        say(
+            f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} "
+            "episodes"
+        )
         say(f"finished: {result.run_dir}")
         return 0
 
@@ -105,9 +129,11 @@ class Evaluate(Command):
     Example: arcade-torch evaluate runs/one --episodes 256 --observability full
     """
 
-    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]  # Run folder or checkpoint.
+    # Run folder or checkpoint.
+    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]
     episodes: int = 128  # Number of episodes, each in an environment of its own.
-    observability: Literal["full", "partial"] | None = None  # Another twin than the agent was trained on.
+    # Another twin than the agent was trained on.
+    observability: Literal["full", "partial"] | None = None
     json: Path | None = None  # File for the numbers; not overwritten.
 
     def run(self) -> int:
@@ -118,7 +144,8 @@ class Evaluate(Command):
             raise FileExistsError(f"{self.json} exists: choose another file")
         agent = load(self.run_folder)
         result = evaluate(agent, self.observability, self.episodes)
-        config, twin = agent.config, self.observability or agent.config.observability
+        config = agent.config
+        twin = self.observability or agent.config.observability
         which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
         say(f"{which}, {agent.frames:,} frames of training: {result.text}")
         if self.json is not None:
@@ -129,16 +156,22 @@ class Evaluate(Command):
 
 def _read_config(file: Path) -> TrainConfig:
     if not file.is_file():
-        raise FileNotFoundError(f"no config at {file}: give the config.json of a run, or one that a study wrote")
+        raise FileNotFoundError(
+            f"no config at {file}: give the config.json of a run, or one that a study wrote"
+        )
     values = read_json(file)
     try:
-        return TrainConfig.from_dict(values["config"] if isinstance(values, dict) and "config" in values else values)
+        return TrainConfig.from_dict(
+            values["config"] if isinstance(values, dict) and "config" in values else values
+        )
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file} holds no config: {error}") from error
 
 
 def _flags(argv: Sequence[str]) -> dict[str, str]:
-    """Names and values of options before they are read: of ``--total-frames 5`` or ``--total-frames=5``."""
+    """Names and values of options before they are read: of ``--total-frames 5`` or
+    ``--total-frames=5``.
+    """
     found = {}
     for word, following in zip(argv, [*argv[1:], ""], strict=True):
         name, equals, value = word.partition("=")

@@ -17,43 +17,61 @@ from arcade_torch.tools.runs import find_runs
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
 
-Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]  # title, frames [T, H, W, 3], maps [T, H, W] up to step n
+# title, frames [T, H, W, 3], maps [T, H, W] up to step n
+Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]
 
 
 def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
-    """The figure ``saliency``: every run that is named, and of studies the first seed of every agent and task."""
+    """The figure ``saliency``: every run that is named, and of studies the first seed of every
+    agent and task.
+    """
     at_least(options, show=1, max_steps=1)
     paths, notes = checkpoints_of(options.runs)
     if len(paths) > 1 and all((path / "eval.json").is_file() for path in paths):
         first = [runs[0].path for runs in find_runs(paths).groups().values()]
         paths = [path for path in paths if path in first or path in options.runs]
     measured = measure_runs(paths, episode_saliency, vars(options), progress)
-    drawn, cells = list[Row](), list[tuple[str, int, str]]()
-    arrays, numbers = dict[str, Any](), list[dict[str, Any]]()
+    drawn = list[Row]()
+    cells = list[tuple[str, int, str]]()
+    arrays = dict[str, Any]()
+    numbers = list[dict[str, Any]]()
     for index, (label, found) in enumerate(measured):
-        title = f"{label.agent}, {label.game} ({TWIN_NAMES[label.observability]}), seed {label.seed}"
+        title = (
+            f"{label.agent}, {label.game} ({TWIN_NAMES[label.observability]}), seed {label.seed}"
+        )
         shares = found.shares()
         drawn.append((title, found.frames, found.maps))
         cells.append((title, len(shares), f"{100 * shares[-1]:.1f} %"))
         numbers += rows_of(row=index, run=title, step=np.arange(len(shares)), share=shares)
         arrays[f"title_{index}"] = np.array(title)
-        arrays |= {f"{name}_{index}": getattr(found, name) for name in ("frames", "maps", "per_frame", "action")}
+        arrays |= {
+            f"{name}_{index}": getattr(found, name)
+            for name in ("frames", "maps", "per_frame", "action")
+        }
     note = (
         f"n = 1 episode a row, decision at n; {options.reduce}, {options.norm} of the gradient, "
         f"{measured[0][1].target}, brightness is its square root; no interval"
     )
-    picture = Picture("saliency", saliency_figure(drawn, show=options.show, figure=new_figure()), note, numbers, arrays)
+    picture = Picture(
+        "saliency",
+        saliency_figure(drawn, show=options.show, figure=new_figure()),
+        note,
+        numbers,
+        arrays,
+    )
     table = Table("gradient of the last decision", ("run", "frames", "on the last frame"), cells)
     return Made([picture], notes, [table])
 
 
 def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -> Any:
-    """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose top it names.
+    """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose
+    top it names.
 
     Args:
         rows: one ``(title, frames, maps)`` each, see `Row`.
         show: how many of the last frames are drawn.
-        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default, which notebooks show.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default, which
+            notebooks show.
 
     Returns:
         A matplotlib figure.
@@ -65,7 +83,9 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
         peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0])
-        part.suptitle(f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False)
+        part.suptitle(
+            f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False
+        )
     return figure
 
 
@@ -76,13 +96,19 @@ def plot(
     sigma_px: float | None = None,
     below: NDArray[np.float64] | None = None,
 ) -> float:
-    """Draw the last frames of a trajectory, heat over each, on one scale; returns the value that is brightest.
+    """Draw the last frames of a trajectory, heat over each, on one scale; returns the value that is
+    brightest.
 
-    The heat is the square root of the smoothed map: that makes a frame visible that has a hundredth of the brightest.
+    The heat is the square root of the smoothed map: that makes a frame visible that has a hundredth
+    of the brightest.
     """
     sigma = SIGMA_PX * frames.shape[1] / 128 if sigma_px is None else sigma_px
     blur = need("scipy.ndimage").gaussian_filter
-    soft = blur(np.asarray(maps, np.float64), (0, sigma, sigma), truncate=3.0) if sigma else np.asarray(maps)
+    soft = (
+        blur(np.asarray(maps, np.float64), (0, sigma, sigma), truncate=3.0)
+        if sigma
+        else np.asarray(maps)
+    )
     peak = float(soft.max(initial=0.0))
     heat = np.sqrt(soft / peak) if peak > 0 else soft
     n = len(frames) - 1
@@ -91,6 +117,7 @@ def plot(
         if t >= 0:
             axis.imshow(frames[t], interpolation="nearest")
             axis.imshow(heat[t], cmap="afmhot", vmin=0, vmax=1, alpha=0.5, interpolation="nearest")
-            name, share = "n" if t == n else f"n-{n - t}", "" if below is None else f": {below[t]:.1f} %"
+            name = "n" if t == n else f"n-{n - t}"
+            share = "" if below is None else f": {below[t]:.1f} %"
             axis.set_title(f"$o_{{{name}}}${share}", fontsize="small", parse_math=True)
     return peak

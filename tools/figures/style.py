@@ -37,17 +37,29 @@ AGENT_COLOURS = {
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
 
-SPARE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#5e3c10", "#000000")
+SPARE_COLOURS = (
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#d55e00",
+    "#cc79a7",
+    "#56b4e9",
+    "#5e3c10",
+    "#000000",
+)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)))  # lines that lie on one another are seen both
-MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")  # recall density: the darkest is the most recent third
+# recall density: the darkest is the most recent third
+MDP_THIRDS = ("#c6dbef", "#6baed6", "#2171b5")
 POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
 
 STYLES = Path(__file__).resolve().parents[1] / "data"
-"""Folder of the style sheets, in matplotlib's format: light.mplstyle, and print.mplstyle for what differs."""
+"""Folder of the style sheets, in matplotlib's format: light.mplstyle, and print.mplstyle for what
+differs.
+"""
 _PLAIN = {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
 """Environment in which matplotlib can be imported."""
 _OF_AXES = ("sharex", "sharey", "width_ratios", "height_ratios", "subplot_kw", "gridspec_kw")
@@ -55,7 +67,8 @@ _PRINT_SCALE = 0.62  # sizes of figures are given for a screen; on a page they a
 
 
 def import_matplotlib() -> Any:
-    """Import matplotlib, also where the user's matplotlibrc file, or MPLBACKEND, holds what matplotlib refuses.
+    """Import matplotlib, also where the user's matplotlibrc file, or MPLBACKEND, holds what
+    matplotlib refuses.
 
     The environment is left as it is, and so are settings of a matplotlib that is imported already.
     """
@@ -81,13 +94,20 @@ def import_matplotlib() -> Any:
 def drawing(style: str) -> Iterator[Any]:
     """Draw in a style of ours: ``light`` for screens, ``print`` (smaller, serif) for a page.
 
-    It begins from matplotlib's defaults, whatever the user has set, and puts the user's settings back. Figures are none
-    of ``pyplot``: no window, no backend, and the user's own figures stay open. Gives a namespace with `subplots`.
+    It begins from matplotlib's defaults, whatever the user has set, and puts the user's settings
+    back. Figures are none of ``pyplot``: no window, no backend, and the user's own figures stay
+    open. Gives a namespace with `subplots`.
     """
     matplotlib = import_matplotlib()
-    look = {name: value for name, value in matplotlib.rcParamsDefault.items() if not name.startswith("backend")}
+    look = {
+        name: value
+        for name, value in matplotlib.rcParamsDefault.items()
+        if not name.startswith("backend")
+    }
     for sheet in dict.fromkeys(("light", style)):
-        look |= matplotlib.rc_params_from_file(STYLES / f"{sheet}.mplstyle", use_default_template=False)
+        look |= matplotlib.rc_params_from_file(
+            STYLES / f"{sheet}.mplstyle", use_default_template=False
+        )
     with matplotlib.rc_context(look):
         yield SimpleNamespace(subplots=subplots)
 
@@ -97,7 +117,9 @@ def new_figure(**options: Any) -> Any:
     return need("matplotlib.figure").Figure(**options)
 
 
-def subplots(rows: int = 1, columns: int = 1, *, squeeze: bool = True, **options: Any) -> tuple[Any, Any]:
+def subplots(
+    rows: int = 1, columns: int = 1, *, squeeze: bool = True, **options: Any
+) -> tuple[Any, Any]:
     """A figure and its axes; options are those of ``matplotlib.pyplot.subplots``."""
     of_axes = {name: options.pop(name) for name in _OF_AXES if name in options}
     figure = new_figure(**options)
@@ -110,12 +132,16 @@ def panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -
 
 
 def legend_name(name: str) -> str:
-    """A name as the label of an artist: matplotlib leaves labels with an underscore in front out of legends."""
+    """A name as the label of an artist: matplotlib leaves labels with an underscore in front out of
+    legends.
+    """
     return f"\u200b{name}" if name.startswith("_") else name
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for every agent: that of its memory, or a spare one where there is none or another agent has it."""
+    """A colour for every agent: that of its memory, or a spare one where there is none or another
+    agent has it.
+    """
     found: dict[str, str] = {}
     for place, name in enumerate(names):
         memory = name.lower().partition(" ")[0].rpartition("-")[2]
@@ -126,18 +152,24 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
 
 
 def whiskers(value: Array, low: Array, high: Array) -> Any:
-    """Lengths of error bars [2, n] for matplotlib; NaN, which is not drawn, where there is no interval."""
+    """Lengths of error bars [2, n] for matplotlib; NaN, which is not drawn, where there is no
+    interval.
+    """
     return np.maximum([value - low, high - value], 0.0)
 
 
-def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars", share: float | None = None) -> str:
-    """How many seeds, which interval, and what it is worth: its coverage ``share``, that of one cell's mean by default.
+def seeds_note(
+    seeds: Sequence[int], confidence: float, what: str = "bars", share: float | None = None
+) -> str:
+    """How many seeds, which interval, and what it is worth: its coverage ``share``, that of one
+    cell's mean by default.
 
     Example:
         >>> seeds_note([1], 0.95)
         'n = 1 seed, no interval (needs two)'
     """
-    low, high = min(seeds), max(seeds)
+    low = min(seeds)
+    high = max(seeds)
     count = f"n = {low} seed{'s' * (low > 1)}" if low == high else f"n = {low} to {high} seeds"
     if high < 2:
         return f"{count}, no interval (needs two)"
@@ -148,7 +180,9 @@ def seeds_note(seeds: Sequence[int], confidence: float, what: str = "bars", shar
     )
 
 
-def agents_by_task(found: Mapping[tuple[str, str, str], Any]) -> dict[tuple[str, str], dict[str, Any]]:
+def agents_by_task(
+    found: Mapping[tuple[str, str, str], Any],
+) -> dict[tuple[str, str], dict[str, Any]]:
     """(agent, game, twin) -> value, sorted by task: (game, twin) -> agent -> value."""
     tasks: dict[tuple[str, str], dict[str, Any]] = {}
     for (agent, game, twin), value in found.items():
@@ -157,7 +191,8 @@ def agents_by_task(found: Mapping[tuple[str, str, str], Any]) -> dict[tuple[str,
 
 
 def rows_of(**columns: Any) -> list[dict[str, Any]]:
-    """Numbers of a figure: a row a cell of columns that are arrays of one shape, or single values for all rows.
+    """Numbers of a figure: a row a cell of columns that are arrays of one shape, or single values
+    for all rows.
 
     Example:
         >>> rows_of(agent="lru", delay=[0, 1])
@@ -177,7 +212,11 @@ def save(options: Options, picture: Picture) -> list[Path]:
     if picture.note:  # wrapped to the width of the figure
         label = figure.supxlabel(" ", fontsize="small", color=NEUTRAL)
         letters = int(figure.get_figwidth() * 72 / (0.56 * label.get_fontsize()))
-        label.set_text("\n".join(line for part in picture.note.split("\n") for line in textwrap.wrap(part, letters)))
+        label.set_text(
+            "\n".join(
+                line for part in picture.note.split("\n") for line in textwrap.wrap(part, letters)
+            )
+        )
     for ending in [ending for ending in endings if ending in PICTURES]:
         buffer = BytesIO()
         figure.savefig(buffer, format=ending[1:])
@@ -194,8 +233,12 @@ def svg(figure: Any, name: str) -> str:
     buffer = StringIO()
     figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
-    text = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL)
-    text = re.sub(r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text)
+    text = re.sub(
+        r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL
+    )
+    text = re.sub(
+        r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text
+    )
     text = re.sub(r"-?\d+\.\d{2,}", lambda found: f"{float(found[0]):.4g}", text)
     prefix = re.sub(r"\W+", "-", name)
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", re.sub(r">\s+<", "><", text))
@@ -204,7 +247,10 @@ def svg(figure: Any, name: str) -> str:
 
 def png(figure: Any, colours: int = 128) -> bytes:
     """A figure as a small PNG file, its colours counted."""
-    buffer, packed = BytesIO(), BytesIO()
+    buffer = BytesIO()
+    packed = BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
-    need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(packed, "PNG", optimize=True)
+    need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(
+        packed, "PNG", optimize=True
+    )
     return packed.getvalue()

@@ -1,4 +1,6 @@
-"""Players at a session, and pictures of what they play: films as GIF or MP4, single moments as PNG."""
+"""Players at a session, and pictures of what they play: films as GIF or MP4, single moments as
+PNG.
+"""
 
 import io
 import subprocess
@@ -25,9 +27,13 @@ SCRIPTED = ("random", "state-oracle", "frames-oracle")
 FASTEST_FPS = {".gif": 50, ".mp4": 240}  # a GIF shows a frame for 2 hundredths of a second or more
 # Quality of x264: 0 is lossless, 23 its default. Most players want this pixel format.
 _ENCODING = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
-FILM_FPS, FILM_SEED = 10, 2**31
-"""Of films of a training. The seed is far from those of training and always the same, so that films compare."""
-GAP, PAPER = 8, 255
+FILM_FPS = 10
+FILM_SEED = 2**31
+"""Of films of a training. The seed is far from those of training and always the same, so that films
+compare.
+"""
+GAP = 8
+PAPER = 255
 """Between pictures on a sheet or a strip, in pixels, and its colour."""
 
 Chooser = Callable[[Session], int]
@@ -36,7 +42,11 @@ Chooser = Callable[[Session], int]
 
 def scripted(name: str, game: Any, seed: int) -> Chooser:
     """The random player or an oracle of the games, one of `SCRIPTED`."""
-    player = RandomPlayer(seed) if name == "random" else make_oracle(game, "state" if name[0] == "s" else "frames")
+    player = (
+        RandomPlayer(seed)
+        if name == "random"
+        else make_oracle(game, "state" if name[0] == "s" else "frames")
+    )
 
     def choose(session: Session) -> int:
         seen = session.view(partial=True) if name == "frames-oracle" else session.state
@@ -51,7 +61,8 @@ def trained(agent: Any, partial: bool) -> Chooser:
     from tensordict import TensorDict
 
     device = next(agent.network.parameters()).device
-    state, last_action = agent.initial_state(1), 0
+    state = agent.initial_state(1)
+    last_action = 0
 
     def choose(session: Session) -> int:
         nonlocal state, last_action
@@ -70,7 +81,9 @@ def trained(agent: Any, partial: bool) -> Chooser:
     return choose
 
 
-def recorded_frames(session: Session, choose: Chooser, *, max_steps: int, hold: int, scale: int) -> Iterator[Frame]:
+def recorded_frames(
+    session: Session, choose: Chooser, *, max_steps: int, hold: int, scale: int
+) -> Iterator[Frame]:
     """Play a session to its end and give out its frames, the last of an episode ``hold`` times."""
     while not session.closed:
         yield enlarge(session.frame, scale)
@@ -94,10 +107,13 @@ def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
 
 def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel."""
-    image, buffer = need("PIL.Image"), io.BytesIO()
+    image = need("PIL.Image")
+    buffer = io.BytesIO()
     pictures = (image.fromarray(frame).quantize(256) for frame in frames)
     duration_ms = 10 * max(1, round(100 / fps))
-    next(pictures).save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0)
+    next(pictures).save(
+        buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0
+    )
     return write_atomic(path, buffer.getvalue())
 
 
@@ -110,11 +126,22 @@ def write_png(path: Path, picture: Frame) -> Path:
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     """Write an H.264 film that browsers show; colours are subsampled, pixels are not exact."""
-    program, rest = need("imageio_ffmpeg").get_ffmpeg_exe(), iter(frames)
+    program = need("imageio_ffmpeg").get_ffmpeg_exe()
+    rest = iter(frames)
     first = next(rest)
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(fps)]
+    source = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{first.shape[1]}x{first.shape[0]}",
+        "-r",
+        str(fps),
+    ]
     with tempfile.TemporaryDirectory() as folder:
-        film, log = Path(folder) / "film.mp4", Path(folder) / "log"
+        film = Path(folder) / "film.mp4"
+        log = Path(folder) / "log"
         words = [program, "-v", "error", *source, "-i", "-", *_ENCODING, str(film)]
         process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=log.open("wb"))
         with suppress(BrokenPipeError), process:  # ffmpeg may give up early; it says why in its log
@@ -128,18 +155,23 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
 
 
 def _moments(id: str, obs_size: int, seed: int, steps: int) -> Iterator[list[Frame]]:
-    """Both twins of each state of an episode of the scripted player, from the first to that after `steps`, or to the
-    last before the end; of a random one where there is no player that sees the state.
+    """Both twins of each state of an episode of the scripted player, from the first to that after
+    `steps`, or to the last before the end; of a random one where there is no player that sees the
+    state.
     """
     session = Session(compiled_game(id, obs_size, "default", {}), seed=seed)
-    choose = scripted("state-oracle" if "state" in session.game.oracles else "random", session.game, seed)
+    choose = scripted(
+        "state-oracle" if "state" in session.game.oracles else "random", session.game, seed
+    )
     while session.end is None and session.steps <= steps:
         yield [session.view(partial)[0] for partial in (False, True)]
         session.press(ACTION_NAMES[choose(session)])
 
 
 def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]:
-    """Both twins of one moment in the middle of a game, played by the scripted player that sees the state."""
+    """Both twins of one moment in the middle of a game, played by the scripted player that sees the
+    state.
+    """
     *_, last = _moments(id, obs_size, seed, min(steps, make(id, obs_size=obs_size).max_steps // 4))
     return last
 
@@ -150,14 +182,20 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
     require(rises, "steps", list(steps), "whole numbers that rise from 0 or more")
     moments = list(_moments(id, obs_size, seed, steps[-1]))
     if len(moments) <= steps[-1]:
-        raise ValueError(f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay below")
+        raise ValueError(
+            f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay "
+            "below"
+        )
     columns = [np.vstack([_padded(frame, obs_size) for frame in moments[step]]) for step in steps]
     return np.hstack(columns)[:-GAP, :-GAP]
 
 
 def sheet(ids: Sequence[str], columns: int = 2) -> Frame:
     """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
-    games = [np.hstack([_padded(frame, 256) for size in (256, 128) for frame in scene(id, size)]) for id in ids]
+    games = [
+        np.hstack([_padded(frame, 256) for size in (256, 128) for frame in scene(id, size)])
+        for id in ids
+    ]
     games += [np.full_like(games[0], PAPER)] * (-len(games) % columns)
     return np.vstack([np.hstack(games[at : at + columns]) for at in range(0, len(games), columns)])
 
@@ -170,12 +208,14 @@ def _padded(frame: Frame, height: int) -> Frame:
 class EvaluationVideos:
     """Films one greedy episode whenever it is called; give it to ``train`` as ``on_evaluation``.
 
-    Playing draws no random number of the training, so a run is the same to the bit with and without it. A film that
-    fails is reported in a warning, and it was the last.
+    Playing draws no random number of the training, so a run is the same to the bit with and without
+    it. A film that fails is reported in a warning, and it was the last.
     """
 
     def __init__(self, folder: Path, suffix: str = ".gif", max_steps: int = 500) -> None:
-        self.folder, self.suffix, self.max_steps = folder, suffix, max_steps
+        self.folder = folder
+        self.suffix = suffix
+        self.max_steps = max_steps
         self._write = writer_for(folder / f"film{suffix}")
         self._failed = False
 
@@ -185,11 +225,23 @@ class EvaluationVideos:
             return
         path = self.folder / f"frames-{agent.frames:09d}{self.suffix}"
         try:
-            config, partial = agent.config, agent.config.observability != "full"
-            game = compiled_game(config.env, config.obs_size, config.rules, dict(config.env_options))
-            session = Session(game, seed=FILM_SEED, partial=partial, both=config.observability == "mixed", episodes=1)
-            player, how = trained(agent, partial), {"max_steps": self.max_steps, "hold": FILM_FPS, "scale": 2}
+            config = agent.config
+            partial = agent.config.observability != "full"
+            game = compiled_game(
+                config.env, config.obs_size, config.rules, dict(config.env_options)
+            )
+            session = Session(
+                game,
+                seed=FILM_SEED,
+                partial=partial,
+                both=config.observability == "mixed",
+                episodes=1,
+            )
+            player = trained(agent, partial)
+            how = {"max_steps": self.max_steps, "hold": FILM_FPS, "scale": 2}
             self._write(path, recorded_frames(session, player, **how), FILM_FPS)
         except Exception as error:  # a training is worth more than its film
             self._failed = True
-            warnings.warn(f"no more films, {path.name}: {type(error).__name__}: {error}", stacklevel=2)
+            warnings.warn(
+                f"no more films, {path.name}: {type(error).__name__}: {error}", stacklevel=2
+            )

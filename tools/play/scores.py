@@ -1,7 +1,8 @@
 """Human scores in a CSV file: one line an episode, with the seed and the actions that repeat it.
 
-The columns model, env, difficulty and observability are those of the paper's table; model, game, observability, seed
-and return are what ``arcade-torch analyze gap-bias`` reads. An episode that was abandoned has no return.
+The columns model, env, difficulty and observability are those of the paper's table; model, game,
+observability, seed and return are what ``arcade-torch analyze gap-bias`` reads. An episode that was
+abandoned has no return.
 """
 
 import json
@@ -27,11 +28,16 @@ COLUMNS = (
 _WHOLE = re.compile(r"[0-9]{1,10}")
 
 
-def score_row(attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = "") -> dict[str, Any]:
+def score_row(
+    attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = ""
+) -> dict[str, Any]:
     """One line of the table."""
     env = game_of(game.id)
     return {
-        **{name: getattr(attempt, name) for name in ("observability", "steps", "end", "attempt", "seed", "actions")},
+        **{
+            name: getattr(attempt, name)
+            for name in ("observability", "steps", "end", "attempt", "seed", "actions")
+        },
         **{name: getattr(game, name) for name in ("obs_size", "rules")},
         "model": "human",
         "env": env,
@@ -49,9 +55,16 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
         return []
     rows = read_csv(path)
     if read_text(path).partition("\n")[0].strip() != ",".join(COLUMNS):
-        raise ValueError(f"{path} is no table of human scores, and adding one would lose what it holds")
+        raise ValueError(
+            f"{path} is no table of human scores, and adding one would lose what it holds"
+        )
     for row in rows:
-        require(_WHOLE.fullmatch(row["seed"]) is not None, f"{path}: the seed", row["seed"], "a whole number")
+        require(
+            _WHOLE.fullmatch(row["seed"]) is not None,
+            f"{path}: the seed",
+            row["seed"],
+            "a whole number",
+        )
     return rows
 
 
@@ -73,14 +86,25 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     Raises:
         ValueError: the actions go on after the end, or the line is damaged.
     """
-    found, actions = list[Attempt](), row["actions"]
-    require(re.fullmatch(r"[0-4]+", actions) is not None, "actions", actions, "digits from 0 to 4, one a step")
+    found = list[Attempt]()
+    actions = row["actions"]
+    require(
+        re.fullmatch(r"[0-4]+", actions) is not None,
+        "actions",
+        actions,
+        "digits from 0 to 4, one a step",
+    )
     for name in ("seed", "obs_size"):
         require(_WHOLE.fullmatch(str(row[name])) is not None, name, row[name], "a whole number")
     _, options = name_and_value(f"options={row['options']}")
     require(isinstance(options, dict), "options", row["options"], "a JSON object")
     game = compiled_game(row["game"], int(row["obs_size"]), row["rules"], options)
-    session = Session(game, seed=int(row["seed"]), partial=row["observability"] == "partial", on_attempt=found.append)
+    session = Session(
+        game,
+        seed=int(row["seed"]),
+        partial=row["observability"] == "partial",
+        on_attempt=found.append,
+    )
     for number, action in enumerate(actions):
         if session.end is not None:
             raise ValueError(f"{len(actions)} actions, but the episode ends after {number}")

@@ -1,4 +1,6 @@
-"""Where a session is shown: a window of pygame, or a terminal with half blocks in 24-bit colours, two pixels each."""
+"""Where a session is shown: a window of pygame, or a terminal with half blocks in 24-bit colours,
+two pixels each.
+"""
 
 import os
 import re
@@ -18,21 +20,33 @@ from arcade_torch.tools.text import printable
 
 FPS = 30
 _DELAY_MS = 300  # how long a key is held before it repeats
-WINDOW_KEYS = {"K_UP": "up", "K_DOWN": "down", "K_LEFT": "left", "K_RIGHT": "right", "K_SPACE": "fire"}
+WINDOW_KEYS = {
+    "K_UP": "up",
+    "K_DOWN": "down",
+    "K_LEFT": "left",
+    "K_RIGHT": "right",
+    "K_SPACE": "fire",
+}
 WINDOW_KEYS |= {"K_r": RESTART, "K_p": TOGGLE, "K_RETURN": NEXT, "K_ESCAPE": QUIT}
 
 _ARROWS = dict(zip("ABCD", ("up", "down", "right", "left"), strict=True))
 TERMINAL_KEYS = {
-    **{f"\x1b{prefix}{letter}".encode(): name for prefix in "[O" for letter, name in _ARROWS.items()},
+    **{
+        f"\x1b{prefix}{letter}".encode(): name
+        for prefix in "[O"
+        for letter, name in _ARROWS.items()
+    },
     b" ": "fire",
     **dict.fromkeys((b"r", b"R"), RESTART),
     **dict.fromkeys((b"p", b"P"), TOGGLE),
     **dict.fromkeys((b"\r", b"\n"), NEXT),
     **dict.fromkeys((b"\x1b", b"q", b"\x03", b"\x04"), QUIT),
 }
-_SEQUENCE = re.compile(rb"\x1b[\[O][^@-~]*[@-~]?|.", re.DOTALL)  # up to the final byte of a sequence, or one byte
+# up to the final byte of a sequence, or one byte
+_SEQUENCE = re.compile(rb"\x1b[\[O][^@-~]*[@-~]?|.", re.DOTALL)
 _REST_WITHIN_S = 0.05  # the rest of an arrow key's sequence arrives within this
-_ENTER, _LEAVE = "\x1b[?1049h\x1b[?25l\x1b[2J", "\x1b[0m\x1b[?25h\x1b[?1049l"
+_ENTER = "\x1b[?1049h\x1b[?25l\x1b[2J"
+_LEAVE = "\x1b[0m\x1b[?25h\x1b[?1049l"
 _COLOURS = "\x1b[38;2;{};{};{};48;2;{};{};{}m"
 _TEXT_ROWS = 2
 
@@ -81,13 +95,17 @@ def play_in_terminal(session: Session) -> None:
     """
     if (reason := why_no_terminal()) is not None:
         raise ValueError(f"playing needs a window or a terminal, and this is neither: {reason}")
-    need("PIL.Image")  # before the terminal is changed: an interruption of imports ends the process at once
+    # before the terminal is changed: an interruption of imports ends the process at once
+    need("PIL.Image")
     with _raw_terminal() as source:
         while not session.closed:
             size = shutil.get_terminal_size()
             print(screen(session, size.columns, size.lines), end="", flush=True)
             data = os.read(source, 64)
-            while data.endswith((b"\x1b", b"\x1b[", b"\x1bO")) and select.select([source], [], [], _REST_WITHIN_S)[0]:
+            while (
+                data.endswith((b"\x1b", b"\x1b[", b"\x1bO"))
+                and select.select([source], [], [], _REST_WITHIN_S)[0]
+            ):
                 data += os.read(source, 64)
             for key in decode_keys(data or b"\x04"):  # a closed terminal quits
                 session.press(key)
@@ -106,7 +124,9 @@ def why_no_terminal() -> str | None:
 
 @contextmanager
 def _raw_terminal() -> Iterator[int]:
-    """Keys one by one and unseen, on a screen of our own; everything as before afterwards, whatever happens."""
+    """Keys one by one and unseen, on a screen of our own; everything as before afterwards, whatever
+    happens.
+    """
     import termios
     import tty
 
@@ -122,7 +142,8 @@ def _raw_terminal() -> Iterator[int]:
 
 
 def decode_keys(data: bytes) -> list[str]:
-    """Names of the keys in what a terminal sent; a lone escape is quit, unknown sequences are left out.
+    """Names of the keys in what a terminal sent; a lone escape is quit, unknown sequences are left
+    out.
 
     Example:
         >>> decode_keys(b"\\x1b[A p\\x1b")
@@ -139,7 +160,8 @@ def screen(session: Session, columns: int, rows: int) -> str:
 
 
 def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
-    """Lines that draw a frame, made smaller by means over areas until it fits, two rows of pixels each.
+    """Lines that draw a frame, made smaller by means over areas until it fits, two rows of pixels
+    each.
 
     The upper row has the colour of the text, the lower one that of the background.
     """
@@ -150,7 +172,10 @@ def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
     pixels = np.pad(pixels, ((0, len(pixels) % 2), (0, 0), (0, 0))).tolist()
     lines = []
     for upper, lower in zip(pixels[::2], pixels[1::2], strict=True):
-        runs = [(colours, len(list(cells))) for colours, cells in groupby(zip(upper, lower, strict=True))]
+        runs = [
+            (colours, len(list(cells)))
+            for colours, cells in groupby(zip(upper, lower, strict=True))
+        ]
         parts = [_COLOURS.format(*top, *bottom) + "\u2580" * count for (top, bottom), count in runs]
         lines.append("".join(parts) + "\x1b[0m")
     return lines

@@ -1,6 +1,8 @@
-"""A session of play: keys in, frames, a caption and finished episodes out. Knows neither window nor terminal.
+"""A session of play: keys in, frames, a caption and finished episodes out. Knows neither window nor
+terminal.
 
-Nothing moves on its own: one key, one step. The last picture of an episode stays until the next one is asked for.
+Nothing moves on its own: one key, one step. The last picture of an episode stays until the next one
+is asked for.
 """
 
 from collections.abc import Callable
@@ -18,9 +20,14 @@ from arcade_torch.gym.batch import NumpyBatch, seed_keys
 Frame = npt.NDArray[np.uint8]
 End = Literal["terminated", "truncated", "abandoned"]
 
-RESTART, TOGGLE, NEXT, QUIT = "restart", "toggle", "next", "quit"
+RESTART = "restart"
+TOGGLE = "toggle"
+NEXT = "next"
+QUIT = "quit"
 KEYS = (*ACTION_NAMES, RESTART, TOGGLE, NEXT, QUIT)
-LEGEND = "arrows and space play, P changes the twin, R restarts, Enter goes on after an end, Esc quits"
+LEGEND = (
+    "arrows and space play, P changes the twin, R restarts, Enter goes on after an end, Esc quits"
+)
 
 
 @dataclass(frozen=True)
@@ -29,10 +36,12 @@ class Attempt:
 
     seed: int  # the episode is that of env 0 of an ``ArcadeEnv`` with this seed
     attempt: int  # 1, or more after restarts of the same episode
-    observability: str  # ``full``, ``partial``, ``both`` (side by side) or ``mixed`` (changed in mid-episode)
+    # ``full``, ``partial``, ``both`` (side by side) or ``mixed`` (changed in mid-episode)
+    observability: str
     actions: str  # one digit a step, 0 to 4
     total: float  # undiscounted return so far
-    end: End  # ``terminated`` by the game, ``truncated`` by the time limit, or ``abandoned`` by the player
+    # ``terminated`` by the game, ``truncated`` by the time limit, or ``abandoned`` by the player
+    end: End
 
     @property
     def steps(self) -> int:
@@ -46,7 +55,8 @@ class Attempt:
 class Session:
     """One player at one game.
 
-    ``seed`` and ``end`` (None while it runs) are those of the running episode; a ``closed`` session hears nothing.
+    ``seed`` and ``end`` (None while it runs) are those of the running episode; a ``closed`` session
+    hears nothing.
 
     Args:
         game: what is played.
@@ -82,8 +92,14 @@ class Session:
     ) -> None:
         require(episodes >= 0, "episodes", episodes, "0 (no end) or more")
         self._batch = NumpyBatch(game, np.zeros(1, bool))
-        self.partial, self.both, self.seed, self.finished, self.closed = partial, both, seed, 0, False
-        self._episodes, self._on_attempt, self._attempt = episodes, on_attempt, 0
+        self.partial = partial
+        self.both = both
+        self.seed = seed
+        self.finished = 0
+        self.closed = False
+        self._episodes = episodes
+        self._on_attempt = on_attempt
+        self._attempt = 0
         self._begin(seed)
 
     @property
@@ -120,9 +136,14 @@ class Session:
     def caption(self) -> str:
         """Game, twin, return, steps and last reward in one line."""
         twin = "MDP | POMDP" if self.both else "POMDP" if self.partial else "MDP"
-        numbers = f"return {self.total:+.3f}  steps {self.steps}/{self.game.max_steps}  last {self._reward:+.3f}"
+        numbers = (
+            f"return {self.total:+.3f}  steps {self.steps}/{self.game.max_steps}  last "
+            f"{self._reward:+.3f}"
+        )
         why = {None: "", "terminated": "  over", "truncated": "  time is up"}[self.end]
-        what_now = f": Enter {'ends' if self._all_played() else 'for the next'}, Esc quits" if why else ""
+        what_now = (
+            f": Enter {'ends' if self._all_played() else 'for the next'}, Esc quits" if why else ""
+        )
         return f"{self.game.id} {twin}  {numbers}{why}{what_now}"
 
     def press(self, key: str) -> None:
@@ -159,7 +180,8 @@ class Session:
         self.seed = seed
         self._batch.reset(np.ones(1, bool), seed_keys(seed, 1))
         self._actions: list[int] = []
-        self._reward, self._mixed = 0.0, False
+        self._reward = 0.0
+        self._mixed = False
         self.end = None
 
     def _all_played(self) -> bool:
@@ -171,6 +193,14 @@ class Session:
             self._report("abandoned")
 
     def _report(self, end: End) -> None:
-        twin = "both" if self.both else "mixed" if self._mixed else "partial" if self.partial else "full"
+        twin = (
+            "both"
+            if self.both
+            else "mixed"
+            if self._mixed
+            else "partial"
+            if self.partial
+            else "full"
+        )
         actions = "".join(map(str, self._actions))
         self._on_attempt(Attempt(self.seed, self._attempt, twin, actions, self.total, end))

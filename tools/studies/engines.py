@@ -1,7 +1,8 @@
-"""Where the runs of a study are carried out: in this process, in processes of this machine, on a Ray cluster.
+"""Where the runs of a study are carried out: in this process, in processes of this machine, on a
+Ray cluster.
 
-An engine takes jobs and yields one result for each as they end. A job is a JSON file, the config of a run. Progress
-needs no channel of its own: every run writes ``progress.json`` into its folder.
+An engine takes jobs and yields one result for each as they end. A job is a JSON file, the config of
+a run. Progress needs no channel of its own: every run writes ``progress.json`` into its folder.
 """
 
 import contextlib
@@ -41,14 +42,21 @@ GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
 
 PARENT_VARIABLE = "ARCADE_TORCH_PARENT"
-"""Process id that a worker watches: when that process is gone the worker stops with a checkpoint."""
+"""Process id that a worker watches: when that process is gone the worker stops with a
+checkpoint."""
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
-_QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+_QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_DEDUP_LOGS": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
 
 
 class Job(NamedTuple):
-    """One run to do: its name, JSON file with its config, its folder, and the log for what it prints."""
+    """One run to do: its name, JSON file with its config, its folder, and the log for what it
+    prints.
+    """
 
     name: str
     config: Path
@@ -72,11 +80,16 @@ class Job(NamedTuple):
         load_extensions()  # of the process that made the job
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
-        if train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status == "interrupted":
+        if (
+            train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status
+            == "interrupted"
+        ):
             raise KeyboardInterrupt
 
     def attempt(self) -> tuple[str, str]:
-        """Carry it out; returns why it failed in one line, and the traceback, both empty for success."""
+        """Carry it out; returns why it failed in one line, and the traceback, both empty for
+        success.
+        """
         try:
             self.train()
         except Exception as error:
@@ -109,7 +122,9 @@ class Inline:
     """One job after the other in this process."""
 
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
-        """Run the jobs in order; an exception of one becomes its result, and its traceback goes into the log."""
+        """Run the jobs in order; an exception of one becomes its result, and its traceback goes
+        into the log.
+        """
         for job in jobs:
             error, trace = job.attempt()
             if trace:
@@ -119,24 +134,32 @@ class Inline:
 
 @dataclass
 class Processes:
-    """Local worker processes, one a job; where they are as many as the cores, each on a core of its own."""
+    """Local worker processes, one a job; where they are as many as the cores, each on a core of its
+    own.
+    """
 
     workers: int = 0  # how many at once; one a core by default
-    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")  # start of a worker's command line
+    # start of a worker's command line
+    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")
     poll_s: float = 0.1  # between two looks at the workers
     grace_s: float = GRACE_S
 
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
-        """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time to save."""
+        """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
+        to save.
+        """
         cores = available_cores()
-        waiting, active = list(jobs), dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
-        # Fewer workers go where there is room: another study, or shard, may be at work on the same machine.
+        waiting = list(jobs)
+        active = dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
+        # Fewer workers go where there is room: another study, or shard, may be at work on the same
+        # machine.
         shared = [set(cores)] * min(self.workers, len(waiting))
         free = [{core} for core in cores] if self.workers in (0, len(cores)) else shared
         try:
             while waiting or active:
                 while waiting and free:
-                    job, where = waiting.pop(0), free.pop(0)
+                    job = waiting.pop(0)
+                    where = free.pop(0)
                     active[self._start(job, where)] = job, where
                 for process in [each for each in active if each.poll() is not None]:
                     job, where = active.pop(process)
@@ -164,16 +187,20 @@ class Processes:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **threads, PARENT_VARIABLE: str(os.getpid())},
-                start_new_session=True,  # the terminal's Ctrl-C goes to the study alone, which then stops its workers
+                # the terminal's Ctrl-C goes to the study alone, which then stops its workers
+                start_new_session=True,
             )
         if hasattr(os, "sched_setaffinity"):
-            with contextlib.suppress(ProcessLookupError, PermissionError):  # slower without it, not wrong
+            # slower without it, not wrong
+            with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.sched_setaffinity(process.pid, cores)
         return process
 
 
 def watch_parent(every_s: float = 2.0) -> None:
-    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing happens."""
+    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing
+    happens.
+    """
     parent = os.environ.get(PARENT_VARIABLE)
 
     def look() -> None:
@@ -207,7 +234,9 @@ class ClusterLostError(RuntimeError):
 class RayOptions:
     """How a Ray cluster is used."""
 
-    address: str = ""  # Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this machine.
+    # Ray: address of a cluster (auto, HOST:PORT); without one, a cluster of its own on this
+    # machine.
+    address: str = ""
     cpus_per_run: float = 1.0  # Ray: cores that a run keeps busy.
     gpus_per_run: float = 0.0  # Ray: GPUs, or the part of one, that a run keeps busy.
     retries: int = 2  # Ray: further attempts at a run whose process or machine was lost.
@@ -215,12 +244,13 @@ class RayOptions:
 
 @dataclass
 class Ray(RayOptions):
-    """Carries out runs as tasks of a Ray cluster: one of its own on this machine, or an existing one.
+    """Carries out runs as tasks of a Ray cluster: one of its own on this machine, or an existing
+    one.
 
-    Ray places the runs, and starts one again whose worker or machine was lost; it goes on from its last checkpoint.
-    Where a machine sees the study's folder, the run is written there. Where it does not, the run is carried out on the
-    disk of that machine and its small files travel back. A cluster of its own can be reached from this machine alone
-    and ends with the study.
+    Ray places the runs, and starts one again whose worker or machine was lost; it goes on from its
+    last checkpoint. Where a machine sees the study's folder, the run is written there. Where it
+    does not, the run is carried out on the disk of that machine and its small files travel back. A
+    cluster of its own can be reached from this machine alone and ends with the study.
 
     Raises:
         ValueError: a number is out of range.
@@ -240,24 +270,39 @@ class Ray(RayOptions):
         """Run the jobs as there is room; on Ctrl-C or close each run gets time to save."""
         with self._cluster() as ray:
             have = ray.cluster_resources()
-            cpus, gpus = have.get("CPU", 0), have.get("GPU", 0)
+            cpus = have.get("CPU", 0)
+            gpus = have.get("GPU", 0)
             if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
-                wanted = f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this machine has"
-                raise ValueError(f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run")
-            options = {"num_cpus": self.cpus_per_run, "num_gpus": self.gpus_per_run, "max_retries": self.retries}
+                wanted = (
+                    f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this "
+                    "machine has"
+                )
+                raise ValueError(
+                    f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run"
+                )
+            options = {
+                "num_cpus": self.cpus_per_run,
+                "num_gpus": self.gpus_per_run,
+                "max_retries": self.retries,
+            }
             environment = {"env_vars": {VARIABLE: os.environ.get(VARIABLE, "")}}
             task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
-            waiting, flying = list(jobs), dict[Any, Job]()
+            waiting = list(jobs)
+            flying = dict[Any, Job]()
             try:
                 while waiting or flying:
                     while waiting and len(flying) < (self.workers or len(waiting) + len(flying)):
                         job = waiting.pop(0)
-                        there = job._replace(config=job.config.absolute(), folder=job.folder.absolute())
+                        there = job._replace(
+                            config=job.config.absolute(), folder=job.folder.absolute()
+                        )
                         flying[task.remote(there, read_bytes(job.config, MOST_JSON))] = job
                     ready, _ = ray.wait(list(flying), num_returns=1, timeout=1.0)
-                    if not self.address and not ray.cluster_resources().get("CPU"):  # it began with all cores
+                    # it began with all cores
+                    if not self.address and not ray.cluster_resources().get("CPU"):
                         raise ClusterLostError(
-                            "Ray's node on this machine is gone (killed, or out of memory); finished runs are kept, "
+                            "Ray's node on this machine is gone (killed, or out of memory); "
+                            "finished runs are kept, "
                             "the same command goes on with the others"
                         )
                     for reference in ready:
@@ -278,13 +323,21 @@ class Ray(RayOptions):
             return
         for key, value in _QUIET.items():
             os.environ.setdefault(key, value)
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "address": self.address or "local"}
+        options: dict[str, Any] = {
+            "log_to_driver": False,
+            "logging_level": "ERROR",
+            "address": self.address or "local",
+        }
         if not self.address:
-            # Ray replaces 127.0.0.1 by the address that other machines know, and listens there, but for this switch,
-            # made for firewalls that ask; it is read from the environment when ray is imported.
+            # Ray replaces 127.0.0.1 by the address that other machines know, and listens there, but
+            # for this switch, made for firewalls that ask; it is read from the environment when ray
+            # is imported.
             with contextlib.suppress(ImportError, AttributeError):
                 importlib.import_module("ray._private.ray_constants").ENABLE_RAY_CLUSTER = False  # type: ignore[attr-defined]
-            options |= {"num_cpus": max(len(available_cores()), self.workers), "include_dashboard": False}
+            options |= {
+                "num_cpus": max(len(available_cores()), self.workers),
+                "include_dashboard": False,
+            }
             options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": 128 << 20}
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
@@ -303,15 +356,20 @@ class Ray(RayOptions):
 def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """Carry out a run on a machine of the cluster.
 
-    The paths of the job are those of the machine that sends it. Returns why the run failed, in one line, and the
-    traceback (empty for success), and where the disk is not shared its small files: of a failed run no checkpoints.
+    The paths of the job are those of the machine that sends it. Returns why the run failed, in one
+    line, and the traceback (empty for success), and where the disk is not shared its small files:
+    of a failed run no checkpoints.
     """
-    shared, files = False, dict[str, bytes]()
+    shared = False
+    files = dict[str, bytes]()
     with contextlib.suppress(OSError, ValueError):
         shared = read_bytes(job.config, MOST_JSON) == config
     if not shared:
-        key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]  # another attempt finds it again
-        here = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
+        # another attempt finds it again
+        key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]
+        here = (
+            Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
+        )
         job = job._replace(folder=here / "run", config=write_atomic(here / "config.json", config))
     error, trace = job.attempt()
     if not shared:
@@ -330,7 +388,9 @@ def _result(ray: Any, reference: Any, job: Job) -> JobResult:
     try:
         error, trace, files = ray.get(reference)
     except ray.exceptions.RayError as lost:
-        return JobResult(job.name, f"its worker was lost: {type(lost).__name__}: {one_line(lost)[:200]}")
+        return JobResult(
+            job.name, f"its worker was lost: {type(lost).__name__}: {one_line(lost)[:200]}"
+        )
     for name in files:
         if not is_inside(job.folder, name):
             return JobResult(job.name, f"its worker sent {name!r}, which is no file of a run")

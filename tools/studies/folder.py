@@ -4,8 +4,8 @@
 
     study.json    the study, its versions, the command of every run
     configs/NAME.json  the config of a run, which `arcade-torch train --config` takes
-    results.csv   one row a run, in the order of the grid; the same to the bit on every engine, interrupted or not
-    timings.csv   seconds of every run
+    results.csv   one row a run, in the order of the grid; the same to the bit on every engine,
+    interrupted or not timings.csv   seconds of every run
     runs/NAME/    one run folder each (see `arcade_torch.agents`)
     logs/NAME.log what the run printed, or why it failed
     failures/NAME.json the same in one line; gone when the run succeeds
@@ -30,7 +30,17 @@ from arcade_torch.tools.studies.grid import RunSpec, Study
 
 Row = dict[str, Any]
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
-RESULT_COLUMNS = ("run", *_CELL, "status", "frames", "eval_mean", "eval_std", "eval_n", "train_max_ewm", "error")
+RESULT_COLUMNS = (
+    "run",
+    *_CELL,
+    "status",
+    "frames",
+    "eval_mean",
+    "eval_std",
+    "eval_n",
+    "train_max_ewm",
+    "error",
+)
 TIMING_COLUMNS = ("run", "frames", "seconds")
 
 
@@ -42,7 +52,8 @@ class StudyFolder:
 
     def job(self, spec: RunSpec) -> Job:
         """Where the config, the folder and the log of a run stand."""
-        config, log = self.root / "configs" / f"{spec.name}.json", self.root / "logs" / f"{spec.name}.log"
+        config = self.root / "configs" / f"{spec.name}.json"
+        log = self.root / "logs" / f"{spec.name}.log"
         return Job(spec.name, config, self.root / "runs" / spec.name, log)
 
     def run(self, spec: RunSpec) -> Run:
@@ -67,10 +78,14 @@ class StudyFolder:
         return read_record(self.root / "study.json")
 
     def load(self) -> Study:
-        """The study that was run here; a ``FileNotFoundError`` or ``ValueError`` if there is none to read."""
+        """The study that was run here; a ``FileNotFoundError`` or ``ValueError`` if there is none
+        to read.
+        """
         file = self.root / "study.json"
         if not file.exists():
-            raise FileNotFoundError(f"{self.root} is not the folder of a study: it has no study.json")
+            raise FileNotFoundError(
+                f"{self.root} is not the folder of a study: it has no study.json"
+            )
         values = read_json(file)
         try:
             return Study.from_dict(values["study"])
@@ -80,43 +95,70 @@ class StudyFolder:
     def claim(self, study: Study, command: str = "") -> None:
         """Write ``study.json``, or go on where the same study stands already.
 
-        The grid may grow between two invocations; what decides a run's result may not change. A ``study.json`` that is
-        not even JSON is written anew: the run folders know what they hold and refuse other settings themselves. A
-        folder with other files, or a study or a finished run with other settings, is refused by a ``FileExistsError``.
+        The grid may grow between two invocations; what decides a run's result may not change. A
+        ``study.json`` that is not even JSON is written anew: the run folders know what they hold
+        and refuse other settings themselves. A folder with other files, or a study or a finished
+        run with other settings, is refused by a ``FileExistsError``.
         """
         old: dict[str, Any] = {}
         # Looked at before study.json, which another shard may be about to write.
-        foreign = self.root.exists() and not all(each.name.startswith(".study.json.") for each in self.root.iterdir())
+        foreign = self.root.exists() and not all(
+            each.name.startswith(".study.json.") for each in self.root.iterdir()
+        )
         if (self.root / "study.json").exists():
             with contextlib.suppress(ValueError):
                 old = self.record()
             before = self.load() if old else study
-            was, now, names = before.fixed(), study.fixed(), {run.name for run in study.runs()}
-            what = [f"study {before.name!r} with {k} = {was[k]!r}, not {now[k]!r}" for k in now if was[k] != now[k]]
-            what += [f"run {run.name}, which this study lacks" for run in before.runs() if run.name not in names]
+            was = before.fixed()
+            now = study.fixed()
+            names = {run.name for run in study.runs()}
+            what = [
+                f"study {before.name!r} with {k} = {was[k]!r}, not {now[k]!r}"
+                for k in now
+                if was[k] != now[k]
+            ]
+            what += [
+                f"run {run.name}, which this study lacks"
+                for run in before.runs()
+                if run.name not in names
+            ]
             if what:
                 raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
         elif foreign:
-            raise FileExistsError(f"{self.root} is not empty and holds no study: choose another --out")
+            raise FileExistsError(
+                f"{self.root} is not empty and holds no study: choose another --out"
+            )
         finished = [spec for spec in study.runs() if self.run(spec).final is not None]
         for spec, config in study.configs(finished).items():
             run = self.run(spec)
             if fields := _other_settings(run, config):
-                raise FileExistsError(f"{run.path} has other settings, {', '.join(fields)}: choose another --out")
+                raise FileExistsError(
+                    f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
+                )
         jobs = [self.job(run) for run in study.runs()]
         commands = {job.name: command_line(["train", *job.words]) for job in jobs}
         here = versions()
-        first, also = old.get("versions", here), old.get("also")  # what the first runs were made with stays on record
+        # what the first runs were made with stays on record
+        first = old.get("versions", here)
+        also = old.get("also")
         also = list(also) if isinstance(also, list) else []
         also += [] if here in (first, *also) else [here]
-        made = {"study": study.to_dict(), "command": command, "versions": first, "also": also, "runs": commands}
+        made = {
+            "study": study.to_dict(),
+            "command": command,
+            "versions": first,
+            "also": also,
+            "runs": commands,
+        }
         if made != old:
             write_json(self.root / "study.json", made)
 
     def write_results(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
-        """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both, joined.
+        """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both,
+        joined.
 
-        ``finished`` keeps the rows of finished runs from one call to the next: they are not read again.
+        ``finished`` keeps the rows of finished runs from one call to the next: they are not read
+        again.
         """
         finished = {} if finished is None else finished
         rows = list[Row]()
@@ -126,27 +168,48 @@ class StudyFolder:
                 finished[run] = row
             rows.append(row)
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
-        write_csv(self.root / "timings.csv", [row for row in rows if row["seconds"] is not None], TIMING_COLUMNS)
+        write_csv(
+            self.root / "timings.csv",
+            [row for row in rows if row["seconds"] is not None],
+            TIMING_COLUMNS,
+        )
         return rows
 
     def _row(self, spec: RunSpec) -> Row:
-        run, error = self.run(spec), ""
+        run = self.run(spec)
+        error = ""
         row: Row = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
-        row |= {"run": spec.name, "frames": run.progress()[0]} | {name: getattr(spec, name) for name in _CELL}
+        row |= {"run": spec.name, "frames": run.progress()[0]} | {
+            name: getattr(spec, name) for name in _CELL
+        }
         if final := run.final:
-            mean, returns = float(final["mean"]), [float(value) for value in final["returns"]]
+            mean = float(final["mean"])
+            returns = [float(value) for value in final["returns"]]
             squares = sum((value - mean) ** 2 for value in returns)
-            spread = (squares / (len(returns) - 1)) ** 0.5 if len(returns) > 1 else None  # of one episode there is none
-            row |= {name: final[name] for name in ("frames", "seconds", "train_max_ewm") if name in final}
+            # of one episode there is none
+            spread = (squares / (len(returns) - 1)) ** 0.5 if len(returns) > 1 else None
+            row |= {
+                name: final[name]
+                for name in ("frames", "seconds", "train_max_ewm")
+                if name in final
+            }
             row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
         else:
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # there is none, or it is damaged
+            # there is none, or it is damaged
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 error = str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
         begun = "unfinished" if run.path.exists() else "waiting"
-        return row | {"error": error, "status": "finished" if final else "failed" if error else begun}
+        return row | {
+            "error": error,
+            "status": "finished" if final else "failed" if error else begun,
+        }
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
-    """In what a run differs from its plan that may change its result; damaged settings are refused."""
+    """In what a run differs from its plan that may change its result; damaged settings are
+    refused.
+    """
     described(run)
-    return differing_fields(run.config | {"env": resolve_id(run.game)}, replace(plan, env=resolve_id(plan.env)), FREE)
+    return differing_fields(
+        run.config | {"env": resolve_id(run.game)}, replace(plan, env=resolve_id(plan.env)), FREE
+    )

@@ -84,9 +84,11 @@ class Study:
     algorithms: tuple[str, ...] = ("pqn",)  # learners
     preset: str = "paper"  # settings that all runs start from
     total_frames: int | None = None  # environment steps of each run; None keeps the preset's
-    settings: Mapping[str, Any] = field(default_factory=dict)  # fields of ``TrainConfig``: ``{"pqn": {"gamma": 0.9}}``
+    # fields of ``TrainConfig``: ``{"pqn": {"gamma": 0.9}}``
+    settings: Mapping[str, Any] = field(default_factory=dict)
     baseline: str = "mlp"  # the memory-free agent, against which Bias is measured
-    sizes: tuple[str, ...] = ()  # of the memory block, ``2x512``; the memory-free agent keeps the preset's
+    # of the memory block, ``2x512``; the memory-free agent keeps the preset's
+    sizes: tuple[str, ...] = ()
     question: str = ""  # what the study asks, a sentence for its report
 
     def __post_init__(self) -> None:
@@ -99,11 +101,15 @@ class Study:
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)
         if self.total_frames is not None:
-            object.__setattr__(self, "total_frames", coerce("total_frames", self.total_frames, _FRAMES))
+            object.__setattr__(
+                self, "total_frames", coerce("total_frames", self.total_frames, _FRAMES)
+            )
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Study":
-        """A study from plain values, as they stand in a TOML or JSON file; refuses unknown and missing keys."""
+        """A study from plain values, as they stand in a TOML or JSON file; refuses unknown and
+        missing keys.
+        """
         require(isinstance(values, Mapping), "a study", values, "a table of names and values")
         known = [item.name for item in fields(cls)]
         if unknown := [key for key in values if key not in known]:
@@ -122,7 +128,9 @@ class Study:
             if "baseline" in values:
                 study.require_baseline()
         except FileNotFoundError:
-            raise FileNotFoundError(f"no study at {path}: give a TOML file with games, memories and seeds") from None
+            raise FileNotFoundError(
+                f"no study at {path}: give a TOML file with games, memories and seeds"
+            ) from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ValueError(f"{path} is not TOML in UTF-8: {error}") from error
         except (ValueError, TypeError) as error:
@@ -131,31 +139,55 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in asdict(self).items()
+        }
 
     def require_baseline(self) -> None:
-        """Refuse a memory-free agent that the study does not train: there would be no Bias to report."""
-        keys = [AgentKey(algorithm, memory) for algorithm in self.algorithms for memory in self.memories]
+        """Refuse a memory-free agent that the study does not train: there would be no Bias to
+        report.
+        """
+        keys = [
+            AgentKey(algorithm, memory) for algorithm in self.algorithms for memory in self.memories
+        ]
         names = list(agent_names(keys).values())
         if not find_baselines(names, self.baseline):
             raise ValueError(
-                f"baseline = {self.baseline!r} is none of the agents that this study trains, {', '.join(names)}: "
+                f"baseline = {self.baseline!r} is none of the agents that this study trains, "
+                f"{', '.join(names)}: "
                 "add it to memories, or name one of them"
             )
 
     def fixed(self) -> dict[str, Any]:
-        """What may not change between two invocations in one folder: everything that decides a run's result."""
-        return {"preset": self.preset, "total_frames": self.total_frames, "settings": flatten(self.settings)}
+        """What may not change between two invocations in one folder: everything that decides a
+        run's result.
+        """
+        return {
+            "preset": self.preset,
+            "total_frames": self.total_frames,
+            "settings": flatten(self.settings),
+        }
 
     def runs(self) -> list[RunSpec]:
-        """All cells; seeds vary slowest, so that an unfinished study holds every agent once before any twice."""
-        sizes = {memory: self.sizes if memory != self.baseline and self.sizes else ("",) for memory in self.memories}
+        """All cells; seeds vary slowest, so that an unfinished study holds every agent once before
+        any twice.
+        """
+        sizes = {
+            memory: self.sizes if memory != self.baseline and self.sizes else ("",)
+            for memory in self.memories
+        }
         agents = [(memory, size) for memory in self.memories for size in sizes[memory]]
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
-        return [RunSpec(game, twin, agent[0], algo, seed, agent[1]) for seed, game, algo, agent, twin in cells]
+        return [
+            RunSpec(game, twin, agent[0], algo, seed, agent[1])
+            for seed, game, algo, agent, twin in cells
+        ]
 
     def configs(self, runs: Iterable[RunSpec]) -> dict[RunSpec, TrainConfig]:
-        """The configs of some runs; seeds of one cell share all that was checked, but for the seed."""
+        """The configs of some runs; seeds of one cell share all that was checked, but for the
+        seed.
+        """
         cells = dict[RunSpec, TrainConfig]()
         configs = dict[RunSpec, TrainConfig]()
         for run in runs:
@@ -167,16 +199,27 @@ class Study:
         return configs
 
     def config(self, run: RunSpec) -> TrainConfig:
-        """The config of one run; with one torch thread unless told, so that results are equal everywhere."""
+        """The config of one run; with one torch thread unless told, so that results are equal
+        everywhere.
+        """
         others = set(self.algorithms) - {run.algorithm}
-        changes = {"threads": 1} | {name: value for name, value in self.settings.items() if name not in others}
+        changes = {"threads": 1} | {
+            name: value for name, value in self.settings.items() if name not in others
+        }
         changes |= {} if self.total_frames is None else {"total_frames": self.total_frames}
         base = preset(self.preset, env=run.game, algorithm=run.algorithm)
         for name in ("env_options", "network_options"):
             changes[name] = {**getattr(base, name), **changes.get(name, {})}
         if run.size:
-            changes["network_options"] |= zip(("layers", "hidden_size"), map(int, run.size.split("x")), strict=True)
-        cell = {"env": run.game, "observability": run.observability, "memory": run.memory, "seed": run.seed}
+            changes["network_options"] |= zip(
+                ("layers", "hidden_size"), map(int, run.size.split("x")), strict=True
+            )
+        cell = {
+            "env": run.game,
+            "observability": run.observability,
+            "memory": run.memory,
+            "seed": run.seed,
+        }
         return preset(self.preset, algorithm=run.algorithm, **cell, **changes)
 
 
@@ -187,15 +230,26 @@ def study_preset(name: str) -> Study:
         >>> len(study_preset("paper").runs())
         2400
     """
-    require(name in STUDY_PRESETS, "the preset of a study", name, f"one of {', '.join(STUDY_PRESETS)}")
-    return replace(Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name)
+    require(
+        name in STUDY_PRESETS, "the preset of a study", name, f"one of {', '.join(STUDY_PRESETS)}"
+    )
+    return replace(
+        Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name
+    )
 
 
 def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
-    """The study behind ``arcade-torch demo``: games, both twins, one memory model and the memory-free control."""
+    """The study behind ``arcade-torch demo``: games, both twins, one memory model and the
+    memory-free control.
+    """
     demo = study_preset("demo")
-    what = Study.from_dict(demo.to_dict() | {"games": games, "seeds": seeds, "total_frames": frames})
-    question = f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and POMDPs (partial)?"
+    what = Study.from_dict(
+        demo.to_dict() | {"games": games, "seeds": seeds, "total_frames": frames}
+    )
+    question = (
+        f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and "
+        "POMDPs (partial)?"
+    )
     return what if games == demo.games else replace(what, question=question)
 
 
@@ -203,7 +257,10 @@ def _text_of(path: Path) -> str:
     """The text of a file that is small and plain enough to be a study."""
     text = read_text(path, MOST_BYTES)
     if any(line.count(".") > MOST_DOTS for line in text.split("\n")):
-        raise ValueError(f"it has a line with more than {MOST_DOTS:,} dots: give a TOML file with games and memories")
+        raise ValueError(
+            f"it has a line with more than {MOST_DOTS:,} dots: give a TOML file with games and "
+            "memories"
+        )
     return text
 
 
@@ -211,11 +268,23 @@ def _axis(axis: str, value: Any) -> tuple[Any, ...]:
     """The values of an axis, checked."""
     if axis == "seeds" and type(value) is int:
         if not 1 <= value <= MOST_SEEDS:
-            raise ValueError(f"seeds = {value}: give the number of seeds (1 to {MOST_SEEDS}) or a list")
+            raise ValueError(
+                f"seeds = {value}: give the number of seeds (1 to {MOST_SEEDS}) or a list"
+            )
         value = range(value)
-    values = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, Sequence) else None
+    values = (
+        (value,)
+        if isinstance(value, str)
+        else tuple(value)
+        if isinstance(value, Sequence)
+        else None
+    )
     if values is None or not (values or axis == "sizes"):
-        raise ValueError(f"{axis} is empty: a study needs at least one" if values == () else f"{axis} must be a list")
+        raise ValueError(
+            f"{axis} is empty: a study needs at least one"
+            if values == ()
+            else f"{axis} must be a list"
+        )
     values = tuple(coerce(axis, value, _AXES[axis]) for value in values)
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")

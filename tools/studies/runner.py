@@ -1,4 +1,6 @@
-"""Run a study: skip what is finished, resume what was interrupted, keep what others did when one fails."""
+"""Run a study: skip what is finished, resume what was interrupted, keep what others did when one
+fails.
+"""
 
 import contextlib
 import errno
@@ -27,7 +29,9 @@ LEAST_FREE_BYTES = 1 << 20
 
 
 class DiskFullError(RuntimeError):
-    """There is no space left; what is finished is kept, what is not goes on from its last checkpoint."""
+    """There is no space left; what is finished is kept, what is not goes on from its last
+    checkpoint.
+    """
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,8 @@ class StudyResult:
 
     root: Path
     rows: list[dict[str, Any]]  # of ``results.csv``
-    errors: dict[str, str]  # run name -> one line with the reason and the log, for runs that failed in this invocation
+    # run name -> one line with the reason and the log, for runs that failed in this invocation
+    errors: dict[str, str]
 
     @property
     def finished(self) -> int:
@@ -55,17 +60,19 @@ def study(
 ) -> StudyResult:
     """Carry out a study, or go on with it.
 
-    Finished runs are skipped, interrupted ones resumed from their last checkpoint, failed ones tried again.
+    Finished runs are skipped, interrupted ones resumed from their last checkpoint, failed ones
+    tried again.
 
     Args:
         what: a study or the path of its TOML file.
         out: folder of the study; made if it is missing, continued if it holds this study.
-        engine: where the runs are carried out: ``auto``, ``inline``, ``processes``, ``ray`` or an object with a
-            method ``run``.
+        engine: where the runs are carried out: ``auto``, ``inline``, ``processes``, ``ray`` or an
+            object with a method ``run``.
         workers: how many runs at once, 0 for one a core.
         command: how the user started this, kept in ``study.json``.
         stream: where progress is shown, stderr by default.
-        shard: ``3/10`` carries out the third tenth of the runs; others, in the same folder, the other tenths.
+        shard: ``3/10`` carries out the third tenth of the runs; others, in the same folder, the
+            other tenths.
 
     Returns:
         The rows of ``results.csv`` and the errors of this invocation.
@@ -73,12 +80,14 @@ def study(
     Raises:
         FileNotFoundError: there is no such file.
         FileExistsError: ``out`` holds something else.
-        ValueError: the study names a game, memory model or setting that does not exist, or is no study.
+        ValueError: the study names a game, memory model or setting that does not exist, or is no
+            study.
         DiskFullError: there is no space left for results; what is finished is kept.
     """
     what = what if isinstance(what, Study) else Study.load(what)
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
-    plan, folder = planned(what, shard), StudyFolder(Path(out))
+    plan = planned(what, shard)
+    folder = StudyFolder(Path(out))
     try:
         folder.claim(what, command)
         results = Results(folder, what)
@@ -86,12 +95,16 @@ def study(
         jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
         for run, job in jobs.items():
             write_json(job.config, plan[run].to_dict())
-        errors = _carry_out(results, list(plan), list(jobs.values()), engine, stream) if jobs else {}
+        errors = (
+            _carry_out(results, list(plan), list(jobs.values()), engine, stream) if jobs else {}
+        )
         return StudyResult(folder.root, results.write(), errors)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        raise DiskFullError(f"{error.strerror}: {error.filename or 'the study'}; make room and start again") from error
+        raise DiskFullError(
+            f"{error.strerror}: {error.filename or 'the study'}; make room and start again"
+        ) from error
 
 
 def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> Engine:
@@ -101,7 +114,9 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     if name == "ray":
         return Ray(**of_ray, workers=workers)
     if wrong := [key for key, value in of_ray.items() if value != getattr(RayOptions, key)]:
-        raise ValueError(f"--{wrong[0].replace('_', '-')} is for --engine ray, and the engine is {name}")
+        raise ValueError(
+            f"--{wrong[0].replace('_', '-')} is for --engine ray, and the engine is {name}"
+        )
     if name == "processes" or (name == "auto" and len(available_cores()) > 1):
         return Processes(workers)
     if name in ("auto", "inline"):
@@ -110,7 +125,9 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
 
 
 def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
-    """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and all checked."""
+    """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and
+    all checked.
+    """
     _check_names(what)
     found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
@@ -119,12 +136,15 @@ def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
 
 
 def _check_names(what: Study) -> None:
-    """Refuse games and memories that do not exist, or stand there twice by two names, and an untrained baseline."""
+    """Refuse games and memories that do not exist, or stand there twice by two names, and an
+    untrained baseline.
+    """
     from arcade_torch.envs_jax import make, resolve_id
     from arcade_torch.models import make_memory, memory_names
     from arcade_torch.models.registry import ALIASES
 
-    games, memories = dict[str, str](), dict[str, str]()
+    games = dict[str, str]()
+    memories = dict[str, str]()
     for game in what.games:
         make(game)
         bare = resolve_id(game).rpartition("-v")[0]
@@ -158,7 +178,9 @@ class Results:
             self._pace.work(self.write)
 
 
-def _carry_out(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any) -> dict[str, str]:
+def _carry_out(
+    results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
+) -> dict[str, str]:
     """Run the jobs and watch them; the tables are written in the end too, whatever ends it."""
     try:
         return _watch(results, plan, jobs, engine, stream)
@@ -168,9 +190,13 @@ def _carry_out(results: Results, plan: list[RunSpec], jobs: list[Job], engine: E
         raise
 
 
-def _watch(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any) -> dict[str, str]:
-    what, folder = results.study, results.folder
-    runs, errors = {run.name: run for run in plan}, dict[str, str]()
+def _watch(
+    results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
+) -> dict[str, str]:
+    what = results.study
+    folder = results.folder
+    runs = {run.name: run for run in plan}
+    errors = dict[str, str]()
     ended = set(runs) - {job.name for job in jobs}
     bars = shown(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
     with bars as note, contextlib.closing(engine.run(jobs)) as ends:  # type: ignore[type-var]
@@ -179,7 +205,8 @@ def _watch(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engin
         for name, error in ends:
             run = runs[name]
             ended.add(name)
-            if folder.run(run).final is not None:  # a process killed after its last word has done its work
+            # a process killed after its last word has done its work
+            if folder.run(run).final is not None:
                 error = ""
             else:
                 error = error or "ended without a final evaluation"
@@ -187,16 +214,24 @@ def _watch(results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engin
                 note(f"{name} failed: {errors[name]}")
             folder.note_failure(run, error)
             results.write_if_due()
-            if error and ("No space left" in error or shutil.disk_usage(folder.root).free < LEAST_FREE_BYTES):
-                raise DiskFullError(f"the disk with {folder.root} is full ({error}); make room and start it again")
+            if error and (
+                "No space left" in error or shutil.disk_usage(folder.root).free < LEAST_FREE_BYTES
+            ):
+                raise DiskFullError(
+                    f"the disk with {folder.root} is full ({error}); make room and start it again"
+                )
     return errors
 
 
 @contextlib.contextmanager
-def shown(title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None) -> Iterator[Callable[[str], None]]:
-    """Show how far a study is, from the ``progress.json`` of its runs, a bar for all and one for each run at work.
+def shown(
+    title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None
+) -> Iterator[Callable[[str], None]]:
+    """Show how far a study is, from the ``progress.json`` of its runs, a bar for all and one for
+    each run at work.
 
-    ``ended`` holds the names of the runs that have ended; the caller adds to it. Gives a function that prints a line.
+    ``ended`` holds the names of the runs that have ended; the caller adds to it. Gives a function
+    that prints a line.
     """
     stop = threading.Event()
     with Bars(stream, "frames", first_line_s=3.0) as bars:
@@ -227,7 +262,9 @@ def show_progress(
     ended: set[str],
     kept: dict[str, tuple[int, int, str]] | None = None,
 ) -> None:
-    """Read the folders of all runs and draw the bars; ``kept`` gathers what those that have ended said at last."""
+    """Read the folders of all runs and draw the bars; ``kept`` gathers what those that have ended
+    said at last.
+    """
     kept = {} if kept is None else kept
     seen = dict[str, tuple[int, int, str]]()
     for name, run in runs.items():
@@ -240,7 +277,8 @@ def show_progress(
     for name, (done, wanted, status) in seen.items():
         wanted = wanted or usual
         done = wanted if name in ended else min(done, wanted)
-        frames, total = frames + done, total + wanted
+        frames = frames + done
+        total = total + wanted
         bar = f"  {name.replace('__', ' ')}"
         if bars.terminal and status == "running" and name not in ended:
             bars.update(bar, done, wanted)

@@ -1,4 +1,6 @@
-"""Record what the losses of commit 44399dd compute, in float64. It runs against that commit only; see README.md."""
+"""Record what the losses of commit 44399dd compute, in float64. It runs against that commit only;
+see README.md.
+"""
 
 import copy
 import sys
@@ -16,7 +18,11 @@ from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.frames import next_pixels
 from arcade_torch.models import make_actor_critic, make_network
 
-GAMES, ALGORITHMS, MEMORIES = ("MineSweeperEasy", "NavigatorEasy"), ("pqn", "ppo", "dqn"), ("lru", "gru", "mlp")
+GAMES, ALGORITHMS, MEMORIES = (
+    ("MineSweeperEasy", "NavigatorEasy"),
+    ("pqn", "ppo", "dqn"),
+    ("lru", "gru", "mlp"),
+)
 ENVS, NEW, OVERLAP = 32, 12, 4
 DATA = Path(__file__).parent
 
@@ -29,7 +35,10 @@ class Player:
         self.generator = torch.Generator().manual_seed(5)
 
     def initial_state(self, batch_size):
-        return TensorDict({name: net.initial_state(batch_size) for name, net in self.networks.items()}, [batch_size])
+        return TensorDict(
+            {name: net.initial_state(batch_size) for name, net in self.networks.items()},
+            [batch_size],
+        )
 
     @torch.no_grad()
     def act(self, obs, state):
@@ -38,7 +47,9 @@ class Player:
         action = torch.randint(self.num_actions, (len(last_action),), generator=self.generator)
         after, extras = self.initial_state(len(last_action)), {}
         for name, network in self.networks.items():
-            out, after[name] = network(pixels, last_action, obs["is_init"].reshape(-1, 1), state[name])
+            out, after[name] = network(
+                pixels, last_action, obs["is_init"].reshape(-1, 1), state[name]
+            )
             if name.startswith("ppo"):
                 log_probs = network.split(out.squeeze(1))[0].log_softmax(-1)
                 extras[f"log_prob_{name}"] = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
@@ -46,7 +57,9 @@ class Player:
 
 
 def choose_rows(terminated, truncated):
-    """Four rows: both endings inside, a truncation inside, an end at the last step, no end; None if there are none."""
+    """Four rows: both endings inside, a truncation inside, an end at the last step, no end; None if
+    there are none.
+    """
     inside, any_end = slice(OVERLAP + 1, -1), (terminated | truncated)
     cut = truncated[:, inside].any(1)
     wanted = (terminated[:, inside].any(1) & cut, cut, any_end[:, -1], ~any_end.any(1))
@@ -68,13 +81,19 @@ def collect(game, networks):
     collector = arcade_torch.ArcadeCollector(env, player, frames_per_batch=ENVS * NEW, **options)
     for window in range(40):
         batch = collector.collect()
-        if window == 0:  # scale the input by the first frames; the states of later windows are those of the new scale
+        # Scale the input by the first frames; the states of later windows are those of the new scale.
+        if window == 0:
             for network in networks.values():
                 network.calibrate(batch["pixels"])
-        terminated, truncated = (batch["next", key].squeeze(-1) for key in ("terminated", "truncated"))
+        terminated, truncated = (
+            batch["next", key].squeeze(-1) for key in ("terminated", "truncated")
+        )
         rows = choose_rows(terminated, truncated & ~terminated)
         if window > 1 and rows is not None:
-            states = {overlap: player.states[window * NEW + OVERLAP - overlap][rows] for overlap in (0, OVERLAP)}
+            states = {
+                overlap: player.states[window * NEW + OVERLAP - overlap][rows]
+                for overlap in (0, OVERLAP)
+            }
             batch = batch[rows].clone()
             for key, value in batch["initial_state"].items(True, True):
                 assert torch.equal(value, states[OVERLAP][key])
@@ -86,7 +105,9 @@ def collect(game, networks):
 def with_overlap(batch, state, overlap, log_prob=None):
     """The batch with so many steps of the window before, as the collector gives it."""
     first = OVERLAP - overlap
-    cut = TensorDict({"initial_state": state, "next_pool": batch.get("next_pool")}, batch.batch_size)
+    cut = TensorDict(
+        {"initial_state": state, "next_pool": batch.get("next_pool")}, batch.batch_size
+    )
     for key in ("pixels", "action", "last_action", "is_init"):
         cut[key] = batch[key][:, first:]
     for key in ("reward", "terminated", "truncated", "frame_slot"):
@@ -108,12 +129,20 @@ def disturbed(network, scale, seed):
 def grads(network, loss):
     network.zero_grad()
     loss.backward()
-    return {f"grad/{name}": torch.zeros_like(p) if p.grad is None else p.grad for name, p in network.named_parameters()}
+    return {
+        f"grad/{name}": torch.zeros_like(p) if p.grad is None else p.grad
+        for name, p in network.named_parameters()
+    }
 
 
 def q_case(loss, batch):
     out = loss.compute(loss.read(batch))
-    return {"loss": out.loss, "target": out.target, "next_value": out.next_value, **grads(loss.network, out.loss)}
+    return {
+        "loss": out.loss,
+        "target": out.target,
+        "next_value": out.next_value,
+        **grads(loss.network, out.loss),
+    }
 
 
 def pqn_cases(network, batches):
@@ -121,7 +150,10 @@ def pqn_cases(network, batches):
         for bootstrap in ("next", "last"):
             for limit in ("bootstrap", "terminal"):
                 loss = PQNLoss(network, time_limit=limit, bootstrap=bootstrap)
-                yield f"overlap={overlap},bootstrap={bootstrap},time_limit={limit}", q_case(loss, batch)
+                yield (
+                    f"overlap={overlap},bootstrap={bootstrap},time_limit={limit}",
+                    q_case(loss, batch),
+                )
 
 
 def dqn_cases(network, target, batches):
@@ -172,7 +204,9 @@ def record(game):
     }
     write(game, experience)
     for name, behaviour in networks.items():
-        network = disturbed(behaviour, 0.02, 1)  # float32, as everything that is read from the files
+        network = disturbed(
+            behaviour, 0.02, 1
+        )  # float32, as everything that is read from the files
         other = disturbed(network, 0.1, 2)  # target network of DQN; PPO's after some gradient steps
         log_prob = batch.get(f"log_prob_{name}", None)
         batches = {o: with_overlap(batch, states[o][name], o, log_prob) for o in (0, OVERLAP)}
@@ -207,7 +241,10 @@ def doubled(batch):
 
 def write(name, tensors):
     file = DATA / f"{name}.safetensors"
-    tensors = {key: value.float() if value.dtype == torch.float64 else value for key, value in tensors.items()}
+    tensors = {
+        key: value.float() if value.dtype == torch.float64 else value
+        for key, value in tensors.items()
+    }
     save_file({key: value.detach().clone().contiguous() for key, value in tensors.items()}, file)
     print(f"{file.stat().st_size:8d} {file.name}")
 

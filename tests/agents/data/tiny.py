@@ -13,8 +13,16 @@ class TinyEncoder(SmallEncoder):
         self.feature_size = 8
         self.conv1 = nn.Conv2d(3, 2, 4, 4)
         self.conv2 = nn.Conv2d(2, 2, 3)
-        self.linear = nn.Conv2d(2, 8, 6)  # recorded as nn.Linear(72, 8), which is the same weights in another shape
+        self.linear = nn.Conv2d(
+            2, 8, 6
+        )  # recorded as nn.Linear(72, 8), which is the same weights in another shape
 
 
-NETWORK = {"preset": "small", "obs_size": 128, "encoder": TinyEncoder, "hidden_size": 8, "towers": 2}
+NETWORK = {
+    "preset": "small",
+    "obs_size": 128,
+    "encoder": TinyEncoder,
+    "hidden_size": 8,
+    "towers": 2,
+}
 """Options of every recorded network beside its memory."""

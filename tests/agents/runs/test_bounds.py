@@ -58,7 +58,7 @@ def test_a_refusal_says_once_what_is_wrong(tmp_path: Path) -> None:
         read_json(tmp_path)
 
 
-# -- appending ---------------------------------------------------------------------------------------------------------
+# -- appending -------------------------------------------------------------------------------------
 
 
 @pytest.mark.timeout(20)
@@ -102,12 +102,14 @@ def test_a_log_that_could_not_be_written_closes_without_another_error(tmp_path: 
     log.close()
 
 
-# -- names -------------------------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["lock", "tensorboard", "wandb", "wandb_id.txt"])
 def test_a_run_follows_no_link_to_where_it_writes(tmp_path: Path, name: str) -> None:
-    """Before: TensorBoard wrote behind the link; locks of filelock 3.12 empty the file behind theirs."""
+    """Before: TensorBoard wrote behind the link; locks of filelock 3.12 empty the file behind
+    theirs.
+    """
     outside = tmp_path / "outside"
     outside.write_text("mine")
     run = tmp_path / "run"
@@ -163,7 +165,7 @@ def test_a_finished_run_that_may_not_be_read_is_not_evaluated_again(
         RunFolder(tmp_path).finished()
 
 
-# -- tensors -----------------------------------------------------------------------------------------------------------
+# -- tensors ---------------------------------------------------------------------------------------
 
 
 class Claim:

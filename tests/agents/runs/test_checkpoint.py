@@ -88,7 +88,8 @@ def test_a_checkpoint_of_version_0_1_is_refused_in_one_line_that_says_so(tmp_pat
     for frames in (64, 128):
         file = save(tmp_path, frames) / "meta.json"
         old = json.loads(file.read_text())
-        old["config"]["pqn"]["epsilon_share"] = 0.25  # a name of then; the config is not to be looked at
+        # a name of then; the config is not to be looked at
+        old["config"]["pqn"]["epsilon_share"] = 0.25
         file.write_text(json.dumps(old | {"format": 1}))
     with pytest.raises(CheckpointError) as refused:
         load_latest(tmp_path)

@@ -1,4 +1,6 @@
-"""Files of a run that somebody else made, or that cannot be written: refused in one line, and nothing is harmed."""
+"""Files of a run that somebody else made, or that cannot be written: refused in one line, and
+nothing is harmed.
+"""
 
 import errno
 import io
@@ -65,7 +67,7 @@ def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path: Path) -> None:
     assert read_csv(tmp_path / "a.csv") == [{"a": "1", "b": "2"}]
 
 
-# -- names -------------------------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------
 
 
 def replay(folder: Path) -> SequenceReplay:
@@ -76,7 +78,9 @@ def replay(folder: Path) -> SequenceReplay:
 
 @pytest.mark.parametrize("name", ["{outside}", "../outside", "window-1.safetensors", "sub/window-000000000.safetensors"])
 def test_a_forged_name_reaches_no_file_outside(tmp_path: Path, name: str) -> None:
-    """Before: an absolute name, or one with .., was opened, and removed when the replay was full."""
+    """Before: an absolute name, or one with .., was opened, and removed when the replay was
+    full.
+    """
     outside = tmp_path / "outside"
     made = replay(tmp_path / "run" / "replay")
     state = made.state_dict()
@@ -131,7 +135,7 @@ def test_a_folder_of_another_name_is_no_checkpoint(tmp_path: Path) -> None:
     assert checkpoints.list_checkpoints(tmp_path) == []
 
 
-# -- tensors -----------------------------------------------------------------------------------------------------------
+# -- tensors ---------------------------------------------------------------------------------------
 
 
 def saved(folder: Path) -> Path:
@@ -190,7 +194,7 @@ def test_what_may_not_be_read_is_not_called_damaged(tmp_path: Path, monkeypatch:
         checkpoints.load_checkpoint(path)
 
 
-# -- writing -----------------------------------------------------------------------------------------------------------
+# -- writing ---------------------------------------------------------------------------------------
 
 
 def test_files_have_the_mode_of_the_umask(tmp_path: Path) -> None:

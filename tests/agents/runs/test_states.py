@@ -1,4 +1,6 @@
-"""A forged state of a trainer is refused in one line, or the training goes on with it; nothing fails in between."""
+"""A forged state of a trainer is refused in one line, or the training goes on with it; nothing
+fails in between.
+"""
 
 import random
 from collections.abc import Iterator
@@ -71,7 +73,9 @@ def test_the_state_that_was_saved_is_taken(run: tuple[Trainer, Checkpoint]) -> N
 
 
 def test_a_forged_state_is_refused_or_trains(run: tuple[Trainer, Checkpoint]) -> None:
-    """Before: a sixth of them was taken, and failed in the next update with the errors of torch and Python."""
+    """Before: a sixth of them was taken, and failed in the next update with the errors of torch and
+    Python.
+    """
     trainer, checkpoint = run
     rng = random.Random(0)
     every = [path for path in places(checkpoint.trainer) if path]

@@ -25,7 +25,9 @@ def to_theirs(game: Any, ours: AutoEncodeState) -> dict[str, Any]:
     }
 
 
-def reported(game: Any, ours: AutoEncodeState, terminated: Array, truncated: Array) -> tuple[Array, Array]:
+def reported(
+    game: Any, ours: AutoEncodeState, terminated: Array, truncated: Array
+) -> tuple[Array, Array]:
     """A3: both flags are up one step before the end."""
     return ours.given >= game.level.cards, ours.timestep >= game.max_steps
 

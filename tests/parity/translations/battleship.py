@@ -42,7 +42,9 @@ def hasten(key: Array, game: Any, ours: BattleShipState) -> BattleShipState:
     last = jnp.argmax(ours.board) == jnp.arange(game.level.cells).reshape(ours.board.shape)
     guesses = jax.random.bernoulli(for_shots, 0.9, ours.board.shape) & ~last
     repeats = game.level.max_repeats - jax.random.randint(for_repeats, (), 0, 4)
-    return ours._replace(guesses=small(guesses), hits=(guesses * ours.board).sum(dtype=jnp.int32), repeats=repeats)
+    return ours._replace(
+        guesses=small(guesses), hits=(guesses * ours.board).sum(dtype=jnp.int32), repeats=repeats
+    )
 
 
 TRANSLATION = Translation(to_ours, to_theirs, "timestep", hasten=hasten)

@@ -12,10 +12,19 @@ from tests.parity.translation import Array, Translation, any_flag, number
 
 def to_ours(game: Any, theirs: Any) -> BreakoutState:
     """The rows of the wall alone."""
-    numbers = (theirs.ball_x, theirs.ball_y, theirs.ball_dir, theirs.last_x, theirs.last_y, theirs.pos)
+    numbers = (
+        theirs.ball_x,
+        theirs.ball_y,
+        theirs.ball_dir,
+        theirs.last_x,
+        theirs.last_y,
+        theirs.pos,
+    )
     bricks = jnp.asarray(theirs.brick_map)[WALL_TOP : WALL_TOP + WALL_ROWS] > 0
     strike = jnp.asarray(theirs.strike, bool)
-    return BreakoutState(*map(number, numbers), bricks, strike, number(theirs.score), number(theirs.time))
+    return BreakoutState(
+        *map(number, numbers), bricks, strike, number(theirs.score), number(theirs.time)
+    )
 
 
 def to_theirs(game: Any, ours: BreakoutState) -> dict[str, Any]:
@@ -39,7 +48,9 @@ def to_theirs(game: Any, ours: BreakoutState) -> dict[str, Any]:
 def hasten(key: Array, game: Any, ours: BreakoutState) -> BreakoutState:
     """A few bricks left."""
     for_many, for_one = jax.random.split(key)
-    one = jax.random.randint(for_one, (), 0, BRICKS) == jnp.arange(BRICKS).reshape(WALL_ROWS, COLUMNS)
+    one = jax.random.randint(for_one, (), 0, BRICKS) == jnp.arange(BRICKS).reshape(
+        WALL_ROWS, COLUMNS
+    )
     bricks = one | jax.random.bernoulli(for_many, 0.1, one.shape)
     return ours._replace(bricks=bricks, score=BRICKS - bricks.sum(dtype=jnp.int32))
 

@@ -1,6 +1,8 @@
-"""CartPole and NoisyCartPole: all fields are shared; the noise is in our state alone, and in the picture alone.
+"""CartPole and NoisyCartPole: all fields are shared; the noise is in our state alone, and in the
+picture alone.
 
-A pole lets the last bit of a rounded number grow without bounds, so every step begins from the published pose.
+A pole lets the last bit of a rounded number grow without bounds, so every step begins from the
+published pose.
 """
 
 from typing import Any
@@ -30,17 +32,30 @@ def adopt(game: Any, ours: CartPoleState, theirs: Any) -> CartPoleState:
     return ours._replace(noise=jnp.zeros(4))
 
 
-def reported(game: Any, ours: CartPoleState, terminated: Array, truncated: Array) -> tuple[Array, Array]:
-    """C1: ``terminated`` is up at every end, and ``truncated`` looks at the clock after the step, the end before it."""
+def reported(
+    game: Any, ours: CartPoleState, terminated: Array, truncated: Array
+) -> tuple[Array, Array]:
+    """C1: ``terminated`` is up at every end, and ``truncated`` looks at the clock after the step,
+    the end before it.
+    """
     return terminated | truncated, ours.time >= game.max_steps
 
 
 def hasten(key: Array, game: Any, ours: CartPoleState) -> CartPoleState:
     """A fast cart anywhere, a pole that leans."""
-    x, x_dot, theta, theta_dot = jax.random.uniform(key, (4,), minval=-1.0) * jnp.array([2.4, 3.0, 0.2, 1.0])
+    x, x_dot, theta, theta_dot = jax.random.uniform(key, (4,), minval=-1.0) * jnp.array(
+        [2.4, 3.0, 0.2, 1.0]
+    )
     return ours._replace(x=x, x_dot=x_dot, theta=theta, theta_dot=theta_dot)
 
 
 TRANSLATION = Translation(
-    to_ours, to_theirs, "time", adopt=adopt, reported=reported, hasten=hasten, tolerance=2e-6, resync=True
+    to_ours,
+    to_theirs,
+    "time",
+    adopt=adopt,
+    reported=reported,
+    hasten=hasten,
+    tolerance=2e-6,
+    resync=True,
 )

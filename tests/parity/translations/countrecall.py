@@ -12,7 +12,9 @@ from tests.parity.translation import Array, Translation, number, small
 def to_ours(game: Any, theirs: Any) -> CountRecallState:
     """Cards and counters."""
     counters = (theirs.timestep, theirs.default_action, theirs.score, theirs.alreadyMove)
-    return CountRecallState(small(theirs.value_cards), small(theirs.query_cards), *map(number, counters))
+    return CountRecallState(
+        small(theirs.value_cards), small(theirs.query_cards), *map(number, counters)
+    )
 
 
 def to_theirs(game: Any, ours: CountRecallState) -> dict[str, Any]:

@@ -11,13 +11,22 @@ from tests.parity.translation import Array, Translation, number, small
 def to_ours(game: Any, theirs: Any) -> NavigatorState:
     """Field by field."""
     return NavigatorState(
-        number(theirs.action_x), number(theirs.action_y), small(theirs.board), number(theirs.timestep)
+        number(theirs.action_x),
+        number(theirs.action_y),
+        small(theirs.board),
+        number(theirs.timestep),
     )
 
 
 def to_theirs(game: Any, ours: NavigatorState) -> dict[str, Any]:
     """The score is 0 in mid-episode."""
-    return {"action_x": ours.x, "action_y": ours.y, "timestep": ours.timestep, "board": ours.board, "score": 0}
+    return {
+        "action_x": ours.x,
+        "action_y": ours.y,
+        "timestep": ours.timestep,
+        "board": ours.board,
+        "score": 0,
+    }
 
 
 def hasten(key: Array, game: Any, ours: NavigatorState) -> NavigatorState:

@@ -1,4 +1,6 @@
-"""Skittles: the published grid has one block a row; the new row is drawn by the published step and adopted by ours."""
+"""Skittles: the published grid has one block a row; the new row is drawn by the published step and
+adopted by ours.
+"""
 
 from typing import Any
 
@@ -11,7 +13,9 @@ from tests.parity.translation import Array, Translation, number
 
 
 def to_ours(game: Any, theirs: Any) -> SkittlesState:
-    """Blocks by their column; what the reference rules do not use, the survivors' columns and the flicker, is blank."""
+    """Blocks by their column; what the reference rules do not use, the survivors' columns and the
+    flicker, is blank.
+    """
     grid = jnp.asarray(theirs.matrix_state)
     column = jnp.where(grid.any(1), jnp.argmax(grid, 1), NO_BLOCK)
     return SkittlesState(
@@ -44,7 +48,9 @@ def adopt(game: Any, ours: SkittlesState, theirs: Any) -> SkittlesState:
     return ours._replace(column=column, safe=drawn.safe, flicker_key=drawn.flicker_key)
 
 
-def reported(game: Any, ours: SkittlesState, terminated: Array, truncated: Array) -> tuple[Array, Array]:
+def reported(
+    game: Any, ours: SkittlesState, terminated: Array, truncated: Array
+) -> tuple[Array, Array]:
     """S9: ``terminated`` counts the blocks that hit; here whether any did is compared."""
     return terminated, truncated
 
@@ -55,7 +61,9 @@ def hasten(key: Array, game: Any, ours: SkittlesState) -> SkittlesState:
     column = game.level.first + jax.random.randint(for_blocks, (CELLS,), 0, game.level.width)
     time = jax.random.randint(for_time, (), CELLS, MAX_STEPS)
     # A block in the last row would have hit an agent that stands there.
-    return ours._replace(column=column, time=time, x=game.level.first + (column[-1] - game.level.first + 1) % 6)
+    return ours._replace(
+        column=column, time=time, x=game.level.first + (column[-1] - game.level.first + 1) % 6
+    )
 
 
 TRANSLATION = Translation(to_ours, to_theirs, "time", adopt=adopt, reported=reported, hasten=hasten)

@@ -1,9 +1,9 @@
 """Tetris: the same stream of pieces, indexed in another way.
 
-The published queue is read ``previews - 1`` places behind its index and shuffled by the step that needs the first piece
-of the new order; our bag is read at its index and shuffled as soon as it is empty, one spawn earlier. In between the
-new order exists in our state alone: it is left out of the comparison, and put right when the published step has drawn
-it.
+The published queue is read ``previews - 1`` places behind its index and shuffled by the step that
+needs the first piece of the new order; our bag is read at its index and shuffled as soon as it is
+empty, one spawn earlier. In between the new order exists in our state alone: it is left out of the
+comparison, and put right when the published step has drawn it.
 """
 
 from typing import Any
@@ -66,8 +66,9 @@ def inject(game: Any, ours: TetrisState, theirs: Any, then: Any) -> TetrisState:
 def adopt(game: Any, ours: TetrisState, then: Any) -> TetrisState:
     """The order that the published step has not drawn yet, and colours that nobody sees.
 
-    Where a piece that tops out overlaps the pile, the published board keeps the higher colour number and ours the
-    piece's. That board is in no published frame: the next episode's takes its place. ``terminal`` stands in its flag.
+    Where a piece that tops out overlaps the pile, the published board keeps the higher colour
+    number and ours the piece's. That board is in no published frame: the next episode's takes its
+    place. ``terminal`` stands in its flag.
     """
     ahead = then.queue_index == PIECES - 1
     bag = jnp.where(ahead, number(then.piece_queue), ours.bag)
@@ -77,7 +78,9 @@ def adopt(game: Any, ours: TetrisState, then: Any) -> TetrisState:
 
 
 def hasten(key: Array, game: Any, ours: TetrisState) -> TetrisState:
-    """A pile of any height, in each row a gap that is often above the last one, and one to five lines to go."""
+    """A pile of any height, in each row a gap that is often above the last one, and one to five
+    lines to go.
+    """
     for_height, for_gap, for_jump, for_lines = jax.random.split(key, 4)
     height = jax.random.randint(for_height, (), 0, ROWS - 1)
     jumps = jax.random.bernoulli(for_jump, 0.3, (ROWS,))
@@ -88,4 +91,6 @@ def hasten(key: Array, game: Any, ours: TetrisState) -> TetrisState:
     return ours._replace(board=small(filled), lines=lines)
 
 
-TRANSLATION = Translation(to_ours, to_theirs, "time", inject=inject, adopt=adopt, reported=any_flag, hasten=hasten)
+TRANSLATION = Translation(
+    to_ours, to_theirs, "time", inject=inject, adopt=adopt, reported=any_flag, hasten=hasten
+)

@@ -11,7 +11,12 @@ from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination
-from arcade_torch.tools.analysis.contamination import contamination_example, disturbed_frames, replayed, shuffle_order
+from arcade_torch.tools.analysis.contamination import (
+    contamination_example,
+    disturbed_frames,
+    replayed,
+    shuffle_order,
+)
 from arcade_torch.tools.analysis.windows import greedy_window, greedy_windows
 from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
 
@@ -21,13 +26,23 @@ ENV = (14, 20, 30)
 def test_a_linear_memory_forgets_noise_at_its_own_rate() -> None:
     rho = 0.7
     found = contamination(
-        linear_policy(rho, dtype=torch.float32), ToyEnv(ENV), sigmas=(0.1,), delays=(0, 1, 3), starts=40
+        linear_policy(rho, dtype=torch.float32),
+        ToyEnv(ENV),
+        sigmas=(0.1,),
+        delays=(0, 1, 3),
+        starts=40,
     )
     moved = found.mean("change")[0]
     spread = contamination(
-        linear_policy(rho, dtype=torch.float32), ToyEnv(ENV), sigmas=(0.2,), delays=(0, 1, 3), starts=40
+        linear_policy(rho, dtype=torch.float32),
+        ToyEnv(ENV),
+        sigmas=(0.2,),
+        delays=(0, 1, 3),
+        starts=40,
     )
-    np.testing.assert_allclose(spread.mean("change")[0], 2 * moved, rtol=1e-3)  # linear in sigma, same draw
+    np.testing.assert_allclose(
+        spread.mean("change")[0], 2 * moved, rtol=1e-3
+    )  # linear in sigma, same draw
     assert moved[0] > moved[1] > moved[2] > 0
 
 
@@ -52,7 +67,9 @@ def test_flip_change_and_divergence_are_those_of_a_slow_replay(
         "arcade_torch.tools.analysis.contamination.disturbed_frames",
         lambda frames, places, *rest: 255 - frames[torch.as_tensor(places)].float(),
     )
-    found = contamination(policy, env, sigmas=(0.1,), delays=(0, 2), starts=12, seed=1, target=target)
+    found = contamination(
+        policy, env, sigmas=(0.1,), delays=(0, 2), starts=12, seed=1, target=target
+    )
     windows = list(greedy_windows(policy, env, episodes=28, seed=1))
     for point, (number, place) in enumerate(found.points):
         w = windows[number]
@@ -67,28 +84,41 @@ def test_flip_change_and_divergence_are_those_of_a_slow_replay(
             p, q = (np.exp(y[t]) / np.exp(y[t]).sum() for y in (clean, moved))
             a, b = (p, q) if target == "probs" else (clean[t], moved[t])
             difference = (b - b.mean()) - (a - a.mean())
-            assert found.change[point, 0, k] == pytest.approx(abs(difference).max() / (a.max() - a.min()), rel=1e-4)
+            assert found.change[point, 0, k] == pytest.approx(
+                abs(difference).max() / (a.max() - a.min()), rel=1e-4
+            )
             assert found.flip[point, 0, k] == (a.argmax() != b.argmax())
             if target == "probs":
                 assert found.kl[point, 0, k] == pytest.approx((p * np.log(p / q)).sum(), rel=1e-3)
 
 
 def test_delays_beyond_the_end_of_an_episode_are_missing_and_counted_so() -> None:
-    found = contamination(linear_policy(0.9, dtype=torch.float32), ToyEnv([10]), delays=(0, 5, 9, 50), starts=40)
+    found = contamination(
+        linear_policy(0.9, dtype=torch.float32), ToyEnv([10]), delays=(0, 5, 9, 50), starts=40
+    )
     left = 9 - found.points[:, 1]
     for k, delay in enumerate((0, 5, 9, 50)):
         assert (np.isfinite(found.flip[:, 0, k]) == (left >= delay)).all()
     assert found.counts()[0].tolist() == [(left >= delay).sum() for delay in (0, 5, 9, 50)]
-    assert np.isnan(found.mean("flip")[0, -1]) and np.isnan(found.kl).all()  # Q-values have no distribution
+    assert (
+        np.isnan(found.mean("flip")[0, -1]) and np.isnan(found.kl).all()
+    )  # Q-values have no distribution
 
 
 def test_delays_that_no_episode_reaches_are_refused() -> None:
-    with pytest.raises(ValueError, match="was long enough: 2 frames are needed, and 9 steps after the disturbed one"):
-        contamination(linear_policy(0.9, dtype=torch.float32), ToyEnv([6]), delays=(9, 50), starts=4)
+    with pytest.raises(
+        ValueError,
+        match="was long enough: 2 frames are needed, and 9 steps after the disturbed one",
+    ):
+        contamination(
+            linear_policy(0.9, dtype=torch.float32), ToyEnv([6]), delays=(9, 50), starts=4
+        )
 
 
 def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode() -> None:
-    found = contamination(linear_policy(0.5, dtype=torch.float32), ToyEnv(ENV), starts=50, delays=(0,))
+    found = contamination(
+        linear_policy(0.5, dtype=torch.float32), ToyEnv(ENV), starts=50, delays=(0,)
+    )
     assert len(found.points) == 50
     lengths = np.array(ENV)[found.points[:, 0] % len(ENV)]
     assert (found.points[:, 1] < lengths - 1).all()
@@ -98,7 +128,12 @@ def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode()
 
 def test_noise_has_the_asked_strength_its_draw_is_shared_and_clipping_keeps_the_range() -> None:
     o = torch.full((3, 64, 64, 3), 128, dtype=torch.uint8)
-    noisy = disturbed_frames(o, np.array([0, 2]), np.array([0.0, 0.1, 0.3]), False, seed=0).unflatten(0, (2, 3)) - 128
+    noisy = (
+        disturbed_frames(o, np.array([0, 2]), np.array([0.0, 0.1, 0.3]), False, seed=0).unflatten(
+            0, (2, 3)
+        )
+        - 128
+    )
     assert not noisy[:, 0].any()
     assert noisy[:, 1].std().item() == pytest.approx(25.5, rel=0.02)
     torch.testing.assert_close(noisy[:, 2], 3 * noisy[:, 1], rtol=1e-3, atol=1e-2)
@@ -118,7 +153,9 @@ def test_a_shuffle_moves_the_named_frames_only_and_always_moves_some() -> None:
 
 def test_a_memory_that_adds_up_does_not_notice_the_order_and_one_that_forgets_does() -> None:
     sums, fades = (linear_policy(rho, dtype=torch.float32) for rho in (1.0, 0.9))
-    same, moved = (contamination(p, ToyEnv(ENV), delays=(0, 3), starts=12, shuffle=True) for p in (sums, fades))
+    same, moved = (
+        contamination(p, ToyEnv(ENV), delays=(0, 3), starts=12, shuffle=True) for p in (sums, fades)
+    )
     assert same.mean("change").max() < 1e-4 < moved.mean("change").min()
     short = contamination(fades, ToyEnv([5, 20]), starts=4, delays=(0,), shuffle=True)
     assert short.skipped >= 3 and len(short.points) == 4
@@ -136,7 +173,9 @@ def acting_policy(inertia: float) -> Policy:
 def test_feedback_lets_a_flip_live_on_through_the_actions_and_teacher_forcing_does_not() -> None:
     sticky = acting_policy(10.0)  # repeats its last action for ever
     forced, free = (
-        contamination(sticky, ToyEnv(ENV), sigmas=(30.0,), delays=(0, 1, 4), starts=40, feedback=feedback)
+        contamination(
+            sticky, ToyEnv(ENV), sigmas=(30.0,), delays=(0, 1, 4), starts=40, feedback=feedback
+        )
         for feedback in (False, True)
     )
     assert forced.mean("flip")[0, 0] > 0.2 and forced.mean("flip")[0, 1:].max() == 0
@@ -166,25 +205,37 @@ def test_an_example_holds_the_clean_outputs_and_differs_in_the_hit_frames_alone(
     changed = (found.frames != found.frames[0]).any((2, 3, 4))
     assert [np.flatnonzero(row).tolist() for row in changed] == [[], [1], [5], [9]]
     assert (abs(found.values[1:] - found.values[0]).max(1) > 1e-3).all()
-    shares = contamination_example(linear_policy(0.9, gain=2e-4), ToyEnv([30]), horizon=4, target="probs").values
+    shares = contamination_example(
+        linear_policy(0.9, gain=2e-4), ToyEnv([30]), horizon=4, target="probs"
+    ).values
     np.testing.assert_allclose(shares.sum(1), 1)  # probabilities stay as they are
 
 
 def test_the_shuffled_example_shows_the_same_frames_in_another_order() -> None:
     sums, fades = (linear_policy(rho, dtype=torch.float32) for rho in (1.0, 0.9))
-    same, moved = (contamination_example(policy, ToyEnv([30]), shuffle=True, horizon=4) for policy in (sums, fades))
+    same, moved = (
+        contamination_example(policy, ToyEnv([30]), shuffle=True, horizon=4)
+        for policy in (sums, fades)
+    )
     for found in (same, moved):
         assert found.hits.tolist() == [-1, -1] and found.order[0].tolist() == list(range(15))
         assert found.order[1, [0, 1, 11, 12, 13, 14]].tolist() == [0, 1, 11, 12, 13, 14]
-        assert sorted(found.order[1]) == list(range(15)) and (found.order[1] != found.order[0]).any()
+        assert (
+            sorted(found.order[1]) == list(range(15)) and (found.order[1] != found.order[0]).any()
+        )
         np.testing.assert_array_equal(found.frames[1], found.frames[0][found.order[1]])
     np.testing.assert_allclose(same.values[1], same.values[0], rtol=1e-4)
     assert abs(moved.values[1] - moved.values[0]).max() > 1e-3
 
 
 @pytest.mark.parametrize("feedback", [False, True])
-def test_no_noise_and_no_memory_leave_every_row_of_an_example_as_the_clean_one(feedback: bool) -> None:
-    for net, how in ((Net("gru", torch.float32), {"sigma": 0.0}), (Net("mlp", torch.float32), {"sigma": 1.0})):
+def test_no_noise_and_no_memory_leave_every_row_of_an_example_as_the_clean_one(
+    feedback: bool,
+) -> None:
+    for net, how in (
+        (Net("gru", torch.float32), {"sigma": 0.0}),
+        (Net("mlp", torch.float32), {"sigma": 1.0}),
+    ):
         policy = Policy(net.encode, net.remember, net.initial_state)
         found = contamination_example(policy, ToyEnv([12]), horizon=5, feedback=feedback, **how)  # type: ignore[arg-type]
         np.testing.assert_allclose(found.values, np.tile(found.values[0], (4, 1)), atol=1e-5)
@@ -222,5 +273,10 @@ def test_measuring_leaves_the_mode_and_the_weights_of_a_network_alone() -> None:
     before = {name: value.clone() for name, value in net.state_dict().items()}
     policy = Policy(net.encode, net.remember, net.initial_state, module=net)
     contamination(policy, ToyEnv([8]), starts=4, delays=(0, 1))
-    assert net.training and all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
-    assert all(parameter.grad is None for parameter in net.parameters()) and frames(1).dtype == torch.uint8
+    assert net.training and all(
+        torch.equal(value, before[name]) for name, value in net.state_dict().items()
+    )
+    assert (
+        all(parameter.grad is None for parameter in net.parameters())
+        and frames(1).dtype == torch.uint8
+    )

@@ -1,4 +1,6 @@
-"""``arcade-torch figure``: every figure from runs or from the paper, numbers beside it, and what cannot be compared."""
+"""``arcade-torch figure``: every figure from runs or from the paper, numbers beside it, and what
+cannot be compared.
+"""
 
 import json
 import shutil
@@ -42,14 +44,18 @@ from tests.tools.fabricated import small_study, write_run, write_study
 AGENTS = {"mlp": 0.3, "lru": 0.5, "gru": 0.6}
 
 
-def fabricate(root: Path, seeds: Sequence[int] = (0, 1, 2), games: Sequence[str] = ("CartPoleEasy-v0",)) -> Path:
+def fabricate(
+    root: Path, seeds: Sequence[int] = (0, 1, 2), games: Sequence[str] = ("CartPoleEasy-v0",)
+) -> Path:
     """Finished runs of three agents on both twins."""
     for game in games:
         for agent, score in AGENTS.items():
             for twin in ("full", "partial"):
                 for seed in seeds:
                     spec = RunSpec(game, twin, agent, "pqn", seed)
-                    write_run(root / spec.name, spec, score + 0.01 * seed - 0.1 * (twin == "partial"))
+                    write_run(
+                        root / spec.name, spec, score + 0.01 * seed - 0.1 * (twin == "partial")
+                    )
     return root
 
 
@@ -78,7 +84,8 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "style"), [("returns", "light"), ("gap-bias", "print"), ("human", "print"), ("hyperparameters", "light")]
+    ("name", "style"),
+    [("returns", "light"), ("gap-bias", "print"), ("human", "print"), ("hyperparameters", "light")],
 )
 def test_the_papers_numbers_make_pictures_and_tables(
     name: str, style: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -92,13 +99,17 @@ def test_the_papers_numbers_make_pictures_and_tables(
         assert (tmp_path / "returns-without.png").exists()
 
 
-def test_one_file_is_asked_for_and_one_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_file_is_asked_for_and_one_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     figure(capsys, "hyperparameters", "--paper", "--out", str(tmp_path / "numbers.csv"))
     assert [path.name for path in tmp_path.iterdir()] == ["numbers.csv"]
 
 
 @pytest.mark.parametrize("name", ["returns", "gap-bias", "curves", "hyperparameters"])
-def test_run_folders_make_pictures_and_tables(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_folders_make_pictures_and_tables(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = fabricate(tmp_path / "runs", games=("CartPoleEasy-v0", "SkittlesEasy-v0"))
     text = figure(capsys, name, "--runs", str(runs), "--out", str(tmp_path / "f"))
     assert "left out" not in text and "no interval" not in text
@@ -108,17 +119,26 @@ def test_run_folders_make_pictures_and_tables(name: str, tmp_path: Path, capsys:
         assert float(lru["gap"]) == pytest.approx(0.1) and float(lru["bias"]) == pytest.approx(0.2)
         assert float(lru["gap_low"]) < 0.1 < float(lru["gap_high"]) and lru["seeds"] == "3"
     if name == "curves":
-        assert {row["agent"] for row in rows} == set(AGENTS) and {row["seeds"] for row in rows} == {"3"}
+        assert {row["agent"] for row in rows} == set(AGENTS) and {row["seeds"] for row in rows} == {
+            "3"
+        }
 
 
-def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit_of_its_axis(tmp_path: Path) -> None:
+def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit_of_its_axis(
+    tmp_path: Path,
+) -> None:
     spec = RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 0)
     for name, frames in (("short", 3_000_000), ("long", 6_000_000)):
         write_run(tmp_path / name, spec, 0.5, frames)
     runs = [Run(tmp_path / "short"), Run(tmp_path / "long")]
     for kind, first in (("eval", 1_200_000), ("train", 2048)):
-        ((task, curve),) = logs.curves_of_runs({("lru", "CartPoleEasy-v0", "full"): runs}, kind).items()
-        assert (curve.frames[0], curve.frames[-1]) == (first, 3_000_000) and curve.returns.seeds.shape[0] == 2
+        ((task, curve),) = logs.curves_of_runs(
+            {("lru", "CartPoleEasy-v0", "full"): runs}, kind
+        ).items()
+        assert (curve.frames[0], curve.frames[-1]) == (
+            first,
+            3_000_000,
+        ) and curve.returns.seeds.shape[0] == 2
     rows = [[float(row["mean"]) for row in run.table("eval.csv")] for run in runs]
     curve = logs.curves_of_runs({task: runs}, "eval")[task]
     assert curve.returns.mean[0] == pytest.approx((rows[0][1] + rows[1][0]) / 2)
@@ -127,7 +147,9 @@ def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit
         with drawing("light"):
             axis = panels(1, 1, (3, 3))[1][0, 0]
             logs.plot({"lru": Curve(scale * curve.frames, curve.returns)}, axis, ["lru"])
-        assert axis.get_xlabel() == unit and axis.lines[0].get_xdata()[-1] == (3 if scale == 1 else 300)
+        assert axis.get_xlabel() == unit and axis.lines[0].get_xdata()[-1] == (
+            3 if scale == 1 else 300
+        )
 
 
 def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +159,10 @@ def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch)
                                                ("lru", "full", 0.4, 1), ("lru", "partial", 0.3, 5))
             for seed in range(3)]  # fmt: skip
     row = gap_and_bias(runs, draws=500).row("lru")
-    parts = {("lru", "A", "full"): pooled([[0.2, 0.3, 0.5]]), ("mlp", "A", "full"): pooled([[0.0, 0.0, 1.0]])}
+    parts = {
+        ("lru", "A", "full"): pooled([[0.2, 0.3, 0.5]]),
+        ("mlp", "A", "full"): pooled([[0.0, 0.0, 1.0]]),
+    }
     with drawing("light"):
         axis, other = panels(1, 2, (6, 3))[1][0]
         contamination.plot({"lru": {"flip": three}}, axis, "flip", 1, [0, 1])
@@ -154,11 +179,15 @@ def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch)
               for (agent, game), twins in agents.items() for twin in ("full", "partial")[:twins]]  # fmt: skip
     dense = RecallDensity(np.array([0.1, 0.2, 0.7]), np.array([3]), np.array([True]), 0, 0, "q")
     monkeypatch.setattr(recall_density, "checkpoints_of", lambda paths: ([], []))
-    monkeypatch.setattr(recall_density, "measure_runs", lambda *words: [(label, dense) for label in labels])
+    monkeypatch.setattr(
+        recall_density, "measure_runs", lambda *words: [(label, dense) for label in labels]
+    )
     (note,) = recall_density._measure(DensityOptions(), None)[1]
     assert note.endswith(": lru on A, gru on B")
     bars = [(bar.get_y(), bar.get_height()) for bar in stacked.axes[0].patches]
-    assert np.array(bars) == pytest.approx(np.array([[0, 0.2], [0.2, 0.3], [0.5, 0.5]]))  # without the memory-free one
+    assert np.array(bars) == pytest.approx(
+        np.array([[0, 0.2], [0.2, 0.3], [0.5, 0.5]])
+    )  # without the memory-free one
 
 
 def test_people_stand_beside_the_memory_free_agent_of_the_same_twin() -> None:
@@ -166,17 +195,25 @@ def test_people_stand_beside_the_memory_free_agent_of_the_same_twin() -> None:
         (picture,) = gap_bias.human(PaperOptions(), None).pictures
     for axis in picture.figure.axes:
         (line,) = [line for line in axis.lines if line.get_label() == "memory-free agent"]
-        rows = [row for row in read_csv(PAPER_RETURNS) if (row["model"], row["env"]) == ("MLP", axis.get_title())]
+        rows = [
+            row
+            for row in read_csv(PAPER_RETURNS)
+            if (row["model"], row["env"]) == ("MLP", axis.get_title())
+        ]
         assert line.get_ydata().tolist() == [float(row["pomdp_mean"]) for row in rows]
 
 
-def test_a_size_sweep_names_layers_and_width(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_size_sweep_names_layers_and_width(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = fabricate(tmp_path / "runs")
     for layers, width in ((1, 512), (2, 128)):
         for twin in ("full", "partial"):
             for seed in (0, 1):
                 run = runs / f"big-{layers}-{width}-{twin}-{seed}"
-                write_run(run, RunSpec("CartPoleEasy-v0", twin, "lru", "pqn", seed), 0.4 + layers / 10)
+                write_run(
+                    run, RunSpec("CartPoleEasy-v0", twin, "lru", "pqn", seed), 0.4 + layers / 10
+                )
                 change(run, network_options={"layers": layers, "hidden_size": width})
     figure(capsys, "size-sweep", "--runs", str(runs), "--out", str(tmp_path / "f"))
     rows = {row["agent"]: row for row in read_csv(tmp_path / "f" / "size-sweep.csv")}
@@ -197,21 +234,28 @@ def test_unfinished_runs_and_missing_twins_are_left_out_and_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = fabricate(tmp_path / "runs")
-    write_run(runs / "slow", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9), 0.5, status="running")
+    write_run(
+        runs / "slow", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9), 0.5, status="running"
+    )
     write_run(runs / "alone", RunSpec("TetrisEasy-v0", "full", "lru", "pqn", 0), 0.5)
     text = figure(capsys, "gap-bias", "--runs", str(runs), "--out", str(tmp_path / "f"))
     assert "left out, not finished: slow" in text
     assert "left out, some agent lacks one of its twins: TetrisEasy-v0" in text
 
 
-@pytest.mark.parametrize("command", ["figure gap-bias", "figure returns", "figure curves", "analyze gap-bias"])
+@pytest.mark.parametrize(
+    "command", ["figure gap-bias", "figure returns", "figure curves", "analyze gap-bias"]
+)
 def test_numbers_as_csv_stand_alone_and_what_was_left_out_is_said_on_standard_error(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_study(tmp_path / "s", small_study())
     (folder.run(small_study().runs()[0]).path / "eval.json").unlink()
     (tmp_path / "s" / "runs" / "lost").symlink_to(tmp_path / "nowhere")
-    assert cli.main([*command.split(), str(tmp_path / "s"), "--csv", "--out", str(tmp_path / "f")]) == 0
+    assert (
+        cli.main([*command.split(), str(tmp_path / "s"), "--csv", "--out", str(tmp_path / "f")])
+        == 0
+    )
     said = capsys.readouterr()
     assert "left out, not finished: MineSweeperEasy__full__mingru__pqn__seed0" in said.err
     assert "leads nowhere" in said.err and "left out" not in said.out
@@ -219,7 +263,9 @@ def test_numbers_as_csv_stand_alone_and_what_was_left_out_is_said_on_standard_er
     assert read_csv(tmp_path / "printed.csv")
 
 
-def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_compared_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs, out = fabricate(tmp_path / "runs"), ["--out", str(tmp_path / "f")]
     ask = ["figure", "returns", *out, "--runs", str(runs)]
     write_run(runs / "new", RunSpec("CartPoleEasy-v1", "full", "lru", "pqn", 0), 0.5)
@@ -271,7 +317,12 @@ def test_bad_input_is_one_line(
     (tmp_path / "file.csv").write_text("a\n")
     (tmp_path / "point" / "meta.json").write_text("{}")
     (tmp_path / "odd" / "config.json").write_text("{}")
-    write_run(tmp_path / "slow", RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9), 0.5, status="running")
+    write_run(
+        tmp_path / "slow",
+        RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 9),
+        0.5,
+        status="running",
+    )
     assert message in refused(capsys, *words)
     assert not (tmp_path / "figures").exists()
 
@@ -297,19 +348,28 @@ def test_a_table_is_readable_at_80_columns(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     runs = fabricate(tmp_path / "runs")
-    assert cli.main(["analyze", "gap-bias", str(runs), "--out", str(tmp_path / "t.csv")]) == cli.EXIT_OK
+    assert (
+        cli.main(["analyze", "gap-bias", str(runs), "--out", str(tmp_path / "t.csv")])
+        == cli.EXIT_OK
+    )
     lines = capsys.readouterr().out.splitlines()
     table = [line for line in lines if not line.startswith(str(tmp_path))]
     assert max(map(len, table)) <= 80 and not any("…" in line for line in table)
     row = read_csv(tmp_path / "t.csv")[1]
-    ends = [f"{float(row[name]):+.3f}" for name in ("gap", "gap_low", "gap_high", "pomdp_iqm_low", "bias_high")]
+    ends = [
+        f"{float(row[name]):+.3f}"
+        for name in ("gap", "gap_low", "gap_high", "pomdp_iqm_low", "bias_high")
+    ]
     assert all(any(end in line for line in table) for end in ends)
     assert sum("lru" in line for line in table) >= 2  # the name stands in every part
 
 
 def test_colours_of_agents_stay_apart_for_people_who_see_red_and_green_alike() -> None:
     names = [name for name in AGENT_COLOURS if name not in ("tttl", "feedforward", "fart")]
-    rgb = np.array([[int(AGENT_COLOURS[name][i : i + 2], 16) for i in (1, 3, 5)] for name in names]) / 255
+    rgb = (
+        np.array([[int(AGENT_COLOURS[name][i : i + 2], 16) for i in (1, 3, 5)] for name in names])
+        / 255
+    )
     # deuteranopia and protanopia, Machado et al. (2009), severity 1, applied to linear light
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     deutan = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
@@ -326,31 +386,53 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("runs")
     for seed in (0, 1):
         train(
-            preset("smoke", env="MineSweeperEasy", observability="full", memory="gru", seed=seed), root / f"gru-{seed}"
+            preset("smoke", env="MineSweeperEasy", observability="full", memory="gru", seed=seed),
+            root / f"gru-{seed}",
         )
     return root
 
 
 def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     runs = [str(run) for run in sorted(trained.iterdir())]
-    words = ["analyze", "recall-density", *runs, "--episodes", "6", "--max-frames", "12", "--out", str(tmp_path)]
+    words = [
+        "analyze",
+        "recall-density",
+        *runs,
+        "--episodes",
+        "6",
+        "--max-frames",
+        "12",
+        "--out",
+        str(tmp_path),
+    ]
     assert cli.main(words) == 0
     assert "gradient of the last decision" in capsys.readouterr().out
     rows = read_csv(tmp_path / "recall-density-16.csv")
-    assert sum(float(row["mass"]) for row in rows) == pytest.approx(1) and {row["seeds"] for row in rows} == {"2"}
+    assert sum(float(row["mass"]) for row in rows) == pytest.approx(1) and {
+        row["seeds"] for row in rows
+    } == {"2"}
     assert all(float(row["low"]) <= float(row["mass"]) <= float(row["high"]) for row in rows)
     with np.load(tmp_path / "recall-density-3.npz") as kept:
-        assert kept["shares_1"].sum() == pytest.approx(len(kept["lengths_1"])) and kept["points"].shape == (2, 101)
+        assert kept["shares_1"].sum() == pytest.approx(len(kept["lengths_1"])) and kept[
+            "points"
+        ].shape == (2, 101)
     monkeypatch.setattr("arcade_torch.tools.analysis.windows.play", None)
     assert cli.main(words) == 0
     assert read_csv(tmp_path / "recall-density-16.csv") == rows
     monkeypatch.undo()
     file = next((trained / "gru-0" / "analysis").glob("recall_density-*.npz"))
     whole = file.read_bytes()
-    first = 30 + int.from_bytes(whole[26:28], "little") + int.from_bytes(whole[28:30], "little")  # byte of data
-    damaged = whole[:first] + bytes([whole[first] | 0b110]) + whole[first + 1 :]  # no such kind of compressed block
+    first = (
+        30 + int.from_bytes(whole[26:28], "little") + int.from_bytes(whole[28:30], "little")
+    )  # byte of data
+    damaged = (
+        whole[:first] + bytes([whole[first] | 0b110]) + whole[first + 1 :]
+    )  # no such kind of compressed block
     for junk in (b"junk", whole[:200], damaged):  # no zip file, half of one, a flipped bit
         file.write_bytes(junk)
         assert cli.main(words) == 0
@@ -360,13 +442,27 @@ def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
 def test_contamination_of_checkpoints_is_drawn_with_an_example(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["analyze", "contamination", *map(str, sorted(trained.iterdir())), "--starts", "6", "--delays", "0", "1"]
+    words = [
+        "analyze",
+        "contamination",
+        *map(str, sorted(trained.iterdir())),
+        "--starts",
+        "6",
+        "--delays",
+        "0",
+        "1",
+    ]
     words += ["--sigmas", "0", "1", "--out", str(tmp_path)]
     assert cli.main([*words, "--horizon", "3"]) == 0
     text = capsys.readouterr().out
     assert "changed decisions in %" in text and "6 start points" in text
     rows = read_csv(tmp_path / "contamination-noise-MineSweeperEasy-v0-full.csv")
-    assert [(row["sigma"], row["delay"]) for row in rows] == [("0.0", "0"), ("0.0", "1"), ("1.0", "0"), ("1.0", "1")]
+    assert [(row["sigma"], row["delay"]) for row in rows] == [
+        ("0.0", "0"),
+        ("0.0", "1"),
+        ("1.0", "0"),
+        ("1.0", "1"),
+    ]
     assert float(rows[0]["change"]) < 1e-5 < float(rows[2]["change"])
     assert (tmp_path / "contamination-noise-MineSweeperEasy-v0-full.png").exists()
     example = tmp_path / "contamination-noise-example-MineSweeperEasy-v0-full"
@@ -374,21 +470,32 @@ def test_contamination_of_checkpoints_is_drawn_with_an_example(
     rows = read_csv(example.with_suffix(".csv"))
     versions = [(row["row"], row["hit"]) for row in rows[::5]]
     assert versions == [("clean", ""), ("noise on frame 1", "1"), ("noise on frame 2", "2")]
-    assert [row["action"] for row in rows[:5]] == ["up", "down", "left", "right", "fire"] and len(rows) == 15
+    assert [row["action"] for row in rows[:5]] == ["up", "down", "left", "right", "fire"] and len(
+        rows
+    ) == 15
     assert cli.main([*words, "--horizon", "5000"]) == 0
     assert "no example of" in (text := capsys.readouterr().out) and "5001 frames are needed" in text
     assert "--horizon must be at least 2" in refused(capsys, *words, "--horizon", "1")
 
 
 def test_the_bars_of_an_example_say_where_the_best_action_changed() -> None:
-    values, hits = np.array([[0, 1, 0, 0, -1], [0, 2, 0, 0, -2], [3, 1, 0, 0, -4]], np.float64), np.array([-1, 1, 2])
+    values, hits = (
+        np.array([[0, 1, 0, 0, -1], [0, 2, 0, 0, -2], [3, 1, 0, 0, -4]], np.float64),
+        np.array([-1, 1, 2]),
+    )
     pictures, order = np.zeros((3, 4, 8, 8, 3), np.uint8), np.tile(np.arange(4), (3, 1))
     label = Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", 0, Path("run"), "lru")
     with drawing("light"):
-        figure, note, rows = contamination._example(label, Example(pictures, order, hits, values, "q", 0.3))
+        figure, note, rows = contamination._example(
+            label, Example(pictures, order, hits, values, "q", 0.3)
+        )
         bars = [axis for axis in figure.axes if axis.patches]
         colours = [[to_hex(bar.get_facecolor()) for bar in axis.patches] for axis in bars]
-        assert len({axis.get_ylim() for axis in bars}) == 1 and bars[0].get_ylim()[0] < -4 and bars[0].get_ylim()[1] > 3
+        assert (
+            len({axis.get_ylim() for axis in bars}) == 1
+            and bars[0].get_ylim()[0] < -4
+            and bars[0].get_ylim()[1] > 3
+        )
     grey, blue, red = contamination.REST, contamination.CLEAN_BEST, contamination.OTHER_BEST
     assert colours == [[grey, blue, grey, grey, grey]] * 2 + [[red, blue, grey, grey, grey]]
     assert "sigma = 0.3" in note and [row["value"] for row in rows] == values.ravel().tolist()
@@ -403,7 +510,9 @@ def weight_of(agent: Any) -> Weight:
     return Weight(agent.network.weight.item())
 
 
-def test_other_weights_in_the_same_folder_are_measured_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_weights_in_the_same_folder_are_measured_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
     monkeypatch.setattr(checkpoints, "load", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
@@ -417,39 +526,68 @@ def test_the_confidence_that_is_asked_for_is_that_of_bands_and_bars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of three seeds the middle tenth of all draws lies well inside their 95 %."""
-    labels = [Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", seed, Path("run"), "lru") for seed in range(3)]
+    labels = [
+        Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", seed, Path("run"), "lru")
+        for seed in range(3)
+    ]
     shares = [np.array([0.1 * seed, 0.3, 0.7 - 0.1 * seed]) for seed in range(3)]
     dense = [RecallDensity(share, np.array([3]), np.array([True]), 0, 0, "q") for share in shares]
-    flips = [np.array([[[1.0, 0.4 * seed if seed else np.nan]]]) for seed in range(3)]  # one episode ended before
+    flips = [
+        np.array([[[1.0, 0.4 * seed if seed else np.nan]]]) for seed in range(3)
+    ]  # one episode ended before
     noisy = [Contamination(np.array([0.3]), np.array([0, 1]), flip, flip, np.nan * flip, np.zeros((1, 2), np.int64),
                            0.0, 0, "q") for flip in flips]  # fmt: skip
 
     def no_example(*words: Any) -> None:
         raise ValueError("too short")
 
-    monkeypatch.setattr(recall_density, "_measure", lambda *words: (list(zip(labels, dense, strict=True)), []))
+    monkeypatch.setattr(
+        recall_density, "_measure", lambda *words: (list(zip(labels, dense, strict=True)), [])
+    )
     monkeypatch.setattr(contamination, "checkpoints_of", lambda paths: ([], []))
-    monkeypatch.setattr(contamination, "measure_runs", lambda *words: list(zip(labels, noisy, strict=True)))
+    monkeypatch.setattr(
+        contamination, "measure_runs", lambda *words: list(zip(labels, noisy, strict=True))
+    )
     monkeypatch.setattr(contamination, "measure_run", no_example)
     runs = (fabricate(tmp_path),)
 
     def widths(confidence: float) -> list[float]:
         with drawing("light"):
-            density = recall_density.densities(DensityOptions(bins=(3,), confidence=confidence), None).pictures[0]
-            noise = contamination.by_delay(ContaminationOptions(confidence=confidence), None).pictures[0]
+            density = recall_density.densities(
+                DensityOptions(bins=(3,), confidence=confidence), None
+            ).pictures[0]
+            noise = contamination.by_delay(
+                ContaminationOptions(confidence=confidence), None
+            ).pictures[0]
             curve = logs.curves(CurveOptions(runs, confidence=confidence), None).pictures[0]
         assert [row["seeds"] for row in noise.rows] == [3, 2] and "n = 2 to 3 seeds" in noise.note
         rows = density.rows[0], curve.rows[0]
-        return [*(row["high"] - row["low"] for row in rows), noise.rows[1]["flip_high"] - noise.rows[1]["flip_low"]]
+        return [
+            *(row["high"] - row["low"] for row in rows),
+            noise.rows[1]["flip_high"] - noise.rows[1]["flip_low"],
+        ]
 
-    assert all(wide > 2 * narrow >= 0 for wide, narrow in zip(widths(0.95), widths(0.1), strict=True))
+    assert all(
+        wide > 2 * narrow >= 0 for wide, narrow in zip(widths(0.95), widths(0.1), strict=True)
+    )
 
 
 def test_two_checkpoints_of_one_seed_are_not_pooled_as_two_seeds(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = str(trained / "gru-0")
-    words = ["analyze", "contamination", run, run, "--starts", "2", "--delays", "0", "--out", str(tmp_path)]
+    words = [
+        "analyze",
+        "contamination",
+        run,
+        run,
+        "--starts",
+        "2",
+        "--delays",
+        "0",
+        "--out",
+        str(tmp_path),
+    ]
     assert "gru-0 are the same cell: give one of them" in refused(capsys, *words)
 
 
@@ -458,7 +596,9 @@ def test_runs_named_one_by_one_are_compared_like_those_of_a_folder(
 ) -> None:
     runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
     change(runs[1], seed=1, total_frames=7)
-    assert "differ in total_frames: " in refused(capsys, "analyze", "recall-density", *map(str, runs))
+    assert "differ in total_frames: " in refused(
+        capsys, "analyze", "recall-density", *map(str, runs)
+    )
 
 
 def test_checkpoints_named_one_by_one_are_compared_like_those_of_a_folder(
@@ -469,8 +609,12 @@ def test_checkpoints_named_one_by_one_are_compared_like_those_of_a_folder(
     record = json.loads((newest[1] / "meta.json").read_text())
     record["config"] |= {"seed": 1, "amp": True}
     (newest[1] / "meta.json").write_text(json.dumps(record))
-    assert "differ in amp: False and True" in refused(capsys, "analyze", "recall-density", *map(str, newest))
-    assert "differ in amp: False and True" in refused(capsys, "analyze", "saliency", str(runs[0]), str(newest[1]))
+    assert "differ in amp: False and True" in refused(
+        capsys, "analyze", "recall-density", *map(str, newest)
+    )
+    assert "differ in amp: False and True" in refused(
+        capsys, "analyze", "saliency", str(runs[0]), str(newest[1])
+    )
 
 
 def test_seeds_that_learned_different_twins_are_not_pooled_when_one_twin_is_looked_at(
@@ -478,14 +622,24 @@ def test_seeds_that_learned_different_twins_are_not_pooled_when_one_twin_is_look
 ) -> None:
     runs = [shutil.copytree(trained / "gru-0", tmp_path / str(seed)) for seed in (0, 1)]
     twin = (
-        "full" if json.loads((runs[0] / "config.json").read_text())["config"]["observability"] != "full" else "partial"
+        "full"
+        if json.loads((runs[0] / "config.json").read_text())["config"]["observability"] != "full"
+        else "partial"
     )
     change(runs[1], seed=1, observability=twin)
     for file in (runs[1] / "checkpoints").glob("*/meta.json"):
         record = json.loads(file.read_text())
         record["config"] |= {"seed": 1, "observability": twin}
         file.write_text(json.dumps(record))
-    words = ["analyze", "recall-density", *map(str, runs), "--observability", "full", "--episodes", "2"]
+    words = [
+        "analyze",
+        "recall-density",
+        *map(str, runs),
+        "--observability",
+        "full",
+        "--episodes",
+        "2",
+    ]
     assert "learned the twins" in refused(capsys, *words)
 
 

@@ -35,7 +35,10 @@ def test_agents_say_what_they_offer(algorithm: str, natural: str) -> None:
 
 
 def test_an_actor_critic_is_read_by_its_own_rules() -> None:
-    policy, out = policy_of(agent("ppo")), torch.tensor([1.0, 3.0, 2.0, 0.0, 0.5, 99.0])  # five logits and a value
+    policy, out = (
+        policy_of(agent("ppo")),
+        torch.tensor([1.0, 3.0, 2.0, 0.0, 0.5, 99.0]),
+    )  # five logits and a value
     assert outputs(policy, "value")(out).tolist() == [99.0]
     torch.testing.assert_close(outputs(policy, "probs")(out), out[:-1].softmax(-1))
     assert policy.greedy(out) == 1
@@ -53,7 +56,9 @@ def test_a_policy_acts_greedily_and_carries_its_state() -> None:
             picks.append(action)
         starts = torch.tensor([[True, False, False]] * 2)
         actions = torch.zeros(2, 3, dtype=torch.int64)
-        out, _ = player.remember(player.encode(frames.flatten(0, 1)).unflatten(0, (2, 3)), actions, starts, state)
+        out, _ = player.remember(
+            player.encode(frames.flatten(0, 1)).unflatten(0, (2, 3)), actions, starts, state
+        )
         assert torch.equal(torch.stack(picks, 1), out.argmax(-1))
 
 
@@ -64,6 +69,8 @@ def test_what_is_no_policy_is_refused() -> None:
     for wrong in (object(), (encode,), (encode, "remember"), torch.nn.Linear(2, 2)):
         with pytest.raises(TypeError, match="model must be an agent"):
             policy_of(wrong)
-    with pytest.raises(ValueError, match="target must be one of q, logits, probs, value or auto, got 'Q'"):
+    with pytest.raises(
+        ValueError, match="target must be one of q, logits, probs, value or auto, got 'Q'"
+    ):
         outputs(linear_policy(0.5), "Q")
     assert policy_of(Policy(encode, lambda e, a, s, h: (e, h))).read is read_plain

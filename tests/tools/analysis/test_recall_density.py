@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import recall_density, saliency
-from arcade_torch.tools.analysis.recall_density import binned, density_of_windows, no_memory, point_sampled
+from arcade_torch.tools.analysis.recall_density import (
+    binned,
+    density_of_windows,
+    no_memory,
+    point_sampled,
+)
 from arcade_torch.tools.analysis.windows import _end, greedy_windows
 from tests.tools.analysis.toys import Net, ToyEnv, linear_policy, window
 
@@ -20,12 +25,16 @@ RHO = linear_policy(0.8, dtype=torch.float32)
 
 
 @given(shares=st.lists(st.floats(0, 1), min_size=1, max_size=40), bins=st.integers(1, 20))
-def test_binning_keeps_the_mass_and_as_many_bins_as_steps_change_nothing(shares: list[float], bins: int) -> None:
+def test_binning_keeps_the_mass_and_as_many_bins_as_steps_change_nothing(
+    shares: list[float], bins: int
+) -> None:
     mass = np.array(shares)
     assert binned(mass, bins).sum() == pytest.approx(mass.sum(), abs=1e-9)
     np.testing.assert_allclose(binned(mass, len(mass)), mass, atol=1e-9)
     assert (binned(mass, bins) >= -1e-12).all()
-    np.testing.assert_allclose(binned(mass[::-1], bins), binned(mass, bins)[::-1], atol=1e-9)  # time runs either way
+    np.testing.assert_allclose(
+        binned(mass[::-1], bins), binned(mass, bins)[::-1], atol=1e-9
+    )  # time runs either way
 
 
 @given(fine=st.integers(1, 6), coarse=st.integers(1, 6), steps=st.integers(1, 30))
@@ -39,7 +48,10 @@ def test_the_papers_curve_reads_the_step_at_floor_tau_n() -> None:
     shares = np.array([0.1, 0.2, 0.3, 0.4])
     taus = np.array([0.0, 0.32, 1 / 3, 0.5, 0.99, 1.0])
     assert point_sampled(shares, taus).tolist() == [0.1, 0.1, 0.2, 0.2, 0.3, 0.4]
-    uneven = [np.full(10, 0.1), np.full(2, 0.5)]  # does not integrate to one: that is why there are bins
+    uneven = [
+        np.full(10, 0.1),
+        np.full(2, 0.5),
+    ]  # does not integrate to one: that is why there are bins
     mean = np.mean([point_sampled(share, np.linspace(0, 1, 1001)) for share in uneven])
     assert mean == pytest.approx(0.3)
 
@@ -62,7 +74,9 @@ def test_short_trajectories_are_dropped_and_counted() -> None:
         none.mass(3)
 
 
-def test_long_episodes_give_windows_of_the_cap_with_random_ends_and_short_ones_end_with_the_episode() -> None:
+def test_long_episodes_give_windows_of_the_cap_with_random_ends_and_short_ones_end_with_the_episode() -> (
+    None
+):
     windows = list(greedy_windows(RHO, ToyEnv([40, 8]), episodes=40, cap=10))
     ends = [int(w.frames[-1, 0, 0, 0]) for w in windows if w.row == 0]
     assert min(ends) >= 9 and len(set(ends)) > 8 and all(w.n == 9 for w in windows if w.row == 0)
@@ -71,7 +85,11 @@ def test_long_episodes_give_windows_of_the_cap_with_random_ends_and_short_ones_e
 
 def test_every_frame_that_a_window_may_end_with_is_drawn() -> None:
     rng = np.random.default_rng(0)
-    for length, end, wanted in ((12, "last", {9, 10, 11}), (5, "random", {2, 3, 4}), (10, "last", {9})):
+    for length, end, wanted in (
+        (12, "last", {9, 10, 11}),
+        (5, "random", {2, 3, 4}),
+        (10, "last", {9}),
+    ):
         assert {_end(length, end, 10, rng) for _ in range(200)} == wanted  # type: ignore[arg-type]
 
 
@@ -83,7 +101,8 @@ def test_random_ends_are_uniform_from_the_third_frame_on() -> None:
 
 def test_the_same_seed_plays_the_same_episodes_and_another_seed_others() -> None:
     first, again, other = (
-        torch.cat([w.frames for w in greedy_windows(RHO, ToyEnv([9, 12]), episodes=4, seed=seed)]) for seed in (0, 0, 1)
+        torch.cat([w.frames for w in greedy_windows(RHO, ToyEnv([9, 12]), episodes=4, seed=seed)])
+        for seed in (0, 0, 1)
     )
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert not torch.equal(first[:21], first[21:])  # nor are the episodes of one seed the same

@@ -15,14 +15,20 @@ SIZE, FEATURES, ACTIONS = 4, 6, 3
 F64 = torch.float64
 
 
-def linear_policy(rho: float, *, dtype: torch.dtype = F64, pixel_scale: float = 1.0, gain: float = 1.0) -> Policy:
-    """e_t = C o_t / pixel_scale, h_t = rho h_{t-1} + e_t, q_a = gain w_a . h_t; C and w as `matrices` gives them."""
+def linear_policy(
+    rho: float, *, dtype: torch.dtype = F64, pixel_scale: float = 1.0, gain: float = 1.0
+) -> Policy:
+    """e_t = C o_t / pixel_scale, h_t = rho h_{t-1} + e_t, q_a = gain w_a . h_t; C and w as
+    `matrices` gives them.
+    """
     encoder, head = (matrix.to(dtype) for matrix in matrices())
 
     def encode(frames: Tensor) -> Tensor:
         return (frames.to(dtype) / pixel_scale).flatten(-3) @ encoder.T
 
-    def remember(features: Tensor, last_action: Tensor, is_init: Tensor, state: Any) -> tuple[Tensor, Any]:
+    def remember(
+        features: Tensor, last_action: Tensor, is_init: Tensor, state: Any
+    ) -> tuple[Tensor, Any]:
         hidden = torch.zeros_like(features[:, 0]) if state is None else state
         outputs = []
         for t in range(features.shape[1]):
@@ -30,7 +36,9 @@ def linear_policy(rho: float, *, dtype: torch.dtype = F64, pixel_scale: float = 
             outputs.append(gain * hidden @ head.T)
         return torch.stack(outputs, 1), hidden
 
-    return Policy(encode, remember, lambda batch_size: torch.zeros(batch_size, FEATURES, dtype=dtype))
+    return Policy(
+        encode, remember, lambda batch_size: torch.zeros(batch_size, FEATURES, dtype=dtype)
+    )
 
 
 def matrices() -> tuple[Tensor, Tensor]:
@@ -43,12 +51,16 @@ def matrices() -> tuple[Tensor, Tensor]:
 class Net(nn.Module):
     """A small real network: convolution, one of our memory models in some layers, a linear head."""
 
-    def __init__(self, name: str, dtype: torch.dtype = F64, layers: int = 1, **options: Any) -> None:
+    def __init__(
+        self, name: str, dtype: torch.dtype = F64, layers: int = 1, **options: Any
+    ) -> None:
         super().__init__()
         torch.manual_seed(1)
         self.convolution = nn.Conv2d(3, 2, 2, 2)
         inputs = 2 * (SIZE // 2) ** 2
-        self.memories = nn.ModuleList(make_memory(name, inputs if i == 0 else 6, 6, **options) for i in range(layers))
+        self.memories = nn.ModuleList(
+            make_memory(name, inputs if i == 0 else 6, 6, **options) for i in range(layers)
+        )
         self.head = nn.Linear(6, ACTIONS)
         self.to(dtype)
 
@@ -56,20 +68,29 @@ class Net(nn.Module):
         x = (o.to(self.head.weight.dtype) / 255).movedim(-1, -3).reshape(-1, 3, SIZE, SIZE)
         return torch.tanh(self.convolution(x)).flatten(1).reshape(*o.shape[:-3], -1)
 
-    def remember(self, e: Tensor, last_action: Tensor, is_init: Tensor, state: Any) -> tuple[Tensor, Any]:
+    def remember(
+        self, e: Tensor, last_action: Tensor, is_init: Tensor, state: Any
+    ) -> tuple[Tensor, Any]:
         after = {}
         for i, memory in enumerate(self.memories):
             e, after[str(i)] = memory(e, state[str(i)], is_init)
         return self.head(e), TensorDict(after, batch_size=state.batch_size)
 
     def initial_state(self, batch_size: int) -> TensorDict:
-        states = {str(i): memory.initial_state(batch_size) for i, memory in enumerate(self.memories)}
+        states = {
+            str(i): memory.initial_state(batch_size) for i, memory in enumerate(self.memories)
+        }
         return TensorDict(states, batch_size=[batch_size])
 
 
 def frames(steps: int, seed: int = 0) -> Tensor:
     """uint8 [steps, SIZE, SIZE, 3]."""
-    return torch.randint(256, (steps, SIZE, SIZE, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+    return torch.randint(
+        256,
+        (steps, SIZE, SIZE, 3),
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.uint8,
+    )
 
 
 def window(steps: int, starts: Sequence[int] = (0,), seed: int = 0) -> Window:
@@ -77,7 +98,9 @@ def window(steps: int, starts: Sequence[int] = (0,), seed: int = 0) -> Window:
     is_init = torch.zeros(steps, dtype=torch.bool)
     is_init[list(starts)] = True
     action = torch.arange(steps) % ACTIONS
-    return Window(frames(steps, seed), action.roll(1), is_init, action, torch.zeros(steps), None, True, seed)
+    return Window(
+        frames(steps, seed), action.roll(1), is_init, action, torch.zeros(steps), None, True, seed
+    )
 
 
 class ToyEnv:
@@ -106,7 +129,11 @@ class ToyEnv:
 
     def _root(self) -> TensorDict:
         pixels = torch.stack([self.frame(row, int(step)) for row, step in enumerate(self.steps)])
-        values = {"pixels": pixels, "last_action": self.last.clone(), "is_init": (self.steps == 0).unsqueeze(-1)}
+        values = {
+            "pixels": pixels,
+            "last_action": self.last.clone(),
+            "is_init": (self.steps == 0).unsqueeze(-1),
+        }
         return TensorDict(values, batch_size=self.batch_size)
 
     def step_and_maybe_reset(self, td: TensorDict) -> tuple[TensorDict, TensorDict]:
