@@ -216,4 +216,6 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     if device is None:
         wanted = torch.device(config.device)
         device = wanted if (wanted.index or 0) < torch.cuda.device_count() else "cpu"
-    return Agent(config, network.to(device), checkpoint.frames).eval()  # type: ignore[no-any-return]
+    agent = Agent(config, network.to(device), checkpoint.frames)
+    agent.eval()
+    return agent

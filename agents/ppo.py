@@ -295,8 +295,11 @@ class PPOLoss(LossModule):
         """While open, the network has the loss's parameters."""
         if not self.functional:
             return nullcontext()
-        parameters = getattr(self, name)
-        return parameters.to_module(network, preserve_module_state=False)  # type: ignore[no-any-return]
+        parameters: Any = getattr(self, name)
+        opened: AbstractContextManager[Any] = parameters.to_module(
+            network, preserve_module_state=False
+        )
+        return opened
 
     def _scaled(self, advantage: Tensor) -> Tensor:
         if self.advantage_norm is not None:

@@ -108,7 +108,9 @@ class MemoryBlock(nn.Module):
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The cells' initial states, TensorDict [batch_size] with one entry per layer."""
         cells = zip(self.names, self.cells, strict=True)
-        states = {name: cell.initial_state(batch_size) for name, cell in cells}  # type: ignore[operator]
+        states = {}
+        for name, cell in cells:
+            states[name] = cell.initial_state(batch_size)  # type: ignore[operator]
         return TensorDict(
             states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
         )

@@ -81,7 +81,11 @@ class Checkpoint:
 
 
 def save_checkpoint(
-    folder: Path, config: TrainConfig, frames: int, weights: dict[str, Tensor], trainer: dict[str, Any]
+    folder: Path,
+    config: TrainConfig,
+    frames: int,
+    weights: dict[str, Tensor],
+    trainer: dict[str, Any],
 ) -> Path:
     """Write a checkpoint and make it the latest; keep the last two.
 
@@ -111,20 +115,30 @@ def save_checkpoint(
 
 
 def _write_parts(
-    draft: Path, config: TrainConfig, frames: int, weights: dict[str, Tensor], trainer: dict[str, Any]
+    draft: Path,
+    config: TrainConfig,
+    frames: int,
+    weights: dict[str, Tensor],
+    trainer: dict[str, Any],
 ) -> None:
     """Write the files of a checkpoint into a folder that is made."""
     draft.mkdir(parents=True)
     tensors = {key: value.detach().cpu().contiguous().clone() for key, value in weights.items()}
     packed = save(tensors)
     if len(packed) > MOST_WEIGHTS:
-        raise CheckpointError(f"the weights take {len(packed):,} bytes, at most {MOST_WEIGHTS:,}: use a smaller network")
+        raise CheckpointError(
+            f"the weights take {len(packed):,} bytes, at most {MOST_WEIGHTS:,}: use a smaller "
+            "network"
+        )
     write_atomic(draft / _WEIGHTS, packed)
     state = io.BytesIO()
     torch.save(trainer, state)
     write_atomic(draft / _TRAINER, state.getvalue())
     sums = {part: checksum(draft / part) for part in (_WEIGHTS, _TRAINER)}
-    write_json(draft / _META, {"format": FORMAT, "frames": frames, "config": config.to_dict(), "sha256": sums})
+    write_json(
+        draft / _META,
+        {"format": FORMAT, "frames": frames, "config": config.to_dict(), "sha256": sums},
+    )
 
 
 def remove_draft_checkpoints(folder: Path) -> None:
@@ -147,7 +161,9 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return sorted(checkpoints, key=lambda path: path.name != latest)
 
 
-def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only: bool = False) -> Checkpoint:
+def load_checkpoint(
+    path: Path, expect: TrainConfig | None = None, weights_only: bool = False
+) -> Checkpoint:
     """Load one checkpoint folder; with ``weights_only`` the trainer's state is left on disk.
 
     Raises:
@@ -161,10 +177,14 @@ def load_checkpoint(path: Path, expect: TrainConfig | None = None, weights_only:
         sums = dict(meta["sha256"])
         require(type(frames) is int and 0 <= frames < 10**12, "frames", frames, "a count of frames")
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"checkpoint {path} is damaged: {_META} does not describe a run ({error})") from error
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: {_META} does not describe a run ({error})"
+        ) from error
     weights = _read_part(path / _WEIGHTS, sums, _load_weights)
     if expect is not None and (fields := differing_fields(config, expect)):
-        raise _OtherRunError(f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}")
+        raise _OtherRunError(
+            f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}"
+        )
     trainer = None if weights_only else _read_part(path / _TRAINER, sums, _load_tensors)
     return Checkpoint(config, frames, weights, trainer, path)
 
@@ -201,9 +221,13 @@ def load_latest(
             problems.append(str(error))
             continue
         if problems:
-            warnings.warn(f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2
+            )
         return found
-    wanted, why = ("whole checkpoint", f": {'; '.join(problems)}") if problems else ("checkpoint", "")
+    wanted, why = (
+        ("whole checkpoint", f": {'; '.join(problems)}") if problems else ("checkpoint", "")
+    )
     raise CheckpointError(f"no {wanted} in {folder}{why}")
 
 
@@ -212,7 +236,10 @@ def refuse_format(what: object, found: Any) -> str | None:
     if found == FORMAT:
         return None
     origin = "was made by arcade-torch 0.1" if found == 1 else f"has format {found!r}"
-    return f"{what} {origin}; this version reads format {FORMAT}: train it again, or use the version that made it"
+    return (
+        f"{what} {origin}; this version reads format {FORMAT}: train it again, or use the version "
+        "that made it"
+    )
 
 
 def find_checkpoint(path: Path) -> Checkpoint:
@@ -261,7 +288,9 @@ def _check_archive(archive: zipfile.ZipFile) -> None:
         if not entry.filename.endswith(".pkl"):
             continue
         if entry.file_size > MOST_JSON:
-            raise ValueError(f"{entry.filename} has {entry.file_size:,} bytes, at most {MOST_JSON:,} are read")
+            raise ValueError(
+                f"{entry.filename} has {entry.file_size:,} bytes, at most {MOST_JSON:,} are read"
+            )
         for operation, argument, _ in pickletools.genops(archive.read(entry)):
             called = operation.name in ("GLOBAL", "INST", "STACK_GLOBAL")
             if called and not _PLAIN.fullmatch(str(argument)):
@@ -276,7 +305,9 @@ def _read_meta(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
     except ValueError as error:
-        raise CheckpointError(f"checkpoint {path} is damaged: {_META} is not JSON ({error})") from error
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: {_META} is not JSON ({error})"
+        ) from error
     if not isinstance(meta, dict):
         raise CheckpointError(f"checkpoint {path} is damaged: {_META} holds no table")
     if reason := refuse_format(f"checkpoint {path}", meta.get("format")):
@@ -284,7 +315,9 @@ def _read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _read_part(file: Path, sums: dict[str, str], read: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+def _read_part(
+    file: Path, sums: dict[str, str], read: Callable[[Path], dict[str, Any]]
+) -> dict[str, Any]:
     """What a part of a checkpoint holds, if it is the one that was saved."""
     try:
         if checksum(file, _MOST_BYTES[file.name]) == sums.get(file.name):

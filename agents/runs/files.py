@@ -203,13 +203,23 @@ def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
     holds.
     """
-    if not isinstance(values, dict) or values.get("status", "finished") != "finished" or not set(needed) <= set(values):
+    if (
+        not isinstance(values, dict)
+        or values.get("status", "finished") != "finished"
+        or not set(needed) <= set(values)
+    ):
         return False
     returns = values.get("returns", [])
     lengths = values.get("lengths", [])
-    if not (isinstance(returns, list) and isinstance(lengths, list)) or values.get("mean", returns or None) is None:
+    if (
+        not (isinstance(returns, list) and isinstance(lengths, list))
+        or values.get("mean", returns or None) is None
+    ):
         return False
-    others = [values.get(name) for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm")]
+    others = [
+        values.get(name)
+        for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm")
+    ]
     numbers = [*returns, *lengths, *(value for value in others if value is not None)]
     # what can be squared; NaN is one
     sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)
@@ -225,7 +235,11 @@ class CsvLog:
         self.path = path
         self.columns = list(columns)
         rows = read_csv(path, strict=False) if path.exists() else []
-        kept = [[row.get(name, "") for name in columns] for row in rows if int(row["frames"]) <= keep_frames]
+        kept = [
+            [row.get(name, "") for name in columns]
+            for row in rows
+            if int(row["frames"]) <= keep_frames
+        ]
         write_atomic(path, "".join(",".join(cells) + "\n" for cells in [columns, *kept]))
         self._stream = io.TextIOWrapper(open_append(path), encoding="utf-8", newline="")
 
@@ -263,14 +277,20 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
         text = text if strict else text[: text.rfind("\n") + 1]
         header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is {'not CSV in UTF-8' if strict else 'damaged, it is no table'}: {error}") from error
+        raise ValueError(
+            f"{path} is {'not CSV in UTF-8' if strict else 'damaged, it is no table'}: {error}"
+        ) from error
     if not strict:
         if header and (header.count("frames") != 1 or header[0] != "frames"):
             raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
-        rows = [row for row in rows if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])]
+        rows = [
+            row for row in rows if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])
+        ]
     elif not header:
         raise ValueError(f"{path} is empty: expected CSV with a header line")
-    elif len(set(header)) != len(header) or any(name.splitlines() not in ([name], []) for name in header):
+    elif len(set(header)) != len(header) or any(
+        name.splitlines() not in ([name], []) for name in header
+    ):
         raise ValueError(f"{path} has a header that names a column twice, or over several lines")
     elif wrong := next((row for row in rows if len(row) != len(header)), None):
         which = "more" if len(wrong) > len(header) else "fewer"

@@ -62,11 +62,17 @@ class RunFolder:
         if self._config.exists() and resume:
             self._check_same(config)
         elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
-            hint = "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
+            hint = (
+                "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
+            )
             raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
-        existing = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+        existing = next(
+            path for path in (self.path, *self.path.absolute().parents) if path.exists()
+        )
         if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-            raise RunFolderError(f"cannot write to {self.path}: {existing} is not a writable folder")
+            raise RunFolderError(
+                f"cannot write to {self.path}: {existing} is not a writable folder"
+            )
 
     @contextlib.contextmanager
     def claim(self, config: TrainConfig) -> Iterator[None]:
@@ -79,16 +85,22 @@ class RunFolder:
         """
         for name in _WRITTEN:
             if (self.path / name).is_symlink():
-                raise RunFolderError(f"{self.path / name} is a link: a run writes and removes files there; remove it")
+                raise RunFolderError(
+                    f"{self.path / name} is a link: a run writes and removes files there; remove it"
+                )
         with contextlib.ExitStack() as held:
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
                 held.enter_context(FileLock(self.path / LOCK).acquire(timeout=0))
                 self._prepare(config)
             except Timeout as error:
-                raise RunFolderError(f"another process trains in {self.path}: wait for it, or stop it") from error
+                raise RunFolderError(
+                    f"another process trains in {self.path}: wait for it, or stop it"
+                ) from error
             except OSError as error:
-                raise RunFolderError(f"cannot write to {self.path}: {error.strerror or error}") from error
+                raise RunFolderError(
+                    f"cannot write to {self.path}: {error.strerror or error}"
+                ) from error
             yield
 
     def _prepare(self, config: TrainConfig) -> None:
@@ -98,7 +110,12 @@ class RunFolder:
         if self._config.exists():
             self._check_same(config)  # another process may have come first
         else:
-            record = {"format": FORMAT, "config": config.to_dict(), "versions": versions(), "command": sys.argv}
+            record = {
+                "format": FORMAT,
+                "config": config.to_dict(),
+                "versions": versions(),
+                "command": sys.argv,
+            }
             write_json(self._config, record)
 
     def _check_same(self, config: TrainConfig) -> None:
@@ -112,12 +129,16 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(f"{self._config} does not describe a run: {error}") from error
         if fields := differing_fields(saved, config):
-            raise RunFolderError(f"{self.path} holds another run; differing fields: {', '.join(fields)}")
+            raise RunFolderError(
+                f"{self.path} holds another run; differing fields: {', '.join(fields)}"
+            )
 
     def check_there(self) -> None:
         """Raise ``RunFolderError`` if somebody removed or moved the folder while its run trains."""
         if not self._config.is_file():
-            raise RunFolderError(f"{self.path} is not there any more, or its config.json: the run ends here")
+            raise RunFolderError(
+                f"{self.path} is not there any more, or its config.json: the run ends here"
+            )
 
     def finished(self) -> dict[str, Any] | None:
         """The final ``eval.json`` if the run is finished; a damaged one is made again from the last
@@ -126,7 +147,9 @@ class RunFolder:
         try:
             result = read_json(self.path / "eval.json")
         except PermissionError as error:
-            raise RunFolderError(f"{self.path / 'eval.json'} may not be read: {error.strerror}") from error
+            raise RunFolderError(
+                f"{self.path / 'eval.json'} may not be read: {error.strerror}"
+            ) from error
         except (OSError, ValueError):
             return None
         needed = ("status", "frames", "seconds", "returns", "lengths", "train_max_ewm")

@@ -24,7 +24,9 @@ def check_logger(name: str) -> None:
     ``LoggerError``.
     """
     if name != "none" and importlib.util.find_spec(name) is None:
-        raise LoggerError(f"logger={name!r} needs a package that is missing: pip install 'arcade-torch[loggers]'")
+        raise LoggerError(
+            f"logger={name!r} needs a package that is missing: pip install 'arcade-torch[loggers]'"
+        )
 
 
 class RunLogger:
@@ -48,8 +50,16 @@ class RunLogger:
         times ``time/name``.
         """
         if (logger := self._logger) is not None:
-            names = {key: "time" if key in ("seconds", "fps") else group for key in row if key != "frames"}
-            found = {f"{name}/{key}": float(row[key]) for key, name in names.items() if row[key] is not None}
+            names = {
+                key: "time" if key in ("seconds", "fps") else group
+                for key in row
+                if key != "frames"
+            }
+            found = {
+                f"{name}/{key}": float(row[key])
+                for key, name in names.items()
+                if row[key] is not None
+            }
             self._try(lambda: logger.log_metrics(found, step=int(row["frames"])))
 
     def close(self) -> None:
@@ -65,7 +75,10 @@ class RunLogger:
             return call()
         except Exception as error:
             self._logger = None
-            said = f"logging ends here, the run and its CSV files go on: {type(error).__name__}: {error}"
+            said = (
+                f"logging ends here, the run and its CSV files go on: {type(error).__name__}: "
+                f"{error}"
+            )
             warnings.warn(said, stacklevel=3)
 
 

@@ -32,11 +32,16 @@ def check_state(saved: Any, expected: Any, name: str = "the state") -> None:
             check_state(saved[key], expected[key], f"{name}[{key!r}]")
     elif isinstance(expected, list | tuple):
         _require(isinstance(saved, list | tuple), name, saved, "a list")
-        _require(not expected or len(saved) == len(expected), name, saved, f"a list of {len(expected)}")
+        _require(
+            not expected or len(saved) == len(expected), name, saved, f"a list of {len(expected)}"
+        )
         for index, (one, other) in enumerate(zip(saved, expected, strict=False)):
             check_state(one, other, f"{name}[{index}]")
     elif isinstance(expected, Tensor):
-        same = isinstance(saved, Tensor) and (saved.dtype, saved.shape) == (expected.dtype, expected.shape)
+        same = isinstance(saved, Tensor) and (saved.dtype, saved.shape) == (
+            expected.dtype,
+            expected.shape,
+        )
         _require(same, name, saved, _described(expected))
     else:
         _check_value(saved, expected, name)
@@ -59,9 +64,19 @@ def check_optimizer(saved: Any, parameters: Sequence[nn.Parameter]) -> None:
     a ``ValueError``.
     """
     name = "the state['optimizer']"
-    _require(isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping), name, saved, "one of an optimiser")
+    _require(
+        isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping),
+        name,
+        saved,
+        "one of an optimiser",
+    )
     for index, averages in saved["state"].items():
-        _require(type(index) is int and 0 <= index < len(parameters), name, index, "numbers of parameters")
+        _require(
+            type(index) is int and 0 <= index < len(parameters),
+            name,
+            index,
+            "numbers of parameters",
+        )
         part = f"{name}[{index}]"
         complete = isinstance(averages, Mapping) and set(averages) == _MOMENTS
         _require(complete, part, averages, f"a table of {', '.join(sorted(_MOMENTS))}")
@@ -85,7 +100,11 @@ def _described(value: Any) -> str:
         return f"a {type(value).__name__} of {len(value)}"
     if isinstance(value, str):
         return repr(value[:40])
-    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < LARGEST):
+    if (
+        value is None
+        or isinstance(value, bool | float)
+        or (isinstance(value, int) and abs(value) < LARGEST)
+    ):
         return repr(value)
     return f"a {type(value).__name__}"
 

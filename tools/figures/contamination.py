@@ -147,10 +147,13 @@ def pool(
     tasks: Mapping[tuple[str, str, str], Sequence[measure.Contamination]], confidence: float = 0.95
 ) -> dict[tuple[str, str, str], Measures]:
     """(agent, game, twin) -> measures over its seeds."""
-    return {
-        task: {name: pooled([item.mean(name) for item in items], confidence) for name in MEASURES}  # type: ignore[arg-type]
-        for task, items in tasks.items()
-    }
+    pooled_tasks: dict[tuple[str, str, str], dict[str, Pooled]] = {}
+    for task, items in tasks.items():
+        pooled_tasks[task] = {}
+        for name in MEASURES:
+            means = [item.mean(name) for item in items]  # type: ignore[arg-type]
+            pooled_tasks[task][name] = pooled(means, confidence)
+    return pooled_tasks
 
 
 def _figure(

@@ -333,7 +333,8 @@ class Ray(RayOptions):
             # for this switch, made for firewalls that ask; it is read from the environment when ray
             # is imported.
             with contextlib.suppress(ImportError, AttributeError):
-                importlib.import_module("ray._private.ray_constants").ENABLE_RAY_CLUSTER = False  # type: ignore[attr-defined]
+                ray_constants: Any = importlib.import_module("ray._private.ray_constants")
+                ray_constants.ENABLE_RAY_CLUSTER = False
             options |= {
                 "num_cpus": max(len(available_cores()), self.workers),
                 "include_dashboard": False,

@@ -12,7 +12,14 @@ from arcade_torch.agents import preset
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs import checkpoint as checkpoints
 from arcade_torch.agents.runs import files
-from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_bytes, read_csv, read_json, write_json
+from arcade_torch.agents.runs.files import (
+    CheckpointError,
+    CsvLog,
+    read_bytes,
+    read_csv,
+    read_json,
+    write_json,
+)
 from arcade_torch.agents.runs.folder import RunFolder, RunFolderError
 
 CONFIG: TrainConfig = preset("smoke")
@@ -129,7 +136,11 @@ def test_a_checkpoint_that_is_a_link_is_none(tmp_path: Path) -> None:
     assert checkpoints.list_checkpoints(folder) == []
     again = checkpoints.save_checkpoint(folder, CONFIG, 64, {"w": torch.ones(2)}, {"frames": 64})
     assert not again.is_symlink() and checkpoints.load_checkpoint(again).weights["w"].sum() == 2
-    assert sorted(path.name for path in elsewhere.iterdir()) == ["meta.json", "trainer.pt", "weights.safetensors"]
+    assert sorted(path.name for path in elsewhere.iterdir()) == [
+        "meta.json",
+        "trainer.pt",
+        "weights.safetensors",
+    ]
 
 
 @pytest.mark.parametrize("frames", [-1, 10**12, 10**400, True, "64", 64.0, None])
@@ -137,7 +148,7 @@ def test_a_checkpoint_counts_its_frames(tmp_path: Path, frames: object) -> None:
     path = checkpoints.save_checkpoint(tmp_path, CONFIG, 64, {"w": torch.zeros(2)}, {"frames": 64})
     meta = read_json(path / "meta.json")
     write_json(path / "meta.json", meta | {"frames": frames})
-    with pytest.raises(CheckpointError, match="meta.json does not describe a run"):
+    with pytest.raises(CheckpointError, match=r"meta.json does not describe a run"):
         checkpoints.load_checkpoint(path)
 
 
@@ -150,7 +161,7 @@ def test_a_state_that_is_no_table_is_damaged(tmp_path: Path, state: object) -> N
     meta = read_json(path / "meta.json")
     meta["sha256"]["trainer.pt"] = files.checksum(path / "trainer.pt")
     write_json(path / "meta.json", meta)
-    with pytest.raises(CheckpointError, match="trainer.pt cannot be read .*holds no table"):
+    with pytest.raises(CheckpointError, match=r"trainer.pt cannot be read .*holds no table"):
         checkpoints.load_checkpoint(path)
 
 
@@ -203,7 +214,9 @@ def test_a_state_makes_nothing_but_tensors_and_tables(tmp_path: Path, size: int)
     path = forged(tmp_path, "trainer.pt", packed.getvalue())
     tracemalloc.start()
     try:
-        with pytest.raises(CheckpointError, match="names .*bytearray, which is no part of a trainer's state"):
+        with pytest.raises(
+            CheckpointError, match=r"names .*bytearray, which is no part of a trainer's state"
+        ):
             checkpoints.load_checkpoint(path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
@@ -212,8 +225,18 @@ def test_a_state_makes_nothing_but_tensors_and_tables(tmp_path: Path, size: int)
 
 
 def test_every_kind_of_tensor_is_a_part_of_a_state(tmp_path: Path) -> None:
-    kinds = (torch.float32, torch.bfloat16, torch.float16, torch.int8, torch.uint8, torch.int64, torch.bool)
-    state = {str(kind): torch.ones(2, dtype=kind) for kind in kinds} | {"p": torch.nn.Parameter(torch.ones(2))}
+    kinds = (
+        torch.float32,
+        torch.bfloat16,
+        torch.float16,
+        torch.int8,
+        torch.uint8,
+        torch.int64,
+        torch.bool,
+    )
+    state = {str(kind): torch.ones(2, dtype=kind) for kind in kinds} | {
+        "p": torch.nn.Parameter(torch.ones(2))
+    }
     state |= {"kind": torch.float32, "size": torch.ones(2, 3).size(), "device": torch.device("cpu")}
     path = checkpoints.save_checkpoint(tmp_path, CONFIG, 64, {"w": torch.zeros(2)}, state)
     loaded = checkpoints.load_checkpoint(path).trainer

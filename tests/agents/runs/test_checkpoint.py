@@ -36,7 +36,10 @@ def test_what_is_saved_is_loaded(tmp_path):
 def test_the_last_two_are_kept_and_the_newest_comes_first(tmp_path):
     for frames in (64, 128, 192):
         save(tmp_path, frames)
-    assert [p.name for p in list_checkpoints(tmp_path)] == ["frames-000000000192", "frames-000000000128"]
+    assert [p.name for p in list_checkpoints(tmp_path)] == [
+        "frames-000000000192",
+        "frames-000000000128",
+    ]
     assert (tmp_path / "latest").read_text().strip() == "frames-000000000192"
     assert not list(tmp_path.glob(".*"))
 
@@ -69,7 +72,9 @@ def test_nothing_whole_is_an_error_that_says_so(tmp_path):
 
 def test_a_checkpoint_of_another_run_is_refused_with_the_fields(tmp_path):
     save(tmp_path, 64)
-    other = dataclasses.replace(CONFIG, env="MineSweeperEasy", pqn=dataclasses.replace(CONFIG.pqn, lam=0.5))
+    other = dataclasses.replace(
+        CONFIG, env="MineSweeperEasy", pqn=dataclasses.replace(CONFIG.pqn, lam=0.5)
+    )
     words = r"env \('CartPoleEasy' != 'MineSweeperEasy'\), pqn\.lam \(0\.8 != 0\.5\)"
     with pytest.raises(CheckpointError, match=words):
         load_latest(tmp_path, expect=other)

@@ -20,7 +20,9 @@ def test_a_run_folder_has_one_trainer(tmp_path: Path) -> None:
     other = RunFolder(tmp_path / "run")
     with RunFolder(tmp_path / "run").claim(CONFIG):
         other.check(CONFIG, resume=True)
-        with pytest.raises(RunFolderError, match="another process trains in .*run: wait for it, or stop it"):
+        with pytest.raises(
+            RunFolderError, match=r"another process trains in .*run: wait for it, or stop it"
+        ):
             other.claim(CONFIG).__enter__()
     with other.claim(CONFIG):
         pass
@@ -49,7 +51,9 @@ def test_counting_under_the_lock_loses_no_count(tmp_path: Path) -> None:
     assert count.read_text() == "100"
 
 
-def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written_is_removed(tmp_path: Path) -> None:
+def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written_is_removed(
+    tmp_path: Path,
+) -> None:
     folder = RunFolder(tmp_path / "run")
     code = (
         "import sys; from pathlib import Path; from arcade_torch.agents import preset\n"
@@ -57,7 +61,9 @@ def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written
         "with RunFolder(Path(sys.argv[1])).claim(preset('smoke')): print('claimed', flush=True), sys.stdin.read()"
     )
     words = [sys.executable, "-c", code, str(folder.path)]
-    with subprocess.Popen(words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None and process.stdout.readline() == "claimed\n"
         with pytest.raises(RunFolderError, match="another process trains in"):
             folder.claim(CONFIG).__enter__()
@@ -67,13 +73,23 @@ def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written
         (folder.path / ".mine.124-0123abcd.draft").mkdir()
         (folder.checkpoints / ".frames-000000000064.123").mkdir(parents=True)
         folder.replay.mkdir()
-        for name in ("window-000000000.safetensors", ".window-000000001.safetensors.7-0123abcd.draft"):
+        for name in (
+            "window-000000000.safetensors",
+            ".window-000000001.safetensors.7-0123abcd.draft",
+        ):
             (folder.replay / name).write_text("frames")
         process.kill()
     with folder.claim(CONFIG):
         left = sorted(path.name for path in folder.path.rglob("*"))
         kept = [".mine.123", ".mine.124-0123abcd.draft"]
-        assert left == [*kept, "checkpoints", "config.json", LOCK, "replay", "window-000000000.safetensors"]
+        assert left == [
+            *kept,
+            "checkpoints",
+            "config.json",
+            LOCK,
+            "replay",
+            "window-000000000.safetensors",
+        ]
 
 
 def test_a_lock_alone_does_not_make_a_folder_taken(tmp_path: Path) -> None:
@@ -89,7 +105,9 @@ def test_an_error_of_the_training_frees_the_folder_and_stays_what_it_is(tmp_path
 
 
 @pytest.mark.parametrize("without", ["format", None])
-def test_a_run_of_version_0_1_is_refused_in_one_line_and_left_alone(tmp_path: Path, without: str | None) -> None:
+def test_a_run_of_version_0_1_is_refused_in_one_line_and_left_alone(
+    tmp_path: Path, without: str | None
+) -> None:
     with RunFolder(tmp_path).claim(CONFIG):
         pass
     file = tmp_path / "config.json"
@@ -98,7 +116,10 @@ def test_a_run_of_version_0_1_is_refused_in_one_line_and_left_alone(tmp_path: Pa
     old.pop(without, None)
     file.write_text(json.dumps(old))
     said = "was made by arcade-torch 0.1; this version reads format 2: train it again, or use the version that made it"
-    for use in (lambda run: run.check(CONFIG, resume=True), lambda run: run.claim(CONFIG).__enter__()):
+    for use in (
+        lambda run: run.check(CONFIG, resume=True),
+        lambda run: run.claim(CONFIG).__enter__(),
+    ):
         with pytest.raises(RunFolderError) as refused:
             use(RunFolder(tmp_path))
         assert str(refused.value) == f"the run in {tmp_path} {said}"
@@ -107,12 +128,14 @@ def test_a_run_of_version_0_1_is_refused_in_one_line_and_left_alone(tmp_path: Pa
 
 def test_a_lock_that_cannot_be_made_is_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "run" / LOCK).mkdir(parents=True)
-    with pytest.raises(RunFolderError, match="cannot write to .*run: Is a directory"):
+    with pytest.raises(RunFolderError, match=r"cannot write to .*run: Is a directory"):
         RunFolder(tmp_path / "run").claim(CONFIG).__enter__()
     assert os.listdir(tmp_path / "run") == [LOCK]
 
 
-def test_waiting_ends_when_the_other_process_has_stopped_or_the_time_is_over(tmp_path: Path) -> None:
+def test_waiting_ends_when_the_other_process_has_stopped_or_the_time_is_over(
+    tmp_path: Path,
+) -> None:
     wait_until_free(tmp_path / "absent", 60)
     with RunFolder(tmp_path).claim(CONFIG):
         waiting = threading.Thread(target=wait_until_free, args=(tmp_path, 60.0), daemon=True)

@@ -18,12 +18,24 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.replay import SequenceReplay
 from arcade_torch.agents.runs import checkpoint as checkpoints
 from arcade_torch.agents.runs import files
-from arcade_torch.agents.runs.files import CheckpointError, checksum, read_csv, read_json, write_atomic, write_json
+from arcade_torch.agents.runs.files import (
+    CheckpointError,
+    checksum,
+    read_csv,
+    read_json,
+    write_atomic,
+    write_json,
+)
 from arcade_torch.agents.runs.folder import RunFolder, RunFolderError
 from tests.agents.fakes import stream
 
 CONFIG: TrainConfig = preset("smoke")
-READERS = {"json": read_json, "csv": read_csv, "log": lambda path: read_csv(path, strict=False), "sum": checksum}
+READERS = {
+    "json": read_json,
+    "csv": read_csv,
+    "log": lambda path: read_csv(path, strict=False),
+    "sum": checksum,
+}
 
 
 def fifo(path: Path) -> None:
@@ -42,7 +54,9 @@ def listener(path: Path) -> None:
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("kind", [fifo, device, Path.mkdir, listener])
-def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: object, reader: str) -> None:
+def test_what_is_no_regular_file_is_refused_at_once(
+    tmp_path: Path, kind: object, reader: str
+) -> None:
     """Before: a pipe was waited for, for ever, and /dev/zero was read until memory ended."""
     path = tmp_path / "file"
     kind(path)  # type: ignore[operator]
@@ -56,7 +70,7 @@ def test_a_text_beyond_all_measure_is_refused_unread(tmp_path: Path, reader: str
     path = tmp_path / "file"
     with path.open("wb") as sparse:
         sparse.truncate(files.MOST_TEXT + 1)
-    with pytest.raises(ValueError, match="bytes, at most (67,108,864|268,435,456) are read"):
+    with pytest.raises(ValueError, match=r"bytes, at most (67,108,864|268,435,456) are read"):
         READERS[reader](path)
 
 
@@ -76,7 +90,9 @@ def replay(folder: Path) -> SequenceReplay:
     return out
 
 
-@pytest.mark.parametrize("name", ["{outside}", "../outside", "window-1.safetensors", "sub/window-000000000.safetensors"])
+@pytest.mark.parametrize(
+    "name", ["{outside}", "../outside", "window-1.safetensors", "sub/window-000000000.safetensors"]
+)
 def test_a_forged_name_reaches_no_file_outside(tmp_path: Path, name: str) -> None:
     """Before: an absolute name, or one with .., was opened, and removed when the replay was
     full.
@@ -153,7 +169,10 @@ def with_checksum(path: Path) -> None:
 def test_a_packed_state_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
     path = saved(tmp_path)
     packed = io.BytesIO()
-    with zipfile.ZipFile(path / "trainer.pt") as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as bomb:
+    with (
+        zipfile.ZipFile(path / "trainer.pt") as archive,
+        zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as bomb,
+    ):
         for entry in archive.namelist():
             bomb.writestr(entry, archive.read(entry))
         bomb.writestr("archive/data/9", bytes(2**24))
@@ -183,7 +202,9 @@ def test_a_pipe_in_the_place_of_a_config_is_refused(tmp_path: Path, kind: object
     assert RunFolder(tmp_path).finished() is None
 
 
-def test_what_may_not_be_read_is_not_called_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_may_not_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = saved(tmp_path)
 
     def refuse(*_: object) -> None:
@@ -233,4 +254,6 @@ def test_a_full_disk_names_the_file_and_leaves_the_old_one(
         with pytest.raises(OSError, match="No space left on device") as caught:
             write_json(path, {"new": 2})
     assert caught.value.filename == str(path) and caught.value.errno == errno.ENOSPC
-    assert read_json(path) == {"old": 1} and [entry.name for entry in tmp_path.iterdir()] == ["file.json"]
+    assert read_json(path) == {"old": 1} and [entry.name for entry in tmp_path.iterdir()] == [
+        "file.json"
+    ]
