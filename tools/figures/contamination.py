@@ -147,12 +147,13 @@ def pool(
     tasks: Mapping[tuple[str, str, str], Sequence[measure.Contamination]], confidence: float = 0.95
 ) -> dict[tuple[str, str, str], Measures]:
     """(agent, game, twin) -> measures over its seeds."""
-    pooled_tasks: dict[tuple[str, str, str], dict[str, Pooled]] = {}
+    pooled_tasks: dict[tuple[str, str, str], Measures] = {}
     for task, items in tasks.items():
-        pooled_tasks[task] = {}
+        measures = {}
         for name in MEASURES:
             means = [item.mean(name) for item in items]  # type: ignore[arg-type]
-            pooled_tasks[task][name] = pooled(means, confidence)
+            measures[name] = pooled(means, confidence)
+        pooled_tasks[task] = measures
     return pooled_tasks
 
 
