@@ -100,7 +100,7 @@ class EpisodeStats:
         Returns:
             The last finished return of each environment, averaged over the window, for
             :func:`paper_score`; None until each has one: 0 in its place, as in published scores,
-            beats what is negative (docs/differences.md, Tetris).
+            beats what is negative (results/differences.md, Tetris).
         """
         returns = episode_reward.cpu().double().numpy()
         ends = done.cpu().numpy()

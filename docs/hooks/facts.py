@@ -103,7 +103,7 @@ def earned(game: str) -> str:
 
 def differences(title: str) -> str:
     """What differs from the published game."""
-    return section("docs/differences.md", title)
+    return section("results/differences.md", title)
 
 
 def recall(name: str) -> str:

@@ -9,6 +9,7 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "results/README.md": "results/measurements.md",
+    "results/differences.md": "results/differences.md",
     "results/parity.md": "results/parity.md",
     "results/small.md": "results/small.md",
     "results/probe.md": "results/probe.md",

@@ -59,7 +59,7 @@ def paper() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
     found: dict[tuple[str, str], dict[str, tuple[float, float]]] = {}
     with open(PAPER) as file:
         for row in csv.DictReader(file):
-            zeros = (row["env"], row["model"]) == ("Tetris", "MLP")  # docs/differences.md, "The training score"
+            zeros = (row["env"], row["model"]) == ("Tetris", "MLP")  # results/differences.md, "The training score"
             if row["difficulty"] == "easy" and row["model"] != "human" and not zeros:
                 for twin in ("MDP", "POMDP"):
                     value = float(row[f"{twin.lower()}_mean"]), float(row[f"{twin.lower()}_std"])

@@ -1,5 +1,5 @@
 """What each difference is worth in return: ``python -m tests.parity.effects`` writes it into
-docs/differences.md.
+results/differences.md.
 
 Needs no published package: our ``rules="reference"`` stands for it, which ``make parity`` shows to
 be the same law.
@@ -21,7 +21,7 @@ from arcade_torch.envs_jax.registry import DIFFICULTIES, GAMES
 from arcade_torch.tools.machine import versions
 from tests.parity.faults import FAULTS, Fault, take_all
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/differences.md"
+PAGE = Path(__file__).resolve().parents[2] / "results/differences.md"
 BEGIN, END = "<!-- effects: begin -->\n", "<!-- effects: end -->\n"
 RANDOM_EPISODES, ORACLE_EPISODES = 4096, 512
 Returns = npt.NDArray[np.float64]
@@ -30,7 +30,7 @@ TEXT = """
 Undiscounted returns of two players: uniformly random actions ({random:,} episodes a number) and the scripted player
 that sees the state ({oracle:,}), with 95 % intervals. Random numbers are shared by both rules where they can be, so a
 difference is often known better than its two sides. `rules="reference"` stands for the published law, which
-`make parity` shows to be the same ([results/parity.md](../results/parity.md)). `python -m tests.parity.effects` writes
+`make parity` shows to be the same ([results/parity.md](parity.md)). `python -m tests.parity.effects` writes
 this section; made with {versions}.
 
 **All differences of a task together.**

@@ -103,7 +103,7 @@ class Fault:
     """Something the published law does and the default rules do not.
 
     Attributes:
-        ids: its rows in docs/differences.md.
+        ids: its rows in results/differences.md.
         game: which game.
         correct: takes it out.
         planner: the rules that the state oracle reckons with: those of the corrected game where its

@@ -1,4 +1,4 @@
-"""Where the paper's returns of Tetris without memory come from: docs/differences.md, "The training
+"""Where the paper's returns of Tetris without memory come from: results/differences.md, "The training
 score".
 """
 
