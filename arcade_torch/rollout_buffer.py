@@ -1,5 +1,6 @@
 """The storage of a collector: one window of L = overlap + T steps, every frame written once."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any, Literal, cast
 
@@ -15,10 +16,10 @@ from arcade_torch.compiled import (
     STEP_COUNT,
     TERMINATED,
     TRUNCATED,
-    draws_in_place,
 )
-from arcade_torch.dlpack import TensorMemory, upload, write
+from arcade_torch.dlpack import is_host, upload
 from arcade_torch.env import Place
+from arcade_torch.frame_memory import Canvas, Reused, draws_in_place
 from arcade_torch.policies import path_of
 
 FinalFrames = Literal["all", "truncated", "none"]
@@ -29,6 +30,24 @@ _ROOT_COLUMNS: dict[str, torch.dtype] = {
     "step_count": torch.int64,
     "episode_reward": torch.float32,
 }
+
+
+class TensorMemory:
+    """Gives tensors, in memory of earlier ones that nobody can see any more; see ``Reused``."""
+
+    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
+        self._shape = shape
+        self._device = device
+        self._reused = Reused(most=2)  # what is in use, and the one before it
+        # under the last tensor, on the CPU: steps may draw into it
+        self.canvas: Canvas | None = None
+
+    def take(self) -> torch.Tensor:
+        """uint8 of the shape, with any content."""
+        if not is_host(self._device):  # torch's allocator for GPUs keeps memory by itself
+            return torch.empty(self._shape, dtype=torch.uint8, device=self._device)
+        self.canvas = self._reused.take(functools.partial(Canvas, self._shape))
+        return torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
 
 
 class RolloutBuffer:
@@ -175,11 +194,11 @@ class RolloutBuffer:
             target.copy_(frames)
         if self._dense is not None and self._fills_dense and step > self._first:
             self._dense[:, step - 1].copy_(frames)
-        write(self._action, np.s_[:, step], action)
+        _write(self._action, np.s_[:, step], action)
 
     def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
         """Write what came of it, ``Step.numbers``."""
-        write(self._numbers, np.s_[:, step], numbers)
+        _write(self._numbers, np.s_[:, step], numbers)
 
     def write_extras(self, step: int, extras: Mapping[NestedKey, torch.Tensor]) -> None:
         """Write what the policy wants stored; space is made at the first step."""
@@ -249,9 +268,9 @@ class RolloutBuffer:
         """
         places = self._place_of(self._wanted, rows, steps)
         if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
-            write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
+            _write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
         if self.final_frames == "truncated":
-            write(self._final.flatten(0, 1), rows * self._places + places, frames)
+            _write(self._final.flatten(0, 1), rows * self._places + places, frames)
 
     def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """The places of the final observations of some envs and steps."""
@@ -390,3 +409,13 @@ class RolloutBuffer:
                 f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}"
             )
         self._wanted = wanted
+
+
+def _write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
+    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's
+    price or less.
+    """
+    if is_host(target.device):
+        target.numpy()[index] = values.numpy()
+    else:
+        target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values

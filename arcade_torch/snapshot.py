@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
-from arcade_torch.dlpack import to_torch, wait_for_torch
+from arcade_torch.devices import wait_for_torch
+from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched

@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.compiled import CompiledGame, FinalObservations, FrameMemory
+from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.final_observations import FinalObservations
+from arcade_torch.frame_memory import FrameMemory
 from arcade_torch.process import check_process
 
 Bools = npt.NDArray[np.bool_]
