@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.autoencode.params import SUITS
+from arcade_torch.envs_jax.autoencode.rules import SUITS
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UP
 from arcade_torch.envs_jax.render.suits import NO_CARD
 

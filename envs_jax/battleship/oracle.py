@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.battleship.params import SHIPS
-from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
+from arcade_torch.envs_jax.battleship.renderer import HIT, KINDS
+from arcade_torch.envs_jax.battleship.rules import SHIPS
 from arcade_torch.envs_jax.minesweeper.oracle import towards
 
 Board = npt.NDArray[Any]

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.breakout import rules
-from arcade_torch.envs_jax.breakout.params import (
+from arcade_torch.envs_jax.breakout.renderer import BALL, KINDS
+from arcade_torch.envs_jax.breakout.rules import (
     COLUMNS,
     PADDLE_ROW,
     ROWS,
@@ -16,7 +17,6 @@ from arcade_torch.envs_jax.breakout.params import (
     WALL_TOP,
     Params,
 )
-from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
 from arcade_torch.envs_jax.settings import compiled, fixed
 

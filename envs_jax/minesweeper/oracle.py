@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.minesweeper.picture import KINDS
+from arcade_torch.envs_jax.minesweeper.renderer import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_SAFE
 
 Board = npt.NDArray[Any]

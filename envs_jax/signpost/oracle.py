@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import RIGHT
-from arcade_torch.envs_jax.signpost.picture import KINDS
+from arcade_torch.envs_jax.signpost.renderer import KINDS
 
 Actions = npt.NDArray[np.int32]
 

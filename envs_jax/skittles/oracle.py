@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
-from arcade_torch.envs_jax.skittles.params import CELLS, Params
-from arcade_torch.envs_jax.skittles.picture import AGENT
-from arcade_torch.envs_jax.skittles.rules import NO_BLOCK
+from arcade_torch.envs_jax.skittles.renderer import AGENT
+from arcade_torch.envs_jax.skittles.rules import CELLS, NO_BLOCK, Params
 
 UNSEEN = -2  # a block is in this row, nobody knows where
 MOVES = np.array([LEFT, UP, RIGHT], np.int32)

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.tetris.params import (
+from arcade_torch.envs_jax.tetris.renderer import BAND
+from arcade_torch.envs_jax.tetris.rules import (
     BOX,
     COLUMNS,
     ROTATIONS,
@@ -17,7 +18,6 @@ from arcade_torch.envs_jax.tetris.params import (
     SPAWN_X,
     SPAWN_Y,
 )
-from arcade_torch.envs_jax.tetris.picture import BAND
 
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from arcade_torch.envs_jax import BatchedGame, env_keys, make
 from arcade_torch.envs_jax.breakout import picture
-from arcade_torch.envs_jax.breakout.picture import KINDS
+from arcade_torch.envs_jax.breakout.renderer import KINDS
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.skittles.oracle import UNSEEN, Planner, outlook
-from arcade_torch.envs_jax.skittles.picture import AGENT
+from arcade_torch.envs_jax.skittles.renderer import AGENT
 from arcade_torch.envs_jax.skittles.rules import NO_BLOCK, shown
 
 from .conftest import Walk, batched, draw, going_on, one, random_actions

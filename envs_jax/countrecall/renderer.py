@@ -5,8 +5,7 @@ before.
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.countrecall.params import Params
-from arcade_torch.envs_jax.countrecall.rules import CountRecallState
+from arcade_torch.envs_jax.countrecall.rules import CountRecallState, Params
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     DIGITS,

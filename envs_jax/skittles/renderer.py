@@ -26,8 +26,7 @@ from arcade_torch.envs_jax.render.palette import (
     WHITE,
     YELLOW,
 )
-from arcade_torch.envs_jax.skittles.params import CELLS, MAX_STEPS
-from arcade_torch.envs_jax.skittles.rules import SkittlesState, shown
+from arcade_torch.envs_jax.skittles.rules import CELLS, MAX_STEPS, SkittlesState, shown
 
 BLOCKS = (RED, ORANGE, YELLOW, GREEN, BLUE, SKY, ULTRAVIOLET)
 AGENT = 1 + len(BLOCKS)  # tile codes: empty, then the blocks by colour, then the agent

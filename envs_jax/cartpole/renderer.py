@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT, X_LIMIT
-from arcade_torch.envs_jax.cartpole.rules import CartPoleState
+from arcade_torch.envs_jax.cartpole.rules import THETA_LIMIT, X_LIMIT, CartPoleState
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,

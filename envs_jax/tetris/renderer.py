@@ -30,8 +30,17 @@ from arcade_torch.envs_jax.render.palette import (
     YELLOW,
     Colour,
 )
-from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, GOAL, ROWS, SHAPES, Params
-from arcade_torch.envs_jax.tetris.rules import TetrisState, complete_rows, covers
+from arcade_torch.envs_jax.tetris.rules import (
+    BOX,
+    COLUMNS,
+    GOAL,
+    ROWS,
+    SHAPES,
+    Params,
+    TetrisState,
+    complete_rows,
+    covers,
+)
 
 # I O T S Z J L
 PIECE_COLOURS: tuple[Colour, ...] = (LAGOON, GOLD, VIOLET, EMERALD, BLOOD, COBALT, AMBER)
