@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.battleship.renderer import HIT, KINDS
 from arcade_torch.envs_jax.battleship.rules import SHIPS
-from arcade_torch.envs_jax.minesweeper.oracle import towards
+from arcade_torch.envs_jax.boards import towards
 
 Board = npt.NDArray[Any]
 UNKNOWN = -1

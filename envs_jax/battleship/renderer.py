@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from arcade_torch.envs_jax.battleship.rules import SHIP_CELLS, BattleShipState, Params
-from arcade_torch.envs_jax.cursor import cell_mask
+from arcade_torch.envs_jax.boards import cell_mask
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 
 SHIPS = (2, 3, 3, 4)  # lengths, in the order of placement

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
+from arcade_torch.envs_jax.boards import towards
 from arcade_torch.envs_jax.minesweeper.renderer import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_SAFE
 
@@ -21,15 +21,6 @@ def snake(side: int) -> npt.NDArray[np.int64]:
     return np.array(
         [(x if y % 2 == 0 else side - 1 - x, y) for y in range(side) for x in range(side)]
     )
-
-
-def towards(x: Board, y: Board, goal_x: Board, goal_y: Board) -> npt.NDArray[np.int32]:
-    """The move that brings each cursor nearer to its goal, first sideways; ``FIRE`` where it is
-    there.
-    """
-    sideways = np.where(goal_x > x, RIGHT, LEFT)
-    along = np.where(goal_y > y, DOWN, UP)
-    return np.where(goal_x != x, sideways, np.where(goal_y != y, along, FIRE)).astype(np.int32)
 
 
 class StateOracle:

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask
+from arcade_torch.envs_jax.boards import cell_mask
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState, Params
 from arcade_torch.envs_jax.render import (

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.cards import random_ranks
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
 
 TNTS = 7  # blocks on every map
@@ -103,9 +103,8 @@ def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
     index = jnp.arange(TNTS + 2)
     treasure = (draw[0] % jnp.uint32(TNTS + 2)).astype(jnp.int32)
     agent = (treasure + 1 + (draw[1] % jnp.uint32(TNTS + 1)).astype(jnp.int32)) % (TNTS + 2)
-    treasure_cell, agent_cell = (
-        jnp.sum(jnp.where(index == role, cells, 0)) for role in (treasure, agent)
-    )
+    treasure_cell = jnp.sum(jnp.where(index == treasure, cells, 0))
+    agent_cell = jnp.sum(jnp.where(index == agent, cells, 0))
     # What is neither treasure nor agent is TNT; their own places in the list are filled with a
     # block's cell.
     spare = (index != treasure) & (index != agent)
@@ -131,9 +130,13 @@ def place_as_published(key: Array, level: Params) -> tuple[Array, Array, Array]:
     is_tnt = (cell == tnt[:, None]).any(0)
     rank = cell - (tnt[:, None] < cell).sum(0)
 
+    def free_cell(entry: Array | int) -> Array:
+        return jnp.sum(jnp.where(~is_tnt & (rank == entry), cell, 0))
+
     def compose(for_x: Array | int, for_y: Array | int) -> Array:
-        x, y = (jnp.sum(jnp.where(~is_tnt & (rank == entry), cell, 0)) for entry in (for_x, for_y))
-        return x // level.side * level.side + y % level.side
+        x = free_cell(for_x) // level.side
+        y = free_cell(for_y) % level.side
+        return x * level.side + y
 
     return tnt, compose(*level.usual_place), compose(entries[0], entries[1])
 
