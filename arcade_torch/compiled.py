@@ -85,7 +85,7 @@ class CompiledGame:
 
     def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack."""
-        root, stepped, outcome, pixels = self.batched.step_auto(batch, action)
+        root, stepped, outcome, pixels = self.batched.step_autoreset(batch, action)
         return Step(self.batched.without_ends(root), stepped.state, pixels, _pack(stepped, outcome))
 
     def step_into(self, canvas: Canvas, at: int, batch: Batch, action: Any) -> Step:

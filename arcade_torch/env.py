@@ -471,12 +471,12 @@ class ArcadeEnv(EnvBase):
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
         mask = jax.numpy.asarray(marked.cpu().numpy())
-        batch = choose_rows(
-            mask, self._batched.wide(stepped.batch), self._batched.wide(before.batch)
-        )
+        padded = self._batched.pad(stepped.batch)
+        padded_before = self._batched.pad(before.batch)
+        batch = choose_rows(mask, padded, padded_before)
         ended = choose_rows(mask, stepped.ended, before.ended)
         ends = stepped.ends.where(marked.unsqueeze(-1), before.ends)
-        self._go_on(self._batched.narrow(batch), ended, ends)
+        self._go_on(self._batched.unpad(batch), ended, ends)
         left_alone = following.apply(torch.zeros_like)
         # an old reward is not earned again
         kept = (key for key in following.keys(True, True) if key != "reward")
