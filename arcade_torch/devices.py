@@ -51,7 +51,8 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
         ValueError: Unknown kind of device, no such GPU, torch without CUDA, or JAX without the
             device of JAX_PLATFORMS.
     """
-    if problem := missing_platform():
+    problem = missing_platform()
+    if problem:
         raise ValueError(problem)
     if device is None:
         on_gpu = jax.default_backend() == "gpu" and torch.cuda.is_available()

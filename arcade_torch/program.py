@@ -128,8 +128,8 @@ def _start_with_docstrings() -> None:
         elif not word.startswith("-") or word.startswith(("-m", "-c")):
             words.append(word)
             break
-        elif (kept := word.replace("O", "")) != "-":
-            words.append(kept)
+        elif word.strip("O") != "-":
+            words.append(word.replace("O", ""))
     words += rest
     if words != sys.orig_argv[1:] or os.environ.get("PYTHONOPTIMIZE", "1") != "1":
         os.environ["PYTHONOPTIMIZE"] = "1"

@@ -72,10 +72,11 @@ def register(
             f"id {id!r} is registered already: raise its version or choose another name"
         )
     names = dict.fromkeys((match["name"], *aliases), match["name"])
-    for each, name in names.items():
-        if (owner := _ALIASES.get(each.partition("-v")[0], name)) != name:
+    for alias, name in names.items():
+        owner = _ALIASES.get(alias.partition("-v")[0], name)
+        if owner != name:
             raise ValueError(
-                f"the name {each!r} belongs to the game {owner!r} already: choose another"
+                f"the name {alias!r} belongs to the game {owner!r} already: choose another"
             )
     _ENTRIES[id] = _Entry(factory, probe)
     _ALIASES.update(names)

@@ -113,14 +113,14 @@ class FramesOracle:
         envs = np.arange(len(seen))
         if len(self.goal) != len(seen):
             self.counts = np.zeros((len(seen), self.level.suits), np.int64)
-            self.turns, self.moves, self.goal = np.zeros((3, len(seen)), np.int64)
+            self.turns = np.zeros(len(seen), np.int64)
+            self.moves = np.zeros(len(seen), np.int64)
+            self.goal = np.zeros(len(seen), np.int64)
             self.fresh = np.ones(len(seen), bool)
         self.counts[is_init] = 0
-        self.turns[is_init], self.moves[is_init], self.fresh[is_init] = (
-            self.level.cards,
-            self.budget,
-            True,
-        )
+        self.turns[is_init] = self.level.cards
+        self.moves[is_init] = self.budget
+        self.fresh[is_init] = True
 
         screen = self.screen
         card = screen.card.read(seen)
