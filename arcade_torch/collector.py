@@ -441,10 +441,10 @@ class ArcadeCollector(BaseCollector):
             self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
 
-    def _as_state(self, state: dict[str, Any], like: TensorDict) -> TensorDict:
+    def _as_state(self, state: dict[str, Any], initial: TensorDict) -> TensorDict:
         """A saved recurrent state; a ValueError if its entries are not those of the policy."""
         saved = TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
-        if _layout(saved) != _layout(like):
+        if _layout(saved) != _layout(initial):
             raise ValueError("the saved recurrent state is not one of this policy")
         return saved
 

@@ -73,17 +73,17 @@ def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
             f"{', '.join(map(str, td.keys())) or 'none'}"
         )
     check_tensor(value, f"entry {key!r}")
-    found: torch.Tensor = value
-    return found
+    dense: torch.Tensor = value
+    return dense
 
 
-def check_tensor(value: Any, what: str) -> None:
-    """Raise TypeError unless ``value``, called ``what``, is a dense tensor."""
+def check_tensor(value: Any, name: str) -> None:
+    """Raise TypeError unless ``value``, called ``name``, is a dense tensor."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
+        raise TypeError(f"{name} is a {type(value).__name__}, expected a tensor")
     if value.layout is not torch.strided:
         raise TypeError(
-            f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()"
+            f"{name} is a {value.layout} tensor, expected a dense one: pass .to_dense()"
         )
 
 

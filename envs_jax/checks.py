@@ -146,10 +146,10 @@ def check_made(game: Any, full_id: str, obs_size: int) -> None:
     if not isinstance(game, Game):
         raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
     if (game.id, game.obs_size) != (full_id, obs_size):
-        made = f"{game.id!r} with obs_size {game.obs_size!r}"
+        arrived = f"{game.id!r} with obs_size {game.obs_size!r}"
         raise ValueError(
-            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: "
-            "pass on both"
+            f"the factory of {full_id} made {arrived}, wanted {full_id!r} with obs_size "
+            f"{obs_size}: pass on both"
         )
     check_foreign(game)
 
@@ -169,10 +169,10 @@ def _check_attributes(game: Game[Any]) -> None:
         raise ValueError(
             f"{type(game).__name__}: id is {name!r}, wanted the versioned id, such as 'MineEasy-v0'"
         )
-    for what in ("obs_size", "max_steps"):
-        value = getattr(game, what, None)
+    for attribute in ("obs_size", "max_steps"):
+        value = getattr(game, attribute, None)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name}: {what} is {value!r}, wanted an int of 1 or more")
+            raise ValueError(f"{name}: {attribute} is {value!r}, wanted an int of 1 or more")
     limits = getattr(game, "return_range", None)
     if not isinstance(limits, tuple) or len(limits) != 2 or not limits[0] <= limits[1]:
         raise ValueError(f"{name}: return_range is {limits!r}, wanted (lowest, highest)")
@@ -183,7 +183,7 @@ def _check_attributes(game: Game[Any]) -> None:
         )
 
 
-def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
+def _traced(name: str, method: str, function: Callable[..., Any], *args: Any) -> Any:
     """What a function would give, by shapes and types."""
     try:
         return jax.eval_shape(function, *args)
@@ -195,7 +195,7 @@ def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> A
             else ""
         )
         raise ValueError(
-            f"{name}: {what} cannot be traced by JAX, wanted a pure function of arrays{hint} "
+            f"{name}: {method} cannot be traced by JAX, wanted a pure function of arrays{hint} "
             f"({type(error).__name__}: {reason})"
         ) from error
 

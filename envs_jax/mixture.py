@@ -52,8 +52,8 @@ class Mixture:
     @property
     def rules(self) -> str:
         """The rule set, ``"mixed"`` where the games differ in it."""
-        found = {str(game.rules) for game in self.games}
-        return found.pop() if len(found) == 1 else "mixed"
+        rules = {str(game.rules) for game in self.games}
+        return rules.pop() if len(rules) == 1 else "mixed"
 
     @property
     def max_steps(self) -> int:

@@ -145,9 +145,9 @@ def resolve_id(id: str) -> str:
         raise ValueError(
             f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}"
         )
-    known = {known.lower(): known for known in _ALIASES}
-    near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
-    hint = f"did you mean {known[near[0]]!r}? " if near else ""
+    names = {alias.lower(): alias for alias in _ALIASES}
+    near = difflib.get_close_matches(name.lower(), list(names), n=1, cutoff=0.4)
+    hint = f"did you mean {names[near[0]]!r}? " if near else ""
     raise ValueError(
         f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or "
         "'arcade-torch list'; a "

@@ -54,7 +54,7 @@ def seed_keys(seed: int | Sequence[int] | npt.NDArray[Any], num_envs: int) -> ja
         return env_keys(seed, num_envs)
     if len(seed) != num_envs:
         raise ValueError(f"{len(seed)} seeds for {num_envs} envs: give one seed, or one an env")
-    return jnp.concatenate([env_keys(each, 1) for each in seed])
+    return jnp.concatenate([env_keys(env_seed, 1) for env_seed in seed])
 
 
 class NumpyBatch:

@@ -132,12 +132,12 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
-    here = cell_mask(state.x, state.y, level.side)
-    shot_before = jnp.any(here & (state.guesses == 1))
-    hit = fire & ~shot_before & jnp.any(here & (state.board == 1))
+    at_cursor = cell_mask(state.x, state.y, level.side)
+    shot_before = jnp.any(at_cursor & (state.guesses == 1))
+    hit = fire & ~shot_before & jnp.any(at_cursor & (state.board == 1))
     again = fire & shot_before
 
-    guesses = jnp.where(here & fire, jnp.int8(1), state.guesses)
+    guesses = jnp.where(at_cursor & fire, jnp.int8(1), state.guesses)
     hits = state.hits + hit
     repeats = state.repeats + again
     new = BattleShipState(x, y, state.board, guesses, hits, repeats, state.timestep + 1)

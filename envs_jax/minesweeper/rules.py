@@ -109,13 +109,13 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
-    here = cell_mask(state.x, state.y, level.side)
-    cell = jnp.sum(jnp.where(here, state.grid, 0))
+    at_cursor = cell_mask(state.x, state.y, level.side)
+    cell = jnp.sum(jnp.where(at_cursor, state.grid, 0))
     safe = fire & (cell == COVERED_SAFE)
     mine = fire & (cell == COVERED_MINE)
     again = fire & (cell == SWEPT)
 
-    grid = jnp.where(here & fire, jnp.int8(SWEPT), state.grid)
+    grid = jnp.where(at_cursor & fire, jnp.int8(SWEPT), state.grid)
     score = state.score + safe
     repeats = state.repeats + again
     new = MineSweeperState(x, y, grid, state.neighbours, score, repeats, state.timestep + 1)

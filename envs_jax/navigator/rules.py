@@ -153,8 +153,8 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
     new = NavigatorState(x, y, state.board, state.timestep + 1)
 
-    here = cell_mask(x, y, level.side)
-    cell = jnp.sum(jnp.where(here, state.board, 0))
+    at_agent = cell_mask(x, y, level.side)
+    cell = jnp.sum(jnp.where(at_agent, state.board, 0))
     fire = action == FIRE
     dead = ~fire & (cell == TNT)
     won = fire & (cell == TREASURE)

@@ -55,8 +55,8 @@ class Slot:
         host.
         """
         height, width = self.pictures.shape[1:3]
-        shown = frames[:, self.y : self.y + height, self.x : self.x + width]
-        return recognise(shown.reshape(len(frames), -1), self.pictures)
+        cutouts = frames[:, self.y : self.y + height, self.x : self.x + width]
+        return recognise(cutouts.reshape(len(frames), -1), self.pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,25 +95,25 @@ class TileGrid:
         )
 
 
-def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
+def recognise(cutouts: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
     """Which of some pictures each of many cut-outs is; on the host.
 
     Args:
-        shown: uint8 [..., h * w * 3], the cut-outs.
+        cutouts: uint8 [..., h * w * 3].
         pictures: uint8 [codes, h, w, 3].
 
     Returns:
         int64 [...]: the lowest code that looks like this, -1 where none does.
     """
-    known = pictures.reshape(len(pictures), -1)
+    flat = pictures.reshape(len(pictures), -1)
     # Random weights give every picture a number of its own; whole numbers are summed without
     # rounding.
-    weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
-    numbers = known @ weights
+    weights = np.random.default_rng(0).integers(1, 2**24, flat.shape[1]).astype(np.float64)
+    numbers = flat @ weights
     order = numbers.argsort(kind="stable")
-    found = np.searchsorted(numbers, shown @ weights, sorter=order)
-    codes = order[np.minimum(found, len(order) - 1)]
-    return np.where((known[codes] == shown).all(-1), codes, -1)
+    places = np.searchsorted(numbers, cutouts @ weights, sorter=order)
+    codes = order[np.minimum(places, len(order) - 1)]
+    return np.where((flat[codes] == cutouts).all(-1), codes, -1)
 
 
 class Layers:
@@ -156,14 +156,14 @@ class Layers:
             if not isinstance(array, jax.core.Tracer):
                 self._check_codes(number, np.asarray(array))
         lines, (slot, start, stride) = self._tables(tuple(array.shape for array in arrays))
-        known = jnp.concatenate(
-            [*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)]
-        )
-        index = start + stride * known.at[slot].get(mode="promise_in_bounds")
+        flat = [array.astype(jnp.uint32).reshape(-1) for array in arrays]
+        code_of_slot = jnp.concatenate([*flat, jnp.zeros(1, jnp.uint32)])
+        index = start + stride * code_of_slot.at[slot].get(mode="promise_in_bounds")
         pictures = [
             jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index
         ]
-        return functools.reduce(operator.xor, pictures).reshape(self.background.shape)
+        frame = functools.reduce(operator.xor, pictures)
+        return frame.reshape(self.background.shape)
 
     def _check_codes(self, number: int, codes: npt.NDArray[Any]) -> None:
         """Refuse codes of a place for which it has no picture."""
@@ -221,11 +221,13 @@ class Layers:
         for number, slot in enumerate(slots):
             if not slot.mixed:
                 on_top[slot.area] = number
-        known: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
-        shown: list[list[tuple[int, int, int]]] = [[] for _ in below]
+        blocks: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
+        # what stands in each line of the screen: slot, line of its code 0, lines to the next code
+        entries_of: list[list[tuple[int, int, int]]] = [[] for _ in below]
 
         def add(block: npt.NDArray[np.uint8]) -> int:
-            return known.setdefault(block.tobytes(), sum(map(len, known)) // below.shape[1])
+            next_line = sum(map(len, blocks)) // below.shape[1]
+            return blocks.setdefault(block.tobytes(), next_line)
 
         for number, slot in enumerate(slots):
             rows, across = slot.area
@@ -237,22 +239,20 @@ class Layers:
             seen = np.asarray(changes.any((0, 2)))
             block = np.zeros((len(changes), *below[rows].shape), np.uint8)
             block[:, :, across] = changes
-            first = seen & [not entries for entries in shown[rows]]
+            first = seen & [not entries for entries in entries_of[rows]]
             block[:, first] ^= below[rows][first]
             start = add(block)
             for row in np.flatnonzero(seen).tolist():
-                shown[slot.y + row].append((number, start + row, len(seen)))
-        for line, entries in zip(below, shown, strict=True):
+                entries_of[slot.y + row].append((number, start + row, len(seen)))
+        for line, entries in zip(below, entries_of, strict=True):
             if not entries:
                 entries.append((0, add(line), 0))
         nothing = (0, add(np.zeros_like(below[0])), 0)
-        most = max(map(len, shown))
-        table = np.array(
-            [entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32
-        )
-        return np.frombuffer(b"".join(known), np.uint8).reshape(
-            -1, below.shape[1]
-        ), table.transpose(2, 1, 0)
+        most = max(map(len, entries_of))
+        padded = [entries + [nothing] * (most - len(entries)) for entries in entries_of]
+        table = np.array(padded, np.uint32).transpose(2, 1, 0)
+        lines = np.frombuffer(b"".join(blocks), np.uint8).reshape(-1, below.shape[1])
+        return lines, table
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:

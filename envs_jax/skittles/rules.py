@@ -113,7 +113,7 @@ def step(
     return new, reward, hit, time >= MAX_STEPS
 
 
-def shown(state: SkittlesState) -> Array:
+def visible_rows(state: SkittlesState) -> Array:
     """Which blocks the POMDP shows: bool [CELLS], one for each row.
 
     At every time each cell of the grid is shown with probability 1/2, as a function of

@@ -118,8 +118,8 @@ class Screen:
         alone.
         """
         pile = jnp.where(jnp.asarray(partial), EMPTY, state.board)
-        shown = jnp.where(covers(state), (state.piece + 1).astype(jnp.int8), pile)
-        return jnp.where(complete_rows(state.board)[:, None], jnp.int8(BAND), shown)
+        cells = jnp.where(covers(state), (state.piece + 1).astype(jnp.int8), pile)
+        return jnp.where(complete_rows(state.board)[:, None], jnp.int8(BAND), cells)
 
     def draw(self, state: TetrisState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]."""
