@@ -39,7 +39,7 @@ from arcade_torch.agents.runs.files import CheckpointError, CsvLog, read_csv, wr
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.agents.runs.states import check_state
-from arcade_torch.dlpack import pick_devices
+from arcade_torch.devices import pick_devices
 from arcade_torch.envs_jax import resolve_id
 
 Progress = Callable[[Mapping[str, Any]], None]

@@ -106,7 +106,8 @@ class ArcadeCollector(BaseCollector):
         _check_arguments(env, policy, frames_per_batch, overlap, final_frames)
         self.env: ArcadeEnv = env
         self.policy = policy
-        self.requested_frames_per_batch = self.frames_per_batch = frames_per_batch
+        self.frames_per_batch = frames_per_batch
+        self.requested_frames_per_batch = frames_per_batch
         self.total_frames = float("inf") if total_frames < 0 else total_frames
         self.init_random_frames = init_random_frames
         self.return_same_td = return_same_td
@@ -196,9 +197,8 @@ class ArcadeCollector(BaseCollector):
             compact = self.compact_obs or self._final_frames != "all"
             buffer, _ = self._collect_window(random=False, dense=not compact)
             batch = buffer.transitions(compact)
-            batch["collector"] = TensorDict(
-                {"traj_ids": self._trajectories(buffer)}, batch_size=batch.batch_size
-            )
+            traj_ids = self._trajectories(buffer)
+            batch["collector"] = TensorDict({"traj_ids": traj_ids}, batch_size=batch.batch_size)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             self._numbered = self._iter  # a window that a hook refused was not
@@ -259,11 +259,15 @@ class ArcadeCollector(BaseCollector):
             self._window_starts.clear()
         assert self._obs is not None
         if self._buffer is None:  # there is none yet, or what it held was a window that was lost
-            sizes = self._num_envs, self._overlap, self._steps, self._obs["pixels"].shape[1:]
-            shortest = min(game.max_steps for game in self.env.games)
-            task = self.env.task if self.env.task_in_td else None
             self._buffer = RolloutBuffer(
-                *sizes, self.env.device, self._final_frames, shortest, task
+                self._num_envs,
+                self._overlap,
+                self._steps,
+                frame_shape=self._obs["pixels"].shape[1:],
+                device=self.env.device,
+                final_frames=self._final_frames,
+                max_steps=min(game.max_steps for game in self.env.games),
+                task=self.env.task if self.env.task_in_td else None,
             )
         return self._buffer, self._obs
 
@@ -300,7 +304,8 @@ class ArcadeCollector(BaseCollector):
             self._finals.add(step, *raw.final)
         self._acted += 1
         reads = ROOT_KEYS if step == buffer.length - 1 else self._runner.reads
-        following = {"pixels": self._compressed(raw.pixels), **raw.root_numbers(reads)}
+        following = {"pixels": self._compressed(raw.pixels)}
+        following.update(raw.root_numbers(reads))
         if "last_action" in reads:
             following["last_action"] = action.to(torch.int64, copy=True)
         if "task" in reads and self.env.task_in_td:
@@ -436,14 +441,10 @@ class ArcadeCollector(BaseCollector):
             self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
 
-    def _as_state(self, state: dict[str, Any], like: TensorDict) -> TensorDict:
+    def _as_state(self, state: dict[str, Any], initial: TensorDict) -> TensorDict:
         """A saved recurrent state; a ValueError if its entries are not those of the policy."""
         saved = TensorDict(state, batch_size=[self._num_envs]).to(self.env.device)
-        layouts = [
-            {key: (value.dtype, value.shape) for key, value in td.items(True, True)}
-            for td in (saved, like)
-        ]
-        if layouts[0] != layouts[1]:
+        if _layout(saved) != _layout(initial):
             raise ValueError("the saved recurrent state is not one of this policy")
         return saved
 
@@ -454,12 +455,18 @@ class ArcadeCollector(BaseCollector):
         nothing to close.
         """
         self.closed = True
-        self._buffer = self._obs = None
+        self._buffer = None
+        self._obs = None
 
     def __repr__(self) -> str:
         """Sizes and env."""
         sizes = f"envs={self._num_envs}, steps={self._steps}, overlap={self._overlap}"
         return f"ArcadeCollector({self.env.game!r}, {sizes})"
+
+
+def _layout(td: TensorDictBase) -> dict[NestedKey, tuple[torch.dtype, torch.Size]]:
+    """Type and shape of every entry."""
+    return {key: (value.dtype, value.shape) for key, value in td.items(True, True)}
 
 
 def _check_arguments(

@@ -17,9 +17,10 @@ _LIVE: dict[Hashable, "weakref.WeakSet[Any]"] = {}  # envs with the default seed
 _warned = False
 
 
-def note(env: Any, plays: Hashable) -> None:
-    """Remember that an env of this kind has the default seed."""
-    _LIVE.setdefault(plays, weakref.WeakSet()).add(env)
+def note(env: Any, seed: int | None, plays: Hashable) -> None:
+    """Remember what an env plays, if its seed is the default."""
+    if isinstance(seed, DefaultSeed):
+        _LIVE.setdefault(plays, weakref.WeakSet()).add(env)
 
 
 def forget(env: Any) -> None:

@@ -7,37 +7,12 @@ in place.
 
 import functools
 import importlib.util
-import os
 import warnings
-from typing import Any
 
+import jax
 import numpy as np
 import torch
 from torch.utils.dlpack import from_dlpack
-
-
-def share_gpu() -> bool:
-    """Let JAX and torch live on one GPU: stop JAX from taking 75 % of its memory at the first use.
-
-    Sets ``XLA_PYTHON_CLIENT_PREALLOCATE=false`` unless the user has set it, and only where torch
-    has CUDA. It takes effect if it is called before JAX makes its first array; importing this
-    module calls it.
-
-    Returns:
-        Whether this process is set up to share a GPU.
-    """
-    if not torch.cuda.is_available():
-        return False
-    return os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false").lower() in ("false", "0")
-
-
-share_gpu()
-
-import jax  # noqa: E402  (after share_gpu)
-
-from arcade_torch.compiled import Canvas, Reused  # noqa: E402
-from arcade_torch.envs_jax.validation import format_value  # noqa: E402
-from arcade_torch.process import missing_platform  # noqa: E402
 
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
 # below it JAX copies; on a GPU its programs refuse the argument
@@ -155,96 +130,10 @@ def int32_argument(tensor: torch.Tensor, jax_device: jax.Device) -> np.ndarray |
     return to_jax(tensor.to(torch.int32, copy=True))
 
 
-def wait_for_torch(device: torch.device, jax_device: jax.Device) -> None:
-    """Wait until torch has read the frames that it has let go of: on a GPU, JAX may take their
-    memory for what is next.
-
-    A step need not wait: JAX waits for its actions, which stand behind those reads in torch's
-    current stream.
-    """
-    if not (is_host(device) or is_host(jax_device)):
-        torch.cuda.current_stream(device).synchronize()
-
-
 def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """Copy an array to a device; the host does not wait."""
     tensor = torch.from_numpy(array)
     return tensor if is_host(device) else tensor.pin_memory().to(device, non_blocking=True)
-
-
-def write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
-    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's
-    price or less.
-    """
-    if is_host(target.device):
-        target.numpy()[index] = values.numpy()
-    else:
-        target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values
-
-
-class TensorMemory:
-    """Gives tensors, in memory of earlier ones that nobody can see any more; see ``Reused``."""
-
-    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
-        self._shape = shape
-        self._device = device
-        self._reused = Reused(most=2)  # what is in use, and the one before it
-        # under the last tensor, on the CPU: steps may draw into it
-        self.canvas: Canvas | None = None
-
-    def take(self) -> torch.Tensor:
-        """uint8 of the shape, with any content."""
-        if not is_host(self._device):  # torch's allocator for GPUs keeps memory by itself
-            return torch.empty(self._shape, dtype=torch.uint8, device=self._device)
-        self.canvas = self._reused.take(functools.partial(Canvas, self._shape))
-        return torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
-
-
-def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.Device]:
-    """Choose where tensors live and where JAX computes.
-
-    Args:
-        device: The device on which tensors are wanted, or None for the one that JAX computes on.
-
-    Returns:
-        The torch device (with an index for CUDA) and the JAX device. They are of different kinds
-        only if CUDA is asked for and JAX has the CPU alone; then every frame is copied, and a
-        warning says so once.
-
-    Raises:
-        ValueError: Unknown kind of device, no such GPU, torch without CUDA, or JAX without the
-            device of JAX_PLATFORMS.
-    """
-    if problem := missing_platform():
-        raise ValueError(problem)
-    if device is None:
-        on_gpu = jax.default_backend() == "gpu" and torch.cuda.is_available()
-        device = "cuda" if on_gpu else "cpu"
-    try:
-        wanted = torch.device(device)
-    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"device is {format_value(device)}, allowed: 'cpu', 'cuda', 'cuda:0', ..."
-        ) from error
-    if wanted.type == "cpu":
-        return torch.device("cpu"), jax.devices("cpu")[0]
-    if wanted.type != "cuda":
-        raise ValueError(f"device is {str(device)!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...")
-    if not torch.cuda.is_available():
-        raise ValueError(
-            f"device is {str(device)!r}, but torch sees no GPU: use 'cpu', or install torch with "
-            "CUDA"
-        )
-    index = wanted.index if wanted.index is not None else torch.cuda.current_device()
-    if index >= torch.cuda.device_count():
-        raise ValueError(
-            f"device is {str(device)!r}, but there are {torch.cuda.device_count()} GPUs"
-        )
-    wanted = torch.device("cuda", index)
-    if jax.default_backend() != "gpu":
-        warn_frames_are_copied()
-        return wanted, jax.devices("cpu")[0]
-    return wanted, jax.devices("gpu")[index]
 
 
 @functools.cache

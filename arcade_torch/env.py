@@ -2,9 +2,9 @@
 JAX wrote.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -18,28 +18,21 @@ from arcade_torch.compiled import (
     REWARD,
     STEP_COUNT,
     TERMINATED,
-    Canvas,
     CompiledGame,
     Ended,
-    FinalObservations,
-    FrameMemory,
 )
-from arcade_torch.dlpack import int32_argument, is_host, pick_devices, to_torch, wait_for_torch
+from arcade_torch.devices import pick_devices, wait_for_torch
+from arcade_torch.dlpack import int32_argument, is_host, to_torch
 from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.envs_jax.validation import check_fits, check_num_envs
+from arcade_torch.final_observations import FinalObservations
+from arcade_torch.frame_memory import Canvas, FrameMemory
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.process import check_process
 from arcade_torch.snapshot import Snapshots
-from arcade_torch.specs import RawStep, make_specs
+from arcade_torch.specs import make_specs
 
-_INTEGERS = {
-    torch.int64: np.uint64,
-    torch.int32: np.uint32,
-    torch.int16: np.uint16,
-    torch.int8: np.uint8,
-}
-_INTEGERS[torch.uint8] = np.uint8
 Place = tuple[Canvas, int, torch.Tensor]
 
 
@@ -52,6 +45,33 @@ class Live:
     ends: torch.Tensor  # bool [N, 2], what a root says: where its last step terminated or truncated
     generation: int = 0  # changes of the state
     view: int = 0  # changes of the observability
+
+
+class RawStep(NamedTuple):
+    """What one fused step gives."""
+
+    # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
+    pixels: torch.Tensor
+    numbers: torch.Tensor  # int32 [N, 5], see ``Step.numbers``
+    # the games' states before the resets, and who saw the partial view
+    final: tuple[Any, jax.Array]
+
+    def root_numbers(self, keys: Collection[str]) -> dict[str, torch.Tensor]:
+        """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if
+        asked for.
+        """
+        numbers = self.numbers
+        out = {}
+        done = numbers[:, TERMINATED:].any(-1, keepdim=True)
+        if "is_init" in keys:
+            out["is_init"] = done
+        if "step_count" in keys:
+            out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
+        if "episode_reward" in keys:
+            out["episode_reward"] = (
+                numbers[:, EPISODE_REWARD, None].view(torch.float32).masked_fill(done, 0)
+            )
+        return out
 
 
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
@@ -133,7 +153,9 @@ class ArcadeEnv(EnvBase):
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         wait_for_torch(torch_device, jax_device)
-        first = self._batched.init(*jax.device_put((env_keys(0, num_envs), flags), jax_device))
+        keys = jax.device_put(env_keys(0, num_envs), jax_device)
+        partial = jax.device_put(flags, jax_device)
+        first = self._batched.init(keys, partial)
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
         no = jax.device_put(np.zeros(num_envs, np.bool_), jax_device)
         self._none_ended: Ended = (no, no)
@@ -144,10 +166,12 @@ class ArcadeEnv(EnvBase):
         self._ends = FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, first, torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
-        made = make_specs(
+        action, observation, reward, done = make_specs(
             num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device
         )
-        self.action_spec, observation, self.reward_spec, self.done_spec = made
+        self.action_spec = action
+        self.reward_spec = reward
+        self.done_spec = done
         if state_in_td:
             observation["state"] = self._snapshots.spec()
             self.state_spec = type(observation)(
@@ -308,7 +332,7 @@ class ArcadeEnv(EnvBase):
             TypeError: Actions that are not integers.
             ValueError: Actions of a wrong shape or out of range.
         """
-        argument = int32_argument(self._check_action(action), self._jax_device)
+        argument = int32_argument(self._integers(action), self._jax_device)
         batch = self._live.batch if self._live.ended is self._none_ended else self._with_ends()
         if into is None:
             step = self._compiled.step(batch, argument, self._memory.spare())
@@ -322,9 +346,9 @@ class ArcadeEnv(EnvBase):
         else:
             canvas.wait()
         self._go_on(step.root)  # on the CPU the step is done; argument lives until here
-        return RawStep(
-            frames, to_torch(step.numbers, self.device), (step.final_state, step.root.partial)
-        )
+        numbers = to_torch(step.numbers, self.device)
+        final = (step.final_state, step.root.partial)
+        return RawStep(frames, numbers, final)
 
     def draws_safely(self) -> bool:
         """Whether steps may draw into memory that tensors lie over: a step that fails would take it
@@ -361,13 +385,13 @@ class ArcadeEnv(EnvBase):
         batch = self._snapshots.load(state)
         terminated, truncated = self._batched.ends(batch)
         some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
-        self._go_on(
-            self._batched.without_ends(batch), (terminated, truncated) if some_ended else None, ends
-        )
+        ended = (terminated, truncated) if some_ended else None
+        self._go_on(self._batched.without_ends(batch), ended, ends)
 
     def _still_ended(self, rows: np.ndarray) -> Ended:
         """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
-        terminated, truncated = (flags & rows for flags in self._live.ended)
+        terminated = self._live.ended[0] & rows
+        truncated = self._live.ended[1] & rows
         # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
         if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
             return self._none_ended
@@ -377,36 +401,13 @@ class ArcadeEnv(EnvBase):
         """The live batch with the flags of an end."""
         return self._batched.with_ends(self._live.batch, *self._live.ended)
 
-    def _check_action(self, action: torch.Tensor) -> torch.Tensor:
-        """Refuse actions that are no integers, of a wrong shape, or (on the CPU) out of range."""
-        validation.check_tensor(action, "action")
+    def _integers(self, action: torch.Tensor) -> torch.Tensor:
+        """The actions as integers [N]; raises if they are not what the spec says."""
         num_actions = self.game.num_actions
-        shape = (self.num_envs,)
         if self.one_hot:
-            if action.shape != (*shape, num_actions):
-                raise ValueError(
-                    f"action has shape {tuple(action.shape)}, expected one-hot "
-                    f"{(*shape, num_actions)}"
-                )
-            if self._check_actions:
-                validation.check_one_hot(action)
+            validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
             return action.to(torch.float32).argmax(-1)
-        unsigned = _INTEGERS.get(action.dtype)
-        if unsigned is None:
-            raise TypeError(
-                f"action has dtype {action.dtype}, expected integers such as torch.int64"
-            )
-        if action.shape != shape:
-            raise ValueError(
-                f"action has shape {tuple(action.shape)}, expected {shape}, one integer an env"
-            )
-        # Seen as unsigned, negative numbers are large: one comparison finds both kinds of error.
-        if self._check_actions and action.cpu().numpy().view(unsigned).max() >= num_actions:
-            lowest = int(action.min())
-            highest = int(action.max())
-            raise ValueError(
-                f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}"
-            )
+        validation.check_integers(action, self.num_envs, num_actions, self._check_actions)
         return action
 
     def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
@@ -440,7 +441,7 @@ class ArcadeEnv(EnvBase):
             twin = self._live.batch.partial
             self._go_on_from(tensordict.get("state", None))
             self._live.batch = self._live.batch._replace(partial=twin)
-        action = self._check_action(validation.tensor(tensordict, "action"))
+        action = self._integers(validation.tensor(tensordict, "action"))
         argument = int32_argument(action, self._jax_device)
         before = Live(self._live.batch, self._live.ended, self._live.ends)
         batch, ended, pixels, packed = self._compiled.step_only(
@@ -470,12 +471,12 @@ class ArcadeEnv(EnvBase):
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
         mask = jax.numpy.asarray(marked.cpu().numpy())
-        batch = choose_rows(
-            mask, self._batched.wide(stepped.batch), self._batched.wide(before.batch)
-        )
+        padded = self._batched.pad(stepped.batch)
+        padded_before = self._batched.pad(before.batch)
+        batch = choose_rows(mask, padded, padded_before)
         ended = choose_rows(mask, stepped.ended, before.ended)
         ends = stepped.ends.where(marked.unsqueeze(-1), before.ends)
-        self._go_on(self._batched.narrow(batch), ended, ends)
+        self._go_on(self._batched.unpad(batch), ended, ends)
         left_alone = following.apply(torch.zeros_like)
         # an old reward is not earned again
         kept = (key for key in following.keys(True, True) if key != "reward")
@@ -504,7 +505,8 @@ class ArcadeEnv(EnvBase):
         if preset is not None:
             unknown = preset.exclude(*following.keys(True, True))
             following.update(unknown)
-            if keys := tuple(unknown.keys(True, True)):
+            keys = tuple(unknown.keys(True, True))
+            if keys:
                 validation.warn_state_is_dropped(*keys)  # by _step_mdp below
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
@@ -522,10 +524,9 @@ class ArcadeEnv(EnvBase):
             seed = int(torch.randint(2**32, (), device="cpu"))
         default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
-        new = jax.device_put(
-            (env_keys(seed, self.num_envs), np.zeros(self.num_envs, np.int32)), self._jax_device
-        )
-        seeded = self._live.batch._replace(key=new[0], last_action=new[1])
+        key = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
+        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
+        seeded = self._live.batch._replace(key=key, last_action=last_action)
         self._go_on(seeded, self._live.ended, self._live.ends)
 
     def _root(self, batch: Batch, ended: Ended, frames: torch.Tensor) -> TensorDict:
@@ -570,10 +571,11 @@ class ArcadeEnv(EnvBase):
         """The entries that root and ``"next"`` have in common; ``ends`` is bool [N, 2]: terminated,
         truncated.
         """
-        entries = {"pixels": frames, "last_action": action.to(torch.int64, copy=True), **counts}
-        entries |= {
-            "done": ends.any(-1, keepdim=True),
-            "terminated": ends[:, :1],
-            "truncated": ends[:, 1:],
-        }
-        return {**entries, "task": self.task} if self.task_in_td else entries
+        entries = {"pixels": frames, "last_action": action.to(torch.int64, copy=True)}
+        entries.update(counts)
+        entries["done"] = ends.any(-1, keepdim=True)
+        entries["terminated"] = ends[:, :1]
+        entries["truncated"] = ends[:, 1:]
+        if self.task_in_td:
+            entries["task"] = self.task
+        return entries

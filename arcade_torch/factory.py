@@ -29,54 +29,39 @@ def make(
     debug: bool = False,
     **options: Any,
 ) -> ArcadeEnv:
-    """Make a batch of envs of one game, or of several that one policy is to play.
+    """Make a batch of envs, not yet reset, of one game or of several that one policy is to play.
 
-    Several games share the envs nearly equally: env 0 and its neighbours play the first, the last
-    envs the last, and what is left over goes to the earlier ones. An id that stands in the list k
-    times gets k shares. The key ``task`` says which game an env plays, as an index into
-    ``env.games``. ``env.game`` then has the longest time limit of all, the lowest and the highest
-    return, and the ids joined by ``+``; to report results, take each game's own from
-    ``env.games[task]``.
+    Several games share the envs nearly equally, in their order; an id that stands in the list k
+    times gets k shares. The key ``task`` is an index into ``env.games``. ``env.game`` has the
+    longest time limit of all and the widest range of returns: report each game's own.
 
     Args:
-        id: Id of the game, such as ``"CartPoleEasy"`` (newest version) or ``"CartPoleEasy-v0"``; or
-            a list of ids.
+        id: ``"CartPoleEasy-v0"``, or ``"CartPoleEasy"`` for its newest version; or a list of ids.
         num_envs: Number of envs in the batch.
-        observability: ``"full"`` (MDP, the default), ``"partial"`` (POMDP twin), or bool
-            [num_envs], true = partial.
+        observability: ``"full"`` (the default), ``"partial"``, or bool [num_envs], true = partial.
         obs_size: Side of the frames, 128 or 256 pixels.
-        seed: Seed of the batch; None draws one. Envs that share one play the same episodes: where
-            several workers each make an env, give each a seed of its own.
+        seed: Seed of the batch; None draws one. Envs with one seed play the same episodes.
         device: Device of all tensors; None for the device that JAX computes on.
         rules: ``"default"`` or ``"reference"`` (those of the published numbers).
         partial_obs: Alias: True means ``observability="partial"``.
         categorical_actions: False for one-hot actions.
-        state_in_td: Whether the whole game state travels in the tensordict, for planners; see
-            ``ArcadeEnv``.
+        state_in_td: Whether the game state is in the tensordict, for planners; see ``ArcadeEnv``.
         task_in_td: Whether there is a key ``task``; None: if ``id`` names several games.
         debug: Whether actions are checked on CUDA too, where that makes the host wait.
-        **options: Options of the game; of several games, each has to know them all.
-
-    Returns:
-        The env, not yet reset.
+        **options: Options of the game; several games all have to have them.
 
     Raises:
-        ValueError: Unknown id, size, rules, device, observability, an empty list of ids, or fewer
-            envs than games.
+        ValueError: An unknown choice, no id, or fewer envs than games.
         TypeError: An argument of a wrong type, or an option the game does not have.
 
     Example:
-        >>> env = make("CartPoleEasy", num_envs=2, observability="partial")
-        >>> env.rollout(3)["pixels"].shape
-        torch.Size([2, 3, 128, 128, 3])
         >>> make(["CartPoleEasy", "MineSweeperEasy"], num_envs=5).reset()["task"]
         tensor([0, 0, 0, 1, 1])
     """
     num_envs = check_num_envs(num_envs)
     flags = partial_flags(observability, num_envs, partial_obs)
-    compiled = compiled_game(id, obs_size, rules, options)
     env = ArcadeEnv(
-        compiled,
+        compiled_game(id, obs_size, rules, options),
         num_envs,
         flags,
         seed=seed,
@@ -86,6 +71,5 @@ def make(
         task_in_td=task_in_td,
         debug=debug,
     )
-    if isinstance(seed, default_seeds.DefaultSeed):
-        default_seeds.note(env, (repr(env.game), num_envs, flags.tobytes()))
+    default_seeds.note(env, seed, plays=(repr(env.game), num_envs, flags.tobytes()))
     return env

@@ -134,7 +134,9 @@ def _primers(policy: Any) -> list[TensorDictPrimer]:
     holds one.
     """
     module = policy if isinstance(policy, nn.Module) else getattr(policy, "module", None)
-    found = get_primers_from_module(module, warn=False) if isinstance(module, nn.Module) else None
-    if found is None:
+    if not isinstance(module, nn.Module):
         return []
-    return [found] if isinstance(found, TensorDictPrimer) else list(found)
+    primers = get_primers_from_module(module, warn=False)
+    if primers is None:
+        return []
+    return [primers] if isinstance(primers, TensorDictPrimer) else list(primers)

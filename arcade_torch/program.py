@@ -128,8 +128,8 @@ def _start_with_docstrings() -> None:
         elif not word.startswith("-") or word.startswith(("-m", "-c")):
             words.append(word)
             break
-        elif (kept := word.replace("O", "")) != "-":
-            words.append(kept)
+        elif word.strip("O") != "-":
+            words.append(word.replace("O", ""))
     words += rest
     if words != sys.orig_argv[1:] or os.environ.get("PYTHONOPTIMIZE", "1") != "1":
         os.environ["PYTHONOPTIMIZE"] = "1"
@@ -215,9 +215,9 @@ def _repeat() -> None:
         signal.pthread_kill(ident, signal.SIGTERM)
 
 
-def _end_now(how: str) -> NoReturn:
+def _end_now(reason: str) -> NoReturn:
     """End this process with a line on stderr; a terminal gets its cursor back."""
-    shown = "\x1b[?25h" if os.isatty(2) else ""
+    show_cursor = "\x1b[?25h" if os.isatty(2) else ""
     with suppress(OSError):
-        os.write(2, f"{shown}arcade-torch: {how}; {_Process.hint}\n".encode())
+        os.write(2, f"{show_cursor}arcade-torch: {reason}; {_Process.hint}\n".encode())
     os._exit(EXIT_STOPPED)

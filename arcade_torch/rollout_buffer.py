@@ -1,5 +1,6 @@
 """The storage of a collector: one window of L = overlap + T steps, every frame written once."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any, Literal, cast
 
@@ -15,10 +16,10 @@ from arcade_torch.compiled import (
     STEP_COUNT,
     TERMINATED,
     TRUNCATED,
-    draws_in_place,
 )
-from arcade_torch.dlpack import TensorMemory, upload, write
+from arcade_torch.dlpack import is_host, upload
 from arcade_torch.env import Place
+from arcade_torch.frame_memory import Canvas, Reused, draws_in_place
 from arcade_torch.policies import path_of
 
 FinalFrames = Literal["all", "truncated", "none"]
@@ -29,6 +30,24 @@ _ROOT_COLUMNS: dict[str, torch.dtype] = {
     "step_count": torch.int64,
     "episode_reward": torch.float32,
 }
+
+
+class TensorMemory:
+    """Gives tensors, in memory of earlier ones that nobody can see any more; see ``Reused``."""
+
+    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
+        self._shape = shape
+        self._device = device
+        self._reused = Reused(most=2)  # what is in use, and the one before it
+        # under the last tensor, on the CPU: steps may draw into it
+        self.canvas: Canvas | None = None
+
+    def take(self) -> torch.Tensor:
+        """uint8 of the shape, with any content."""
+        if not is_host(self._device):  # torch's allocator for GPUs keeps memory by itself
+            return torch.empty(self._shape, dtype=torch.uint8, device=self._device)
+        self.canvas = self._reused.take(functools.partial(Canvas, self._shape))
+        return torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
 
 
 class RolloutBuffer:
@@ -143,8 +162,10 @@ class RolloutBuffer:
             rows, steps = np.nonzero(self._wanted)
             now = self._place_of(self._wanted, rows, steps)
             then = self._place_of(wanted, rows, steps + self.steps)
-            row, to, source = (upload(index, self.device) for index in (rows, now, then))
-            self._final[row, to] = final[row, source]
+            row = upload(rows, self.device)
+            target_place = upload(now, self.device)
+            source_place = upload(then, self.device)
+            self._final[row, target_place] = final[row, source_place]
         return self._first
 
     def place(self, step: int) -> Place | None:
@@ -152,34 +173,31 @@ class RolloutBuffer:
         before it.
         """
         canvas = self._new_pixels.canvas
+        if canvas is None or step == self.length:
+            return None
         config = cast(Any, jax.config)
-        if (
-            canvas is None
-            or step == self.length
-            or config.jax_disable_jit
-            or config.jax_debug_nans
-            or config.jax_debug_infs
-        ):
+        if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
             return None
         if not draws_in_place():
             return None
-        moved = self.pixels.data_ptr() != canvas.address  # by share_memory_
-        return None if moved else (canvas, step, self.pixels[:, step])
+        if self.pixels.data_ptr() != canvas.address:  # share_memory_ has moved it
+            return None
+        return canvas, step, self.pixels[:, step]
 
     def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
-        """Write what was seen and done. This copies the frames, unless they were drawn where they
-        belong.
+        """Write what was seen and done. Copy the frames, unless JAX has drawn them into the buffer
+        already.
         """
         target = self.pixels[:, step]
         if frames.data_ptr() != target.data_ptr():
             target.copy_(frames)
         if self._dense is not None and self._fills_dense and step > self._first:
             self._dense[:, step - 1].copy_(frames)
-        write(self._action, np.s_[:, step], action)
+        _write(self._action, np.s_[:, step], action)
 
     def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
         """Write what came of it, ``Step.numbers``."""
-        write(self._numbers, np.s_[:, step], numbers)
+        _write(self._numbers, np.s_[:, step], numbers)
 
     def write_extras(self, step: int, extras: Mapping[NestedKey, torch.Tensor]) -> None:
         """Write what the policy wants stored; space is made at the first step."""
@@ -218,12 +236,10 @@ class RolloutBuffer:
         numbers = self._numbers[:, before]
         self._root["last_action"][:, after] = self._action[:, before]
         self._root["is_init"][:, after] = done
-        self._root["step_count"][:, after] = (
-            numbers[..., STEP_COUNT].masked_fill(done, 0).to(torch.int64)
-        )
-        self._root["episode_reward"][:, after] = (
-            numbers[..., EPISODE_REWARD].view(torch.float32).masked_fill(done, 0)
-        )
+        step_count = numbers[..., STEP_COUNT].to(torch.int64)
+        self._root["step_count"][:, after] = step_count.masked_fill(done, 0)
+        episode_reward = numbers[..., EPISODE_REWARD].view(torch.float32)
+        self._root["episode_reward"][:, after] = episode_reward.masked_fill(done, 0)
         self._final[:, -1] = last
         if self._dense is not None and self._fills_dense:
             self._dense[:, -1] = last
@@ -232,9 +248,10 @@ class RolloutBuffer:
         flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
         terminated = flags[..., 0]
         truncated = flags[..., 1]
-        self._wanted[:, first:] = (
-            terminated | truncated if self.final_frames == "all" else truncated & ~terminated
-        )
+        if self.final_frames == "all":
+            self._wanted[:, first:] = terminated | truncated
+        else:
+            self._wanted[:, first:] = truncated & ~terminated
         if self._places > 1 and self._wanted[:, :-1].sum(1).max() >= self._places:
             raise RuntimeError(
                 "a game truncated an episode before its max_steps: collect with final_frames='all'"
@@ -249,9 +266,9 @@ class RolloutBuffer:
         """
         places = self._place_of(self._wanted, rows, steps)
         if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
-            write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
+            _write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
         if self.final_frames == "truncated":
-            write(self._final.flatten(0, 1), rows * self._places + places, frames)
+            _write(self._final.flatten(0, 1), rows * self._places + places, frames)
 
     def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """The places of the final observations of some envs and steps."""
@@ -274,12 +291,10 @@ class RolloutBuffer:
         index[rows, places] = steps
         mask[rows, places] = True
         used = upload(mask, self.device)
-        ended = (
-            self._numbers[:, -1, TERMINATED] > 0
-            if self.final_frames == "truncated"
-            else self.done[:, -1]
-        )
-        used[:, -1] = ~ended
+        if self.final_frames == "truncated":
+            used[:, -1] = self._numbers[:, -1, TERMINATED] == 0
+        else:
+            used[:, -1] = ~self.done[:, -1]
         out["final_pixels"] = self._final
         out["final_mask"] = used
         out["final_index"] = upload(index, self.device)
@@ -291,8 +306,8 @@ class RolloutBuffer:
         """
         size = [self.num_envs, self.steps]
         out = self._entries(self.overlap, size)
-        flags = torch.zeros((4, *size, 1), dtype=torch.bool, device=self.device)
-        out["done"], out["terminated"], out["truncated"], out["next", "is_init"] = flags
+        for key in ("done", "terminated", "truncated", ("next", "is_init")):
+            out[key] = torch.zeros((*size, 1), dtype=torch.bool, device=self.device)
         out["next", "last_action"] = out["action"]
         if self._task is not None:
             out["next", "task"] = out["task"]
@@ -318,8 +333,9 @@ class RolloutBuffer:
             ("next", "terminated"): numbers[..., TERMINATED, None] > 0,
             ("next", "truncated"): numbers[..., TRUNCATED, None] > 0,
             ("next", "done"): self.done[:, first:, None],
-            **{key: buffer[:, first:] for key, buffer in self._extras.items()},
         }
+        for key, buffer in self._extras.items():
+            entries[key] = buffer[:, first:]
         if self._task is not None:
             entries["task"] = self._task[:, first:]
         for key, value in entries.items():
@@ -328,31 +344,31 @@ class RolloutBuffer:
 
     def _buffers(self) -> dict[NestedKey, torch.Tensor]:
         """All buffers with axes [N, L, ...]."""
-        dense = (
-            {"dense": self._dense} if self._dense is not None and self.final_frames == "all" else {}
-        )
-        fixed = {
+        buffers: dict[NestedKey, torch.Tensor] = {
             "pixels": self.pixels,
             "action": self._action,
             "outcomes": self._numbers,
-            **self._root,
-            **dense,
         }
-        return {
-            **fixed,
-            **{("extras", *path_of(key)): buffer for key, buffer in self._extras.items()},
-        }
+        buffers.update(self._root)
+        if self._dense is not None and self.final_frames == "all":
+            buffers["dense"] = self._dense
+        for key, buffer in self._extras.items():
+            buffers["extras", *path_of(key)] = buffer
+        return buffers
+
+    def _overlap_buffers(self) -> dict[str, torch.Tensor]:
+        """The steps of all buffers that the next window begins with, by path; views."""
+        buffers = {}
+        for key, buffer in self._buffers().items():
+            buffers["/".join(path_of(key))] = buffer[:, self.steps :]
+        return buffers
 
     def overlap_state(self) -> dict[str, Any]:
         """What the next window needs of this one, as plain tensors: nothing without an overlap."""
         if not self.overlap:
             return {}
-        buffers = {
-            "/".join(path_of(key)): buffer[:, self.steps :].clone()
-            for key, buffer in self._buffers().items()
-        }
         return {
-            "buffers": buffers,
+            "buffers": {name: steps.clone() for name, steps in self._overlap_buffers().items()},
             "final": self._final.clone(),
             "wanted": torch.from_numpy(self._wanted).clone(),
         }
@@ -363,30 +379,36 @@ class RolloutBuffer:
         """
         if not state:
             return
-        for name, saved in state["buffers"].items():
-            parts = tuple(name.split("/"))
-            if parts[0] == "extras" and parts[1:] not in map(path_of, self._extras):
-                self._add_extra(
-                    parts[1:] if len(parts) > 2 else parts[1], saved.shape[2:], saved.dtype
-                )
+        for name, buffer in state["buffers"].items():
+            kind, *path = name.split("/")
+            if kind == "extras" and tuple(path) not in map(path_of, self._extras):
+                key = tuple(path) if len(path) > 1 else path[0]
+                self._add_extra(key, buffer.shape[2:], buffer.dtype)
         if self.final_frames == "all":
             self._dense = self._new_dense.take()
-        here = {
-            "/".join(path_of(key)): buffer[:, self.steps :]
-            for key, buffer in self._buffers().items()
-        }
-        here = {**here, "final": self._final}
-        there = {**state["buffers"], "final": state["final"]}
-        for name in here | there:
-            shapes = [tuple(each[name].shape) if name in each else None for each in (there, here)]
-            if shapes[0] != shapes[1]:
+        ours = {**self._overlap_buffers(), "final": self._final}
+        saved = {**state["buffers"], "final": state["final"]}
+        for name in ours | saved:
+            our_shape = tuple(ours[name].shape) if name in ours else None
+            saved_shape = tuple(saved[name].shape) if name in saved else None
+            if our_shape != saved_shape:
                 raise ValueError(
-                    f"saved overlap {name!r} is {shapes[0]}, this collector's {shapes[1]}"
+                    f"saved overlap {name!r} is {saved_shape}, this collector's {our_shape}"
                 )
-            here[name].copy_(there[name])
+            ours[name].copy_(saved[name])
         wanted = state["wanted"].cpu().numpy().copy()
         if (wanted.dtype, wanted.shape) != (self._wanted.dtype, self._wanted.shape):
             raise ValueError(
                 f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}"
             )
         self._wanted = wanted
+
+
+def _write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
+    """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's
+    price or less.
+    """
+    if is_host(target.device):
+        target.numpy()[index] = values.numpy()
+    else:
+        target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values

@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
-from arcade_torch.dlpack import to_torch, wait_for_torch
+from arcade_torch.devices import wait_for_torch
+from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch
 from arcade_torch.envs_jax.mixture import Batched
@@ -57,15 +58,16 @@ class Snapshots:
     def __init__(
         self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device
     ) -> None:
-        leaves, self._tree = jax.tree_util.tree_flatten_with_path(
-            jax.eval_shape(batched.wide, batch)
-        )
-        self._keys = [
-            tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/"))
-            for path, _ in leaves
-        ]
-        self._dtypes = [np.dtype(leaf.dtype) for _, leaf in leaves]
-        self._shapes = [torch.Size(leaf.shape) for _, leaf in leaves]
+        shapes = jax.eval_shape(batched.pad, batch)
+        leaves, self._tree = jax.tree_util.tree_flatten_with_path(shapes)
+        self._keys: list[tuple[str, ...]] = []
+        self._dtypes: list[np.dtype[Any]] = []
+        self._shapes: list[torch.Size] = []
+        for path, leaf in leaves:
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            self._keys.append(tuple(name.split("/")))
+            self._dtypes.append(np.dtype(leaf.dtype))
+            self._shapes.append(torch.Size(leaf.shape))
         self._num_envs = int(batch.step_count.shape[0])
         self._batched = batched
         self._game_id = batched.game.id
@@ -87,7 +89,8 @@ class Snapshots:
         """
         game = self._games.to(self._device, copy=True)
         out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
-        for key, array in zip(self._keys, jax.tree.leaves(self._batched.wide(batch)), strict=True):
+        leaves = jax.tree.leaves(self._batched.pad(batch))
+        for key, array in zip(self._keys, leaves, strict=True):
             tensor = to_torch(array, self._device)
             signed = _SIGNED.get(np.dtype(array.dtype))
             out[key] = (tensor if signed is None else tensor.view(signed)).clone()
@@ -113,15 +116,15 @@ class Snapshots:
             )
             same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
             if tensor.dtype not in same_bits or tensor.shape != shape:
-                found = str(tensor.dtype).removeprefix("torch.")
+                kind = str(tensor.dtype).removeprefix("torch.")
                 raise ValueError(
-                    f"state entry {name!r} is {found} {tuple(tensor.shape)}, {self._game_id} with "
+                    f"state entry {name!r} is {kind} {tuple(tensor.shape)}, {self._game_id} with "
                     f"{self._num_envs} "
                     f"envs expects {dtype} {tuple(shape)}"
                 )
             value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
             arrays.append(jax.device_put(value, self._jax_device))
-        return self._batched.narrow(jax.tree_util.tree_unflatten(self._tree, arrays))
+        return self._batched.unpad(jax.tree_util.tree_unflatten(self._tree, arrays))
 
     def _check_game(self, td: TensorDictBase) -> None:
         """Refuse the state of another game or of another number of envs."""
@@ -141,8 +144,8 @@ class Snapshots:
         differs = (game.cpu() != self._games).nonzero()
         if len(differs):
             env = int(differs[0])
-            known = {fingerprint(other): other for other in registered_ids()}
-            theirs = known.get(int(game[env]), "another game")
+            ids = {fingerprint(id): id for id in registered_ids()}
+            theirs = ids.get(int(game[env]), "another game")
             raise ValueError(
                 f"the state of env {env} is one of {theirs}, this env plays {self._game_id}"
             )

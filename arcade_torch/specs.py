@@ -1,40 +1,7 @@
-"""What an ``ArcadeEnv`` takes and gives: TorchRL specs, and the step without a tensordict."""
+"""TorchRL's specs of what an ``ArcadeEnv`` takes and gives."""
 
-from collections.abc import Collection
-from typing import Any, NamedTuple
-
-import jax
 import torch
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec, Unbounded
-
-from arcade_torch.compiled import EPISODE_REWARD, STEP_COUNT, TERMINATED
-
-
-class RawStep(NamedTuple):
-    """What one fused step gives."""
-
-    # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
-    pixels: torch.Tensor
-    numbers: torch.Tensor  # int32 [N, 5], see ``Step.numbers``
-    # the games' states before the resets, and who saw the partial view
-    final: tuple[Any, jax.Array]
-
-    def root_numbers(self, keys: Collection[str]) -> dict[str, torch.Tensor]:
-        """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if
-        asked for.
-        """
-        numbers = self.numbers
-        out = {}
-        done = numbers[:, TERMINATED:].any(-1, keepdim=True)
-        if "is_init" in keys:
-            out["is_init"] = done
-        if "step_count" in keys:
-            out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
-        if "episode_reward" in keys:
-            out["episode_reward"] = (
-                numbers[:, EPISODE_REWARD, None].view(torch.float32).masked_fill(done, 0)
-            )
-        return out
 
 
 def make_specs(

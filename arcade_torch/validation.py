@@ -7,10 +7,20 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 
 from arcade_torch.envs_jax.validation import format_value, plain
+
+# integers of torch: the type of numpy under which negative numbers are large
+_UNSIGNED = {
+    torch.int64: np.uint64,
+    torch.int32: np.uint32,
+    torch.int16: np.uint16,
+    torch.int8: np.uint8,
+    torch.uint8: np.uint8,
+}
 
 
 def check_flags(names: str, values: Sequence[Any]) -> None:
@@ -63,24 +73,53 @@ def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
             f"{', '.join(map(str, td.keys())) or 'none'}"
         )
     check_tensor(value, f"entry {key!r}")
-    found: torch.Tensor = value
-    return found
+    dense: torch.Tensor = value
+    return dense
 
 
-def check_tensor(value: Any, what: str) -> None:
-    """Raise TypeError unless ``value``, called ``what``, is a dense tensor."""
+def check_tensor(value: Any, name: str) -> None:
+    """Raise TypeError unless ``value``, called ``name``, is a dense tensor."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{what} is a {type(value).__name__}, expected a tensor")
+        raise TypeError(f"{name} is a {type(value).__name__}, expected a tensor")
     if value.layout is not torch.strided:
         raise TypeError(
-            f"{what} is a {value.layout} tensor, expected a dense one: pass .to_dense()"
+            f"{name} is a {value.layout} tensor, expected a dense one: pass .to_dense()"
         )
 
 
-def check_one_hot(action: torch.Tensor) -> None:
-    """Raise ValueError unless every row, rounded (a softmax may miss the 1), holds a single one
-    among zeros.
+def check_integers(
+    action: torch.Tensor, num_envs: int, num_actions: int, check_range: bool
+) -> None:
+    """Raise if actions are not integers [num_envs], or, where ``check_range`` is true, beyond
+    ``num_actions``.
     """
+    check_tensor(action, "action")
+    unsigned = _UNSIGNED.get(action.dtype)
+    if unsigned is None:
+        raise TypeError(f"action has dtype {action.dtype}, expected integers such as torch.int64")
+    shape = (num_envs,)
+    if action.shape != shape:
+        raise ValueError(
+            f"action has shape {tuple(action.shape)}, expected {shape}, one integer an env"
+        )
+    # Seen as unsigned, negative numbers are large: one comparison finds both kinds of error.
+    if check_range and action.cpu().numpy().view(unsigned).max() >= num_actions:
+        lowest = int(action.min())
+        highest = int(action.max())
+        raise ValueError(
+            f"actions range from {lowest} to {highest}, allowed: 0 to {num_actions - 1}"
+        )
+
+
+def check_one_hot(action: torch.Tensor, shape: tuple[int, int], check_values: bool) -> None:
+    """Raise if actions are not of a shape, or, where ``check_values`` is true, unless every row,
+    rounded (a softmax may miss the 1), holds a single one among zeros.
+    """
+    check_tensor(action, "action")
+    if action.shape != shape:
+        raise ValueError(f"action has shape {tuple(action.shape)}, expected one-hot {shape}")
+    if not check_values:
+        return
     rounded = action.to(torch.float32).round()
     ones = (rounded == 1).sum(-1)
     others = ((rounded != 0) & (rounded != 1)).any(-1)

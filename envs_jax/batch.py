@@ -99,7 +99,8 @@ class Steps(abc.ABC):
         self.render = compiled(self._render)
         self.reset_where = compiled(self._reset_where)
         self.reset_render = compiled(self._reset_render)
-        self.step_auto = compiled(self._step_auto)
+        self.step_autoreset = compiled(self._step_autoreset)
+        self.step_auto = self.step_autoreset  # the name until 0.2
         self.step_render = compiled(self._step_render)
 
     @abc.abstractmethod
@@ -138,7 +139,7 @@ class Steps(abc.ABC):
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""
 
-    def _step_auto(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
+    def _step_autoreset(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
         """Step, begin anew where an episode ended, then draw once.
 
         Returns:
@@ -193,12 +194,12 @@ class BatchedGame(Steps, Generic[State]):
         """The states of each game's own envs."""
         return (state,)
 
-    def wide(self, batch: Batch) -> Batch:
+    def pad(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...], which it has; see ``MixedGames``."""
         return batch
 
-    def narrow(self, batch: Batch) -> Batch:
-        """The inverse of ``wide``."""
+    def unpad(self, batch: Batch) -> Batch:
+        """The inverse of ``pad``."""
         return batch
 
     def without_ends(self, batch: Batch) -> Batch:

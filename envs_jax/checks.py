@@ -1,5 +1,5 @@
-"""Whether a game keeps the contract of ``Game``: shapes, types and structure, found out without
-compiling anything.
+"""Whether a game keeps the contract of ``Game``: shapes, types and structure, without compiling
+anything; on request also what random play shows.
 """
 
 from collections.abc import Callable
@@ -7,13 +7,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
 
-from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
+from arcade_torch.envs_jax.game import NUM_ACTIONS, Game, keeps_ends
+from arcade_torch.envs_jax.settings import compiled
 
 _OURS = "arcade_torch.envs_jax."
+_STEPS_TO_PLAY = 100  # a running episode is played to its end
+_STEPS_BEYOND = 3  # after an end
+_ROUNDING = 1e-4  # of a return
 
 
-def check_game(game: Game[Any]) -> None:
+def check_game(game: Game[Any], play: bool = False) -> None:
     """Refuse a game whose functions do not fit together, or whose frames nobody could use.
 
     Traces ``reset``, ``step`` and ``render`` once each, for shapes and types alone; that takes
@@ -22,15 +28,19 @@ def check_game(game: Game[Any]) -> None:
 
     Args:
         game: The game.
+        play: Play random steps too, to the end of an episode and beyond it, and draw both twins at
+            every step. That compiles ``reset`` and ``step``, and takes seconds.
 
     Raises:
         ValueError: A function cannot be traced, gives something of a wrong shape or type, or
             ``step`` changes the structure of the state; or an attribute is missing or of no use.
-            One line: the game, what arrived, what is wanted.
+            With ``play`` also: a code has no picture, a reward or a state entry is not a number, an
+            episode ends too late or is truncated too early, or a return is out of range. One line:
+            the game, what arrived, what is wanted.
 
     Example:
         >>> from arcade_torch.envs_jax import make
-        >>> check_game(make("MineSweeperEasy"))
+        >>> check_game(make("MineSweeperEasy"), play=True)
     """
     _check_attributes(game)
     name = game.id
@@ -47,12 +57,86 @@ def check_game(game: Game[Any]) -> None:
             f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated"
         )
     _check_state(name, first, stepped[0])
-    for what, value in zip(("reward", "terminated", "truncated"), stepped[1:], strict=True):
-        _check_array(
-            name, f"step gives {what} as", value, (), "float32" if what == "reward" else "bool"
-        )
+    _check_array(name, "step gives reward as", stepped[1], (), "float32")
+    _check_array(name, "step gives terminated as", stepped[2], (), "bool")
+    _check_array(name, "step gives truncated as", stepped[3], (), "bool")
     frame = _traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
     _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
+    if play:
+        _check_play(game)
+
+
+def _check_play(game: Game[Any]) -> None:
+    """Play episodes at random until enough steps have been played."""
+    reset = compiled(game.reset)
+    step = compiled(game.step)
+    steps = 0
+    episodes = 0
+    while steps < _STEPS_TO_PLAY:
+        steps += _check_episode(game, reset, step, seed=episodes)
+        episodes += 1
+
+
+def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> int:
+    """Play one episode at random, to the end and beyond; returns its length."""
+    actions = np.random.default_rng(seed)
+    state = reset(_key(seed, 0))
+    _check_frames(game, state, 0)
+    episode_return = 0.0
+    length = 0
+    done = False
+    while not done:
+        length += 1
+        action = actions.integers(NUM_ACTIONS, dtype=np.int32)
+        state, reward, terminated, truncated = step(_key(seed, length), state, action)
+        _check_numbers(game, state, reward, length)
+        _check_frames(game, state, length)
+        episode_return += float(reward)
+        done = bool(terminated) or bool(truncated)
+        if not done and length >= game.max_steps:
+            raise ValueError(
+                f"{game.id}: neither terminated nor truncated after {length} steps, and max_steps "
+                f"is {game.max_steps}"
+            )
+        if truncated and length < game.max_steps:
+            raise ValueError(
+                f"{game.id}: truncated after {length} steps, and max_steps is {game.max_steps}"
+            )
+    lowest, highest = game.return_range
+    if not lowest - _ROUNDING <= episode_return <= highest + _ROUNDING:
+        raise ValueError(
+            f"{game.id}: an episode returned {episode_return:.6g}, and return_range is "
+            f"{game.return_range}"
+        )
+    if keeps_ends(state):  # other states are not stepped any more
+        for beyond in range(length + 1, length + 1 + _STEPS_BEYOND):
+            action = actions.integers(NUM_ACTIONS, dtype=np.int32)
+            state = step(_key(seed, beyond), state, action)[0]
+            _check_frames(game, state, beyond)
+    return length
+
+
+def _key(seed: int, step: int) -> npt.NDArray[np.uint32]:
+    """A random key for one step of one episode."""
+    return np.array([seed, step], np.uint32)
+
+
+def _check_frames(game: Game[Any], state: Any, steps: int) -> None:
+    """Draw both twins, not compiled, so that ``Layers`` sees the codes."""
+    for partial in (False, True):
+        try:
+            game.render(state, jnp.bool_(partial))
+        except ValueError as error:
+            raise ValueError(f"{game.id}: render after {steps} steps: {error}") from error
+
+
+def _check_numbers(game: Game[Any], state: Any, reward: Any, step: int) -> None:
+    """Refuse a reward that is not finite, and a state with something that is not a number."""
+    if not np.isfinite(reward):
+        raise ValueError(f"{game.id}: step {step} gives the reward {float(reward)}")
+    for name, leaf in _leaves(state).items():
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and np.isnan(leaf).any():
+            raise ValueError(f"{game.id}: step {step} gives state entry {name} as nan")
 
 
 def check_made(game: Any, full_id: str, obs_size: int) -> None:
@@ -62,10 +146,10 @@ def check_made(game: Any, full_id: str, obs_size: int) -> None:
     if not isinstance(game, Game):
         raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
     if (game.id, game.obs_size) != (full_id, obs_size):
-        made = f"{game.id!r} with obs_size {game.obs_size!r}"
+        arrived = f"{game.id!r} with obs_size {game.obs_size!r}"
         raise ValueError(
-            f"the factory of {full_id} made {made}, wanted {full_id!r} with obs_size {obs_size}: "
-            "pass on both"
+            f"the factory of {full_id} made {arrived}, wanted {full_id!r} with obs_size "
+            f"{obs_size}: pass on both"
         )
     check_foreign(game)
 
@@ -85,10 +169,10 @@ def _check_attributes(game: Game[Any]) -> None:
         raise ValueError(
             f"{type(game).__name__}: id is {name!r}, wanted the versioned id, such as 'MineEasy-v0'"
         )
-    for what in ("obs_size", "max_steps"):
-        value = getattr(game, what, None)
+    for attribute in ("obs_size", "max_steps"):
+        value = getattr(game, attribute, None)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name}: {what} is {value!r}, wanted an int of 1 or more")
+            raise ValueError(f"{name}: {attribute} is {value!r}, wanted an int of 1 or more")
     limits = getattr(game, "return_range", None)
     if not isinstance(limits, tuple) or len(limits) != 2 or not limits[0] <= limits[1]:
         raise ValueError(f"{name}: return_range is {limits!r}, wanted (lowest, highest)")
@@ -99,7 +183,7 @@ def _check_attributes(game: Game[Any]) -> None:
         )
 
 
-def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
+def _traced(name: str, method: str, function: Callable[..., Any], *args: Any) -> Any:
     """What a function would give, by shapes and types."""
     try:
         return jax.eval_shape(function, *args)
@@ -111,7 +195,7 @@ def _traced(name: str, what: str, function: Callable[..., Any], *args: Any) -> A
             else ""
         )
         raise ValueError(
-            f"{name}: {what} cannot be traced by JAX, wanted a pure function of arrays{hint} "
+            f"{name}: {method} cannot be traced by JAX, wanted a pure function of arrays{hint} "
             f"({type(error).__name__}: {reason})"
         ) from error
 
@@ -128,7 +212,8 @@ def _check_array(name: str, what: str, value: Any, shape: tuple[int, ...], dtype
 
 def _check_state(name: str, first: Any, following: Any) -> None:
     """Refuse a step whose state has other leaves than that of reset."""
-    ours, theirs = (_leaves(state) for state in (first, following))
+    ours = _leaves(first)
+    theirs = _leaves(following)
     if not ours:
         raise ValueError(
             f"{name}: reset gives a state without any array, wanted a named tuple of arrays"
@@ -152,5 +237,5 @@ def _check_state(name: str, first: Any, following: Any) -> None:
 
 def _leaves(state: Any) -> dict[str, Any]:
     """The arrays of a state by name."""
-    found = jax.tree_util.tree_flatten_with_path(state)[0]
-    return {jax.tree_util.keystr(path).lstrip(".") or "state": leaf for path, leaf in found}
+    named = jax.tree_util.tree_flatten_with_path(state)[0]
+    return {jax.tree_util.keystr(path).lstrip(".") or "state": leaf for path, leaf in named}

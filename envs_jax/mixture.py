@@ -6,6 +6,7 @@ computed for the envs of another. Frames, rewards and counts of all come out as 
 game.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -51,8 +52,8 @@ class Mixture:
     @property
     def rules(self) -> str:
         """The rule set, ``"mixed"`` where the games differ in it."""
-        found = {str(game.rules) for game in self.games}
-        return found.pop() if len(found) == 1 else "mixed"
+        rules = {str(game.rules) for game in self.games}
+        return rules.pop() if len(rules) == 1 else "mixed"
 
     @property
     def max_steps(self) -> int:
@@ -62,8 +63,9 @@ class Mixture:
     @property
     def return_range(self) -> tuple[float, float]:
         """Lowest and highest return that an episode of any game can have."""
-        lows, highs = zip(*(game.return_range for game in self.games), strict=True)
-        return min(lows), max(highs)
+        lowest = min(game.return_range[0] for game in self.games)
+        highest = max(game.return_range[1] for game in self.games)
+        return lowest, highest
 
     def __repr__(self) -> str:
         """The games and their shares."""
@@ -101,8 +103,8 @@ class MixedGames(Steps):
         self.game = Mixture(tuple(games), shares)
         self.groups = tuple(BatchedGame(game) for game in games)
         super().__init__()
-        self.wide = compiled(self._wide)
-        self.narrow = compiled(self._narrow)
+        self.pad = compiled(self._pad)
+        self.unpad = compiled(self._unpad)
 
     def rows(self, num_envs: int) -> tuple[slice, ...]:
         """The envs of each game: contiguous, as the weights say, what is left over going to the
@@ -118,22 +120,23 @@ class MixedGames(Steps):
             ValueError: There are too few envs for every game to get one.
         """
         total = sum(self.game.weights)
-        ends = [-(-num_envs * shares // total) for shares in accumulate(self.game.weights)]
-        rows = tuple(slice(first, last) for first, last in zip([0, *ends], ends, strict=False))
-        for game, part in zip(self.game.games, rows, strict=True):
-            if part.start == part.stop:
+        rows = []
+        first = 0
+        for game, shares in zip(self.game.games, accumulate(self.game.weights), strict=True):
+            last = math.ceil(num_envs * shares / total)
+            if first == last:
                 raise ValueError(
                     f"num_envs is {num_envs}, too few for {self.game.id}: {game.id} would get no "
-                    "env, "
-                    f"{total} are enough"
+                    f"env, {total} are enough"
                 )
-        return rows
+            rows.append(slice(first, last))
+            first = last
+        return tuple(rows)
 
     def task(self, num_envs: int) -> npt.NDArray[np.int64]:
         """The index of the game that each env plays, int64 [num_envs]."""
-        return np.repeat(
-            np.arange(len(self.groups)), [part.stop - part.start for part in self.rows(num_envs)]
-        )
+        sizes = [rows.stop - rows.start for rows in self.rows(num_envs)]
+        return np.repeat(np.arange(len(self.groups)), sizes)
 
     def states(self, state: Any) -> tuple[Any, ...]:
         """The states of each game's own envs, in the order of the games."""
@@ -141,52 +144,59 @@ class MixedGames(Steps):
 
     def without_ends(self, batch: Batch) -> Batch:
         """See :meth:`Steps.without_ends`."""
-        return self._join(
-            [
-                group.without_ends(part)
-                for group, part in zip(self.groups, self._parts(batch), strict=True)
-            ]
-        )
+        running = []
+        for group, part in zip(self.groups, self._parts(batch), strict=True):
+            running.append(group.without_ends(part))
+        return self._join(running)
 
     def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
         """See :meth:`Steps.with_ends`."""
-        flags = [(terminated[rows], truncated[rows]) for rows in self.rows(len(batch.step_count))]
-        parts = zip(self.groups, self._parts(batch), flags, strict=True)
-        return self._join([group.with_ends(part, *part_flags) for group, part, part_flags in parts])
+        all_rows = self.rows(len(batch.step_count))
+        flagged = []
+        for group, part, rows in zip(self.groups, self._parts(batch), all_rows, strict=True):
+            flagged.append(group.with_ends(part, terminated[rows], truncated[rows]))
+        return self._join(flagged)
 
     def ends(self, batch: Batch) -> tuple[Array, Array]:
         """See :meth:`Steps.ends`."""
-        pairs = zip(self.groups, self._parts(batch), strict=True)
-        terminated, truncated = zip(*(group.ends(part) for group, part in pairs), strict=True)
+        terminated = []
+        truncated = []
+        for group, part in zip(self.groups, self._parts(batch), strict=True):
+            part_terminated, part_truncated = group.ends(part)
+            terminated.append(part_terminated)
+            truncated.append(part_truncated)
         return jnp.concatenate(terminated), jnp.concatenate(truncated)
 
     def _init(self, keys: Array, partial: Array) -> Batch:
         keys = raw_key(keys, ndim=2)
-        pairs = zip(self.groups, self.rows(len(keys)), strict=True)
-        return self._join(
-            [group.init(keys[rows], jnp.asarray(partial)[rows]) for group, rows in pairs]
-        )
+        partial = jnp.asarray(partial)
+        parts = []
+        for group, rows in zip(self.groups, self.rows(len(keys)), strict=True):
+            parts.append(group.init(keys[rows], partial[rows]))
+        return self._join(parts)
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        parts = self._split(batch, action)
-        stepped = [group.step(*part) for group, part in zip(self.groups, parts, strict=True)]
-        return self._join([one for one, _ in stepped]), _concatenate(
-            [outcome for _, outcome in stepped]
-        )
+        batches = []
+        outcomes = []
+        for group, part in zip(self.groups, self._split(batch, action), strict=True):
+            stepped, outcome = group.step(*part)
+            batches.append(stepped)
+            outcomes.append(outcome)
+        return self._join(batches), _concatenate(outcomes)
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
-        parts = self._split(batch, jnp.asarray(mask))
-        return self._join(
-            [group.reset_where(*part) for group, part in zip(self.groups, parts, strict=True)]
-        )
+        parts = []
+        for group, part in zip(self.groups, self._split(batch, jnp.asarray(mask)), strict=True):
+            parts.append(group.reset_where(*part))
+        return self._join(parts)
 
     def _render(self, batch: Batch) -> Array:
-        parts = self._split(batch, batch.partial)
-        return jnp.concatenate(
-            [group.render(part) for group, (part, _) in zip(self.groups, parts, strict=True)]
-        )
+        frames = []
+        for group, part in zip(self.groups, self._parts(batch), strict=True):
+            frames.append(group.render(part))
+        return jnp.concatenate(frames)
 
-    def _wide(self, batch: Batch) -> Batch:
+    def _pad(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...]: states of a game are zero in the envs that play
         another.
         """
@@ -194,23 +204,25 @@ class MixedGames(Steps):
         state = {}
         for game, rows in zip(self.game.games, self.rows(size), strict=True):
 
-            def widen(leaf: Array, rows: slice = rows) -> Array:
+            def padded(leaf: Array, rows: slice = rows) -> Array:
                 return jnp.zeros((size, *leaf.shape[1:]), leaf.dtype).at[rows].set(leaf)
 
-            state[game.id] = jax.tree.map(widen, batch.state[game.id])
+            state[game.id] = jax.tree.map(padded, batch.state[game.id])
         return batch._replace(state=state)
 
-    def _narrow(self, batch: Batch) -> Batch:
-        """The inverse of ``wide``."""
-        pairs = zip(self.game.games, self.rows(len(batch.step_count)), strict=True)
-        return batch._replace(
-            state={game.id: _rows_of(batch.state[game.id], rows) for game, rows in pairs}
-        )
+    def _unpad(self, batch: Batch) -> Batch:
+        """The inverse of ``pad``."""
+        state = {}
+        for game, rows in zip(self.game.games, self.rows(len(batch.step_count)), strict=True):
+            state[game.id] = _rows_of(batch.state[game.id], rows)
+        return batch._replace(state=state)
 
     def _split(self, batch: Batch, other: Array) -> list[tuple[Batch, Array]]:
         """The batch of each game, with its part of another array [N]."""
-        rows = self.rows(len(batch.step_count))
-        return [(part, other[own]) for part, own in zip(self._parts(batch), rows, strict=True)]
+        all_rows = self.rows(len(batch.step_count))
+        return [
+            (part, other[rows]) for part, rows in zip(self._parts(batch), all_rows, strict=True)
+        ]
 
     def _parts(self, batch: Batch) -> list[Batch]:
         """The batch of each game."""
@@ -221,9 +233,9 @@ class MixedGames(Steps):
     def _join(self, batches: Sequence[Batch]) -> Batch:
         """The batch of all games from that of each."""
         shared: Batch = _concatenate(_without_states(batches))
-        states = {
-            game.id: batch.state for game, batch in zip(self.game.games, batches, strict=True)
-        }
+        states = {}
+        for game, batch in zip(self.game.games, batches, strict=True):
+            states[game.id] = batch.state
         return shared._replace(state=states)
 
 

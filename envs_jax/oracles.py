@@ -5,6 +5,7 @@ only what the POMDP's frames have shown so far, and remembers it; it shows how m
 memory can recover.
 """
 
+import abc
 import math
 import time
 from typing import Any, Literal, NamedTuple, Protocol
@@ -20,6 +21,8 @@ from arcade_torch.envs_jax.validation import check_choice
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]
+Bools = npt.NDArray[np.bool_]
+Frames = npt.NDArray[np.uint8]
 
 
 class Player(Protocol):
@@ -32,6 +35,42 @@ class Player(Protocol):
 
     def act(self, seen: Any, is_init: npt.NDArray[np.bool_]) -> Actions:
         """Choose an action in every env."""
+
+
+class FramesPlayer(abc.ABC):
+    """A player that sees the frames of the POMDP twin and remembers what they have shown.
+
+    Args:
+        game: What to play.
+    """
+
+    def __init__(self, game: Any) -> None:
+        self.level = game.level
+        self.screen = game.screen
+        self._num_envs = -1
+
+    def act(self, seen: Frames, is_init: Bools) -> Actions:
+        """See :class:`Player`."""
+        if len(seen) != self._num_envs:
+            self.allocate(len(seen))
+            self._num_envs = len(seen)
+        return self.choose(seen, is_init).astype(np.int32)
+
+    @abc.abstractmethod
+    def allocate(self, num_envs: int) -> None:
+        """Make a memory for N envs, with any content."""
+
+    @abc.abstractmethod
+    def choose(self, frames: Frames, is_init: Bools) -> npt.NDArray[Any]:
+        """Choose an action in every env.
+
+        Args:
+            frames: uint8 [N, S, S, 3].
+            is_init: bool [N], where an episode begins, and the memory is to be forgotten.
+
+        Returns:
+            Whole numbers [N].
+        """
 
 
 class Episodes(NamedTuple):

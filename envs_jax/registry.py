@@ -72,10 +72,11 @@ def register(
             f"id {id!r} is registered already: raise its version or choose another name"
         )
     names = dict.fromkeys((match["name"], *aliases), match["name"])
-    for each, name in names.items():
-        if (owner := _ALIASES.get(each.partition("-v")[0], name)) != name:
+    for alias, name in names.items():
+        owner = _ALIASES.get(alias.partition("-v")[0], name)
+        if owner != name:
             raise ValueError(
-                f"the name {each!r} belongs to the game {owner!r} already: choose another"
+                f"the name {alias!r} belongs to the game {owner!r} already: choose another"
             )
     _ENTRIES[id] = _Entry(factory, probe)
     _ALIASES.update(names)
@@ -144,9 +145,9 @@ def resolve_id(id: str) -> str:
         raise ValueError(
             f"unknown version in env id {format_value(id)}: the newest is {newest[name]!r}"
         )
-    known = {known.lower(): known for known in _ALIASES}
-    near = difflib.get_close_matches(name.lower(), list(known), n=1, cutoff=0.4)
-    hint = f"did you mean {known[near[0]]!r}? " if near else ""
+    names = {alias.lower(): alias for alias in _ALIASES}
+    near = difflib.get_close_matches(name.lower(), list(names), n=1, cutoff=0.4)
+    hint = f"did you mean {names[near[0]]!r}? " if near else ""
     raise ValueError(
         f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or "
         "'arcade-torch list'; a "

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax import Game, register
 from arcade_torch.envs_jax import render as draw
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, Array, Rules
 from arcade_torch.envs_jax.render.canvas import Picture
 from arcade_torch.envs_jax.render.palette import (

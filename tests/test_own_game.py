@@ -46,9 +46,9 @@ def way(start: int, goal: int) -> list[int]:
 
 
 def test_the_file_is_short_and_keeps_the_contract(pairs: Any) -> None:
-    assert len(FILE.read_text().splitlines()) < 100
+    assert len(FILE.read_text().splitlines()) < 150
     for size in (128, 256):
-        check_game(make("PairsEasy", obs_size=size))
+        check_game(make("PairsEasy", obs_size=size), play=True)
 
 
 def test_whoever_remembers_finds_all_pairs_and_two_that_differ_are_turned_back(pairs: Any) -> None:

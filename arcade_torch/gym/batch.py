@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.compiled import CompiledGame, FinalObservations, FrameMemory
+from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.final_observations import FinalObservations
+from arcade_torch.frame_memory import FrameMemory
 from arcade_torch.process import check_process
 
 Bools = npt.NDArray[np.bool_]
@@ -52,7 +54,7 @@ def seed_keys(seed: int | Sequence[int] | npt.NDArray[Any], num_envs: int) -> ja
         return env_keys(seed, num_envs)
     if len(seed) != num_envs:
         raise ValueError(f"{len(seed)} seeds for {num_envs} envs: give one seed, or one an env")
-    return jnp.concatenate([env_keys(each, 1) for each in seed])
+    return jnp.concatenate([env_keys(env_seed, 1) for env_seed in seed])
 
 
 class NumpyBatch:

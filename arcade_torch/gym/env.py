@@ -68,7 +68,10 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         ((128, 128, 3), 1)
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS,
+    }
 
     def __init__(
         self,

@@ -95,7 +95,7 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         self.num_envs = num_envs
         self.render_mode = render_mode
         mode = getattr(autoreset_mode, "value", autoreset_mode)
-        check_choice("autoreset_mode", mode, tuple(each.value for each in AutoresetMode))
+        check_choice("autoreset_mode", mode, tuple(one.value for one in AutoresetMode))
         self.autoreset_mode = AutoresetMode(mode)
         self._copy = copy
         self.metadata = {

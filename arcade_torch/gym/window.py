@@ -38,7 +38,8 @@ class Window:
     def show(self, frame: npt.NDArray[np.uint8], title: str) -> None:
         """Show a frame, uint8 [H, W, 3], under a title."""
         pygame = self.pygame
-        height, width = (side * self._scale for side in frame.shape[:2])
+        height = frame.shape[0] * self._scale
+        width = frame.shape[1] * self._scale
         if self._screen is None:
             if Window._shown() is not None:
                 raise RuntimeError(

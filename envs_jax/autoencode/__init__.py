@@ -4,9 +4,8 @@ from typing import ClassVar
 
 from arcade_torch.envs_jax.autoencode import rules
 from arcade_torch.envs_jax.autoencode.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.autoencode.params import LEVELS, Params
-from arcade_torch.envs_jax.autoencode.picture import Screen
-from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
+from arcade_torch.envs_jax.autoencode.renderer import Screen
+from arcade_torch.envs_jax.autoencode.rules import LEVELS, AutoEncodeState, Params
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 

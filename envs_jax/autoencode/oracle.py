@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.autoencode.params import SUITS
+from arcade_torch.envs_jax.autoencode.rules import SUITS
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UP
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
 from arcade_torch.envs_jax.render.suits import NO_CARD
 
 
@@ -39,32 +40,29 @@ class StateOracle:
         )
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: pushes every card it is shown, pops one with every answer; loses
     nothing.
     """
 
     def __init__(self, game: Any) -> None:
-        self.screen = game.screen
+        super().__init__(game)
         self.cards = game.level.cards
         self.rules = game.rules
-        self.stack: npt.NDArray[np.int64] = np.zeros((0, 0), np.int64)
-        self.seen: npt.NDArray[np.int64] = np.zeros(0, np.int64)  # cards shown so far
-        self.left: npt.NDArray[np.int64] = np.zeros(0, np.int64)  # cards shown and not yet named
 
-    def act(
-        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        envs = np.arange(len(seen))
-        if len(self.stack) != len(seen):
-            self.stack = np.zeros((len(seen), self.cards), np.int64)
-            self.seen = np.zeros_like(envs)
-            self.left = np.zeros_like(envs)
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
+        self.stack = np.zeros((num_envs, self.cards), np.int64)
+        self.seen = np.zeros(num_envs, np.int64)  # cards shown so far
+        self.left = np.zeros(num_envs, np.int64)  # cards shown and not yet named
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
+        envs = np.arange(len(frames))
         self.seen[is_init] = 0
         self.left[is_init] = 0
-        card = self.screen.card.read(seen)
-        selected = self.screen.selector.read(seen) - 1
+        card = self.screen.card.read(frames)
+        selected = self.screen.selector.read(frames) - 1
         watching = card != NO_CARD
         self.stack[envs[watching], self.seen[watching]] = card[watching] - 1
         self.seen += watching
@@ -76,4 +74,4 @@ class FramesOracle:
         if self.rules == "reference":  # the first step without a card answers, whatever the action
             answers |= ~watching & (self.left == self.cards)
         self.left -= answers
-        return action.astype(np.int32)
+        return action

@@ -2,13 +2,38 @@
 first.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.autoencode.params import SUITS, Params
 from arcade_torch.envs_jax.cards import deal
 from arcade_torch.envs_jax.game import FIRE, LEFT, RIGHT, UNSET, Array, Rules
+
+SUITS = 4
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty.
+
+    Attributes:
+        cards: Cards to watch and to give back; a right answer pays ``1 / cards``.
+    """
+
+    cards: int
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit in steps."""
+        return 10 * self.cards
+
+
+LEVELS = {
+    "AutoEncodeEasy": Params(26),
+    "AutoEncodeMedium": Params(52),
+    "AutoEncodeHard": Params(78),
+}
 
 
 class AutoEncodeState(NamedTuple):

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 from arcade_torch.envs_jax.battleship import rules
 from arcade_torch.envs_jax.battleship.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.battleship.params import LEVELS, Params
-from arcade_torch.envs_jax.battleship.picture import Screen
-from arcade_torch.envs_jax.battleship.rules import BattleShipState
+from arcade_torch.envs_jax.battleship.renderer import Screen
+from arcade_torch.envs_jax.battleship.rules import LEVELS, BattleShipState, Params
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 

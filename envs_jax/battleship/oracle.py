@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.battleship.params import SHIPS
-from arcade_torch.envs_jax.battleship.picture import HIT, KINDS
-from arcade_torch.envs_jax.minesweeper.oracle import towards
+from arcade_torch.envs_jax.battleship.renderer import HIT, KINDS
+from arcade_torch.envs_jax.battleship.rules import SHIPS
+from arcade_torch.envs_jax.boards import towards
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
 
 Board = npt.NDArray[Any]
 UNKNOWN = -1
@@ -42,7 +43,7 @@ class StateOracle:
         return towards(seen.x, seen.y, goal // self.side, goal % self.side)
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: remembers every mark and fires where a ship is likely and near.
 
     The score of a cell counts the straight places of every ship that hold the cell and no known
@@ -56,41 +57,40 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any, boost: float = 4.0) -> None:
-        self.screen = game.screen
-        self.side = game.level.side
+        super().__init__(game)
         self.boost = boost
-        self.known: npt.NDArray[np.int64] = np.zeros((0, 0, 0), np.int64)
 
-    def act(
-        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        side = self.side
-        envs = np.arange(len(seen))
-        if len(self.known) != len(seen):
-            self.known = np.full((len(seen), side, side), UNKNOWN)
-        self.known[is_init] = UNKNOWN
-        codes = self.screen.board.read(seen, side, side).swapaxes(1, 2)  # [N, column, row]
-        cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
+        side = self.level.side
+        self.marks = np.full((num_envs, side, side), UNKNOWN)
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
+        side = self.level.side
+        envs = np.arange(len(frames))
+        self.marks[is_init] = UNKNOWN
+        codes = self.screen.board.read(frames, side, side).swapaxes(1, 2)  # [N, column, row]
+        cursor = (codes >= KINDS).reshape(len(frames), -1).argmax(1)
         x = cursor // side
         y = cursor % side
         mark = codes[envs, x, y] - KINDS
-        self.known[envs, x, y] = np.where(mark == 0, self.known[envs, x, y], mark == HIT)
+        self.marks[envs, x, y] = np.where(mark == 0, self.marks[envs, x, y], mark == HIT)
 
-        value = ship_scores(self.known, self.boost) / (1 + distances(x, y, side)) ** 2
-        goal = np.where(self.known == UNKNOWN, value, -1).reshape(len(seen), -1).argmax(1)
+        value = ship_scores(self.marks, self.boost) / (1 + distances(x, y, side)) ** 2
+        goal = np.where(self.marks == UNKNOWN, value, -1).reshape(len(frames), -1).argmax(1)
         return towards(x, y, goal // side, goal % side)
 
 
-def ship_scores(known: npt.NDArray[np.int64], boost: float) -> npt.NDArray[np.float64]:
+def ship_scores(marks: npt.NDArray[np.int64], boost: float) -> npt.NDArray[np.float64]:
     """How well ships fit onto each cell of boards of ``UNKNOWN``, ``WATER`` and ``SHIP``: float64
     [N, side, side].
 
     A known ship cell multiplies the weight of a place by ``boost``.
     """
-    score = np.zeros(known.shape)
+    score = np.zeros(marks.shape)
     for turned in (False, True):
-        board = known.swapaxes(1, 2) if turned else known
+        board = marks.swapaxes(1, 2) if turned else marks
         total = score.swapaxes(1, 2) if turned else score
         side = board.shape[1]
         for length in SHIPS:

@@ -2,6 +2,7 @@
 [x, y].
 """
 
+from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 from typing import NamedTuple
@@ -9,9 +10,36 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, SHIPS, Params
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
+
+SHIPS = (2, 3, 3, 4)  # lengths, in the order of placement
+SHIP_CELLS = sum(SHIPS)  # hitting one pays 1 / SHIP_CELLS
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty."""
+
+    side: int  # cells per side of the sea
+
+    @property
+    def cells(self) -> int:
+        """Cells of the sea."""
+        return self.side**2
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit in steps."""
+        return 2 * self.cells
+
+    @property
+    def max_repeats(self) -> int:
+        """Shots at cells shot at before that end the game; each pays ``-2 / cells``."""
+        return self.cells // 2
+
+
+LEVELS = {"BattleShipEasy": Params(8), "BattleShipMedium": Params(10), "BattleShipHard": Params(12)}
 
 
 class BattleShipState(NamedTuple):
@@ -104,12 +132,12 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
-    here = cell_mask(state.x, state.y, level.side)
-    shot_before = jnp.any(here & (state.guesses == 1))
-    hit = fire & ~shot_before & jnp.any(here & (state.board == 1))
+    at_cursor = cell_mask(state.x, state.y, level.side)
+    shot_before = jnp.any(at_cursor & (state.guesses == 1))
+    hit = fire & ~shot_before & jnp.any(at_cursor & (state.board == 1))
     again = fire & shot_before
 
-    guesses = jnp.where(here & fire, jnp.int8(1), state.guesses)
+    guesses = jnp.where(at_cursor & fire, jnp.int8(1), state.guesses)
     hits = state.hits + hit
     repeats = state.repeats + again
     new = BattleShipState(x, y, state.board, guesses, hits, repeats, state.timestep + 1)

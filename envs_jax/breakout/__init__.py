@@ -4,9 +4,8 @@ from typing import ClassVar
 
 from arcade_torch.envs_jax.breakout import rules
 from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.breakout.params import LEVELS, MAX_STEPS, Params
-from arcade_torch.envs_jax.breakout.picture import TAILS, Screen, Tail
-from arcade_torch.envs_jax.breakout.rules import BreakoutState
+from arcade_torch.envs_jax.breakout.renderer import TAILS, Screen, Tail
+from arcade_torch.envs_jax.breakout.rules import LEVELS, MAX_STEPS, BreakoutState, Params
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.validation import check_choice
 

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.breakout import rules
-from arcade_torch.envs_jax.breakout.params import (
+from arcade_torch.envs_jax.breakout.renderer import BALL, KINDS
+from arcade_torch.envs_jax.breakout.rules import (
     COLUMNS,
     PADDLE_ROW,
     ROWS,
@@ -16,7 +17,6 @@ from arcade_torch.envs_jax.breakout.params import (
     WALL_TOP,
     Params,
 )
-from arcade_torch.envs_jax.breakout.picture import BALL, KINDS
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
 from arcade_torch.envs_jax.settings import compiled, fixed
 
@@ -65,7 +65,7 @@ class FramesOracle:
         kinds = codes % KINDS
         marks = codes // KINDS
         ball = (marks == BALL).reshape(len(seen), -1)
-        shown = ball.any(1)
+        visible = ball.any(1)
         cell = ball.argmax(1)
         x = cell % COLUMNS
         y = cell // COLUMNS
@@ -84,13 +84,13 @@ class FramesOracle:
         belief = self.belief
         # At first sight the ball is taken to make for the nearer wall; the second tells.
         guess = np.where(x * 2 >= COLUMNS, rules.UP_RIGHT, rules.UP_LEFT)
-        wrong = shown & ((x != belief.ball_x) | (y != belief.ball_y))
+        wrong = visible & ((x != belief.ball_x) | (y != belief.ball_y))
         turned = np.where(
             is_init, guess, np.where(wrong, belief.ball_dir ^ rules.SIDEWAYS, belief.ball_dir)
         )
         self.belief = belief._replace(
-            ball_x=np.where(shown, x, belief.ball_x).astype(np.int32),
-            ball_y=np.where(shown, y, belief.ball_y).astype(np.int32),
+            ball_x=np.where(visible, x, belief.ball_x).astype(np.int32),
+            ball_y=np.where(visible, y, belief.ball_y).astype(np.int32),
             ball_dir=turned.astype(np.int32),
             pos=pos.astype(np.int32),
             bricks=bricks,

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 from arcade_torch.envs_jax.cartpole import rules
 from arcade_torch.envs_jax.cartpole.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.cartpole.params import LEVELS, Params
-from arcade_torch.envs_jax.cartpole.picture import ARROWS, Arrow, Screen
-from arcade_torch.envs_jax.cartpole.rules import CartPoleState
+from arcade_torch.envs_jax.cartpole.renderer import ARROWS, Arrow, Screen
+from arcade_torch.envs_jax.cartpole.rules import LEVELS, CartPoleState, Params
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.validation import check_choice
 

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.cartpole import rules
-from arcade_torch.envs_jax.cartpole.params import START, THETA_LIMIT, X_LIMIT
-from arcade_torch.envs_jax.cartpole.picture import LINEAR_TOP, LOG_CLASSES
+from arcade_torch.envs_jax.cartpole.renderer import LINEAR_TOP, LOG_CLASSES
+from arcade_torch.envs_jax.cartpole.rules import START, THETA_LIMIT, X_LIMIT
 from arcade_torch.envs_jax.game import LEFT, RIGHT, Array
 from arcade_torch.envs_jax.settings import compiled, fixed
 

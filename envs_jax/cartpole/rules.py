@@ -4,24 +4,42 @@ Source: Barto, Sutton and Anderson (1983), the equations of Gymnasium's CartPole
 of POPGym Arcade (ICML 2026).
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cartpole.params import (
-    FORCE,
-    GRAVITY,
-    HALF_POLE,
-    POLE_MASS,
-    START,
-    TAU,
-    THETA_LIMIT,
-    TOTAL_MASS,
-    X_LIMIT,
-    Params,
-)
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
+
+GRAVITY = 9.8  # m/s^2
+CART_MASS = 1.0  # kg
+POLE_MASS = 0.1  # kg
+TOTAL_MASS = CART_MASS + POLE_MASS
+HALF_POLE = 0.5  # m
+FORCE = 10.0  # N
+TAU = 0.02  # s, one step
+X_LIMIT = 2.4  # m
+THETA_LIMIT = 12 * 2 * 3.141592653589793 / 360  # rad
+START = 0.05  # all four variables start uniformly in [-START, START]
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty."""
+
+    max_steps: int  # time limit in steps; each survived step pays ``1 / max_steps``
+    sigma: float = 0.0  # standard deviation of the noise on what is drawn (m, m/s, rad, rad/s)
+
+
+LEVELS = {
+    "CartPoleEasy": Params(200),
+    "CartPoleMedium": Params(400),
+    "CartPoleHard": Params(600),
+    "NoisyCartPoleEasy": Params(200, 0.1),
+    "NoisyCartPoleMedium": Params(200, 0.2),
+    "NoisyCartPoleHard": Params(200, 0.3),
+}
 
 
 class CartPoleState(NamedTuple):

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 from arcade_torch.envs_jax.countrecall import rules
 from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.countrecall.params import LEVELS, MOVE_BUDGET, Params
-from arcade_torch.envs_jax.countrecall.picture import Screen
-from arcade_torch.envs_jax.countrecall.rules import CountRecallState
+from arcade_torch.envs_jax.countrecall.renderer import Screen
+from arcade_torch.envs_jax.countrecall.rules import LEVELS, MOVE_BUDGET, CountRecallState, Params
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 
 # the counter of the reference, which is not held, then stays within three digits

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, UP
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
 from arcade_torch.envs_jax.render.suits import NO_CARD
 
 Ints = npt.NDArray[np.int64]
@@ -37,7 +38,7 @@ def best_plan(wanted: Ints, budget: int) -> Ints:
         int64 [N, turns]: the value to show in each turn, ``SKIP`` where any will do.
     """
     envs, turns = wanted.shape
-    every = np.arange(envs)
+    env = np.arange(envs)
     values = np.arange(wanted.max() + 1)
     cost = np.full((turns + 1, envs, turns + 1, len(values)), NEVER, np.int16)
     cost[0, :, 0] = values
@@ -45,14 +46,14 @@ def best_plan(wanted: Ints, budget: int) -> Ints:
         goal = wanted[:, t]
         way = np.abs(values - goal[:, None])[:, None, :]
         cost[t + 1] = cost[t]
-        cost[t + 1, :, 1:] = np.minimum(cost[t, :, 1:], cost[t, every, :-1, goal][:, :, None] + way)
+        cost[t + 1, :, 1:] = np.minimum(cost[t, :, 1:], cost[t, env, :-1, goal][:, :, None] + way)
 
     reached = cost[turns].min(2) <= budget
     right = turns - reached[:, ::-1].argmax(1)
-    value = cost[turns, every, right].argmin(1)
+    value = cost[turns, env, right].argmin(1)
     plan = np.full((envs, turns), SKIP)
     for t in reversed(range(turns)):
-        answered = cost[t, every, right, value] > cost[t + 1, every, right, value]
+        answered = cost[t, env, right, value] > cost[t + 1, env, right, value]
         plan[answered, t] = wanted[answered, t]
         value = np.where(answered, wanted[:, t], value)
         right = right - answered
@@ -61,15 +62,15 @@ def best_plan(wanted: Ints, budget: int) -> Ints:
 
 def towards(answer: npt.NDArray[Any], goal: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     """Move the counter to a goal, confirm where it is there or the goal is ``SKIP``."""
-    there = (goal == SKIP) | (goal == answer)
-    return np.where(there, FIRE, np.where(goal > answer, UP, DOWN)).astype(np.int32)
+    confirms = (goal == SKIP) | (goal == answer)
+    return np.where(confirms, FIRE, np.where(goal > answer, UP, DOWN)).astype(np.int32)
 
 
 class StateOracle:
     """Sees both packs, future turns included: reaches the highest return that the step limit
     leaves.
 
-    That is 1 for every deal on Easy and for most on Medium, but for a minority on Hard; the mean is
+    That is 1 for env deal on Easy and for most on Medium, but for a minority on Hard; the mean is
     near 0.96 there.
     """
 
@@ -88,7 +89,7 @@ class StateOracle:
         return towards(seen.answer, self.plan[np.arange(len(turn)), turn])
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: counts the cards of each suit as they are dealt.
 
     It always knows the right answer. What it cannot know is which answers will be asked for, and so
@@ -97,35 +98,29 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any) -> None:
-        self.screen = game.screen
-        self.level = game.level
+        super().__init__(game)
         self.budget = game.move_budget
-        self.counts: Ints = np.zeros((0, 0), np.int64)  # cards dealt before, by suit
-        self.turns: Ints = np.zeros(0, np.int64)  # turns left, this one included
-        self.moves: Ints = np.zeros(0, np.int64)  # counter moves left
-        self.goal: Ints = np.zeros(0, np.int64)
-        self.fresh: npt.NDArray[np.bool_] = np.zeros(0, bool)  # whether this frame begins a turn
 
-    def act(
-        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        envs = np.arange(len(seen))
-        if len(self.goal) != len(seen):
-            self.counts = np.zeros((len(seen), self.level.suits), np.int64)
-            self.turns, self.moves, self.goal = np.zeros((3, len(seen)), np.int64)
-            self.fresh = np.ones(len(seen), bool)
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
+        self.counts = np.zeros((num_envs, self.level.suits), np.int64)  # cards dealt, by suit
+        self.turns = np.zeros(num_envs, np.int64)  # turns left, this one included
+        self.moves = np.zeros(num_envs, np.int64)  # counter moves left
+        self.goal = np.zeros(num_envs, np.int64)
+        self.fresh = np.ones(num_envs, bool)  # whether this frame begins a turn
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
+        envs = np.arange(len(frames))
         self.counts[is_init] = 0
-        self.turns[is_init], self.moves[is_init], self.fresh[is_init] = (
-            self.level.cards,
-            self.budget,
-            True,
-        )
+        self.turns[is_init] = self.level.cards
+        self.moves[is_init] = self.budget
+        self.fresh[is_init] = True
 
         screen = self.screen
-        card = screen.card.read(seen)
-        query = screen.query.read(seen)
-        answer = screen.counter.read(seen) + screen.counter_range[0]
+        card = screen.card.read(frames)
+        query = screen.query.read(frames)
+        answer = screen.counter.read(frames) + screen.counter_range[0]
         wanted = self.counts[envs, np.maximum(query - 1, 0)]
         distance = np.abs(wanted - answer)
         reach = 3.5 * self.moves / np.maximum(self.turns, 1) + 0.5

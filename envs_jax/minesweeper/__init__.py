@@ -5,9 +5,8 @@ from typing import ClassVar
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.minesweeper import rules
 from arcade_torch.envs_jax.minesweeper.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.minesweeper.params import LEVELS, Params
-from arcade_torch.envs_jax.minesweeper.picture import Screen
-from arcade_torch.envs_jax.minesweeper.rules import MineSweeperState
+from arcade_torch.envs_jax.minesweeper.renderer import Screen
+from arcade_torch.envs_jax.minesweeper.rules import LEVELS, MineSweeperState, Params
 from arcade_torch.envs_jax.validation import check_penalty
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.minesweeper.picture import KINDS
+from arcade_torch.envs_jax.boards import towards
+from arcade_torch.envs_jax.minesweeper.renderer import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_SAFE
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
 
 Board = npt.NDArray[Any]
 
@@ -21,15 +22,6 @@ def snake(side: int) -> npt.NDArray[np.int64]:
     return np.array(
         [(x if y % 2 == 0 else side - 1 - x, y) for y in range(side) for x in range(side)]
     )
-
-
-def towards(x: Board, y: Board, goal_x: Board, goal_y: Board) -> npt.NDArray[np.int32]:
-    """The move that brings each cursor nearer to its goal, first sideways; ``FIRE`` where it is
-    there.
-    """
-    sideways = np.where(goal_x > x, RIGHT, LEFT)
-    along = np.where(goal_y > y, DOWN, UP)
-    return np.where(goal_x != x, sideways, np.where(goal_y != y, along, FIRE)).astype(np.int32)
 
 
 class StateOracle:
@@ -60,7 +52,7 @@ class StateOracle:
         return towards(seen.x, seen.y, goal[:, 0], goal[:, 1])
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: remembers every number seen and infers where mines may lie.
 
     Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen
@@ -74,33 +66,32 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any, rounds: int = 30) -> None:
-        self.screen = game.screen
-        self.level = game.level
+        super().__init__(game)
         self.rounds = rounds
-        self.known: npt.NDArray[np.int64] = np.zeros((0, 0, 0), np.int64)
 
-    def act(
-        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
         side = self.level.side
-        envs = np.arange(len(seen))
-        if len(self.known) != len(seen):
-            self.known = np.full((len(seen), side, side), -1)
-        self.known[is_init] = -1
-        codes = self.screen.board.read(seen, side, side)  # [N, row, column]
-        cursor = (codes >= KINDS).reshape(len(seen), -1).argmax(1)
+        self.numbers = np.full((num_envs, side, side), -1)  # numbers, -1 where none was seen
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
+        side = self.level.side
+        envs = np.arange(len(frames))
+        self.numbers[is_init] = -1
+        codes = self.screen.board.read(frames, side, side)  # [N, row, column]
+        cursor = (codes >= KINDS).reshape(len(frames), -1).argmax(1)
         y = cursor // side
         x = cursor % side
         number = codes[envs, y, x] - KINDS - 1
-        self.known[envs, y, x] = np.maximum(number, self.known[envs, y, x])
+        self.numbers[envs, y, x] = np.maximum(number, self.numbers[envs, y, x])
 
-        covered = self.known < 0
-        risk = np.where(covered, mine_chances(self.known, self.level.mines, self.rounds), np.inf)
+        covered = self.numbers < 0
+        risk = np.where(covered, mine_chances(self.numbers, self.level.mines, self.rounds), np.inf)
         rows, columns = np.mgrid[:side, :side]
         distance = np.abs(rows - y[:, None, None]) + np.abs(columns - x[:, None, None])
         cost = np.where(risk < 0.02, 0.0, risk) + 1e-3 * distance
-        goal = cost.reshape(len(seen), -1).argmin(1)
+        goal = cost.reshape(len(frames), -1).argmin(1)
         return towards(x, y, goal % side, goal // side)
 
 
@@ -112,23 +103,25 @@ def block_sum(values: Board) -> Board:
     return total
 
 
-def mine_chances(known: npt.NDArray[np.int64], mines: int, rounds: int) -> npt.NDArray[np.float64]:
+def mine_chances(
+    numbers: npt.NDArray[np.int64], mines: int, rounds: int
+) -> npt.NDArray[np.float64]:
     """Chance of a mine in each covered cell, fitted to the numbers seen: float64 [N, side, side], 0
     in swept cells.
 
-    ``known``, int64 [N, side, side], is the number of each swept cell, -1 where covered.
+    ``numbers``, int64 [N, side, side], is the number of each swept cell, -1 where covered.
     """
-    covered: Board = known < 0
+    covered: Board = numbers < 0
     count = np.maximum(covered.sum((1, 2), keepdims=True), 1)
     chance: npt.NDArray[np.float64] = covered * np.minimum(mines / count, 1.0)
     for _ in range(rounds):
         expected = block_sum(chance)
-        factor = np.where(~covered, known / np.maximum(expected, 1e-9), 1.0)
+        factor = np.where(~covered, numbers / np.maximum(expected, 1e-9), 1.0)
         log_factor = np.where(~covered, np.log(np.clip(factor, 1e-6, 1e6)), 0.0)
         # Every cell moves by the mean wish of the numbers around it, except that a 0 decides alone.
         near = np.maximum(block_sum((~covered).astype(float)), 1.0)
         chance = covered * np.clip(chance * np.exp(block_sum(log_factor) / near), 0.0, 1.0)
-        chance[block_sum(((known == 0) & ~covered).astype(float)) > 0] = 0.0
+        chance[block_sum(((numbers == 0) & ~covered).astype(float)) > 0] = 0.0
         chance *= (
             np.clip(mines / np.maximum(chance.sum((1, 2), keepdims=True), 1e-9), 0.5, 2.0) ** 0.5
         )

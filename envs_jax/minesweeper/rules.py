@@ -1,14 +1,49 @@
 """The rules of MineSweeper: a cursor sweeps cells one by one; boards are indexed [x, y]."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.cards import random_ranks
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
-from arcade_torch.envs_jax.minesweeper.params import Params
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty."""
+
+    side: int  # cells per side of the board
+    mines: int  # mines on the board
+
+    @property
+    def cells(self) -> int:
+        """Cells of the board."""
+        return self.side**2
+
+    @property
+    def safe(self) -> int:
+        """Cells without a mine; sweeping one pays ``1 / safe``."""
+        return self.cells - self.mines
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit in steps."""
+        return 2 * self.cells
+
+    @property
+    def max_repeats(self) -> int:
+        """Sweeps of swept cells that end the game; each pays ``-2 / cells``."""
+        return self.cells // 2
+
+
+LEVELS = {
+    "MineSweeperEasy": Params(4, 2),
+    "MineSweeperMedium": Params(6, 6),
+    "MineSweeperHard": Params(8, 10),
+}
 
 COVERED_SAFE = 0
 COVERED_MINE = 1
@@ -74,13 +109,13 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
 
     fire = action == FIRE
-    here = cell_mask(state.x, state.y, level.side)
-    cell = jnp.sum(jnp.where(here, state.grid, 0))
+    at_cursor = cell_mask(state.x, state.y, level.side)
+    cell = jnp.sum(jnp.where(at_cursor, state.grid, 0))
     safe = fire & (cell == COVERED_SAFE)
     mine = fire & (cell == COVERED_MINE)
     again = fire & (cell == SWEPT)
 
-    grid = jnp.where(here & fire, jnp.int8(SWEPT), state.grid)
+    grid = jnp.where(at_cursor & fire, jnp.int8(SWEPT), state.grid)
     score = state.score + safe
     repeats = state.repeats + again
     new = MineSweeperState(x, y, grid, state.neighbours, score, repeats, state.timestep + 1)

@@ -5,9 +5,8 @@ from typing import ClassVar
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.navigator import rules
 from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.navigator.params import LEVELS, Params
-from arcade_torch.envs_jax.navigator.picture import Screen
-from arcade_torch.envs_jax.navigator.rules import NavigatorState
+from arcade_torch.envs_jax.navigator.renderer import Screen
+from arcade_torch.envs_jax.navigator.rules import LEVELS, NavigatorState, Params
 
 
 class Navigator(LevelGame[NavigatorState]):

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import FIRE
-from arcade_torch.envs_jax.navigator.picture import KINDS
+from arcade_torch.envs_jax.navigator.renderer import KINDS
 from arcade_torch.envs_jax.navigator.rules import TNT, TREASURE
 
 Board = npt.NDArray[Any]

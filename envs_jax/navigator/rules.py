@@ -2,14 +2,51 @@
 y].
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask, move_cursor
+from arcade_torch.envs_jax.boards import cell_mask, move_cursor
 from arcade_torch.envs_jax.game import FIRE, UNSET, Array, Rules
-from arcade_torch.envs_jax.navigator.params import DEATH_REWARD, TNTS, TREASURE_REWARD, Params
+
+TNTS = 7  # blocks on every map
+DEATH_REWARD = -0.5
+TREASURE_REWARD = 1.0
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty."""
+
+    side: int  # cells per side of the map
+    usual_place: tuple[int, int]
+    """Places in the list of free cells (x-major) from which the reference takes the treasure's x
+    and y in every episode. They are inferred from the measured distribution of its treasures.
+    """
+
+    @property
+    def cells(self) -> int:
+        """Cells of the map."""
+        return self.side**2
+
+    @property
+    def max_steps(self) -> int:
+        """Time limit in steps."""
+        return self.cells
+
+    @property
+    def step_reward(self) -> float:
+        """Reward of a step that neither opens the treasure nor ends on TNT."""
+        return -0.5 / self.cells
+
+
+LEVELS = {
+    "NavigatorEasy": Params(8, (18, 38)),
+    "NavigatorMedium": Params(10, (45, 56)),
+    "NavigatorHard": Params(12, (112, 79)),
+}
 
 FREE = 0
 TNT = 1
@@ -66,9 +103,8 @@ def place_apart(key: Array, level: Params) -> tuple[Array, Array, Array]:
     index = jnp.arange(TNTS + 2)
     treasure = (draw[0] % jnp.uint32(TNTS + 2)).astype(jnp.int32)
     agent = (treasure + 1 + (draw[1] % jnp.uint32(TNTS + 1)).astype(jnp.int32)) % (TNTS + 2)
-    treasure_cell, agent_cell = (
-        jnp.sum(jnp.where(index == role, cells, 0)) for role in (treasure, agent)
-    )
+    treasure_cell = jnp.sum(jnp.where(index == treasure, cells, 0))
+    agent_cell = jnp.sum(jnp.where(index == agent, cells, 0))
     # What is neither treasure nor agent is TNT; their own places in the list are filled with a
     # block's cell.
     spare = (index != treasure) & (index != agent)
@@ -94,9 +130,13 @@ def place_as_published(key: Array, level: Params) -> tuple[Array, Array, Array]:
     is_tnt = (cell == tnt[:, None]).any(0)
     rank = cell - (tnt[:, None] < cell).sum(0)
 
+    def free_cell(entry: Array | int) -> Array:
+        return jnp.sum(jnp.where(~is_tnt & (rank == entry), cell, 0))
+
     def compose(for_x: Array | int, for_y: Array | int) -> Array:
-        x, y = (jnp.sum(jnp.where(~is_tnt & (rank == entry), cell, 0)) for entry in (for_x, for_y))
-        return x // level.side * level.side + y % level.side
+        x = free_cell(for_x) // level.side
+        y = free_cell(for_y) % level.side
+        return x * level.side + y
 
     return tnt, compose(*level.usual_place), compose(entries[0], entries[1])
 
@@ -113,8 +153,8 @@ def step(
     x, y = move_cursor(state.x, state.y, action, level.side)
     new = NavigatorState(x, y, state.board, state.timestep + 1)
 
-    here = cell_mask(x, y, level.side)
-    cell = jnp.sum(jnp.where(here, state.board, 0))
+    at_agent = cell_mask(x, y, level.side)
+    cell = jnp.sum(jnp.where(at_agent, state.board, 0))
     fire = action == FIRE
     dead = ~fire & (cell == TNT)
     won = fire & (cell == TREASURE)

@@ -10,7 +10,9 @@ game only says which pictures it has and which code it wants shown.
 import functools
 import operator
 from dataclasses import dataclass
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +20,14 @@ import numpy.typing as npt
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render.canvas import Picture, blank, rectangle
 from arcade_torch.envs_jax.render.palette import Colour
-from arcade_torch.envs_jax.render.text import TEXT, centred, draw_name, number_pictures
+from arcade_torch.envs_jax.render.text import (
+    TEXT,
+    centred,
+    check_size,
+    draw_name,
+    number_pictures,
+)
+from arcade_torch.envs_jax.validation import format_value
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +55,8 @@ class Slot:
         host.
         """
         height, width = self.pictures.shape[1:3]
-        shown = frames[:, self.y : self.y + height, self.x : self.x + width]
-        return recognise(shown.reshape(len(frames), -1), self.pictures)
+        cutouts = frames[:, self.y : self.y + height, self.x : self.x + width]
+        return recognise(cutouts.reshape(len(frames), -1), self.pictures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,25 +95,25 @@ class TileGrid:
         )
 
 
-def recognise(shown: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
+def recognise(cutouts: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[np.int64]:
     """Which of some pictures each of many cut-outs is; on the host.
 
     Args:
-        shown: uint8 [..., h * w * 3], the cut-outs.
+        cutouts: uint8 [..., h * w * 3].
         pictures: uint8 [codes, h, w, 3].
 
     Returns:
         int64 [...]: the lowest code that looks like this, -1 where none does.
     """
-    known = pictures.reshape(len(pictures), -1)
+    flat = pictures.reshape(len(pictures), -1)
     # Random weights give every picture a number of its own; whole numbers are summed without
     # rounding.
-    weights = np.random.default_rng(0).integers(1, 2**24, known.shape[1]).astype(np.float64)
-    numbers = known @ weights
+    weights = np.random.default_rng(0).integers(1, 2**24, flat.shape[1]).astype(np.float64)
+    numbers = flat @ weights
     order = numbers.argsort(kind="stable")
-    found = np.searchsorted(numbers, shown @ weights, sorter=order)
-    codes = order[np.minimum(found, len(order) - 1)]
-    return np.where((known[codes] == shown).all(-1), codes, -1)
+    places = np.searchsorted(numbers, cutouts @ weights, sorter=order)
+    codes = order[np.minimum(places, len(order) - 1)]
+    return np.where((flat[codes] == cutouts).all(-1), codes, -1)
 
 
 class Layers:
@@ -128,19 +137,71 @@ class Layers:
         self._tables = functools.cache(self._make_tables)
 
     def draw(self, *codes: Array | int) -> Array:
-        """Show pictures by code, int [] for a slot and int [rows, columns] for a grid: uint8 [S, S,
-        3].
+        """Show pictures by code.
+
+        Args:
+            *codes: One a place: int [] for a slot, int [rows, columns] for a grid.
+
+        Returns:
+            uint8 [S, S, 3].
+
+        Raises:
+            ValueError: Codes of a wrong shape, or without a picture. Under ``jit`` and ``vmap``
+                nobody knows the codes, so there one without a picture draws anything.
         """
         arrays = [jnp.asarray(code) for code in codes]
+        if len(arrays) != len(self.places):
+            raise ValueError(f"got {len(arrays)} codes for {len(self.places)} places")
+        for number, array in enumerate(arrays):
+            if not isinstance(array, jax.core.Tracer):
+                self._check_codes(number, np.asarray(array))
         lines, (slot, start, stride) = self._tables(tuple(array.shape for array in arrays))
-        known = jnp.concatenate(
-            [*(array.astype(jnp.uint32).reshape(-1) for array in arrays), jnp.zeros(1, jnp.uint32)]
-        )
-        index = start + stride * known.at[slot].get(mode="promise_in_bounds")
+        flat = [array.astype(jnp.uint32).reshape(-1) for array in arrays]
+        code_of_slot = jnp.concatenate([*flat, jnp.zeros(1, jnp.uint32)])
+        index = start + stride * code_of_slot.at[slot].get(mode="promise_in_bounds")
         pictures = [
             jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index
         ]
-        return functools.reduce(operator.xor, pictures).reshape(self.background.shape)
+        frame = functools.reduce(operator.xor, pictures)
+        return frame.reshape(self.background.shape)
+
+    def _check_codes(self, number: int, codes: npt.NDArray[Any]) -> None:
+        """Refuse codes of a place for which it has no picture."""
+        place = self.places[number]
+        pictures = place.pictures if isinstance(place, Slot) else place.atlas
+        wrong = np.argwhere((codes < 0) | (codes >= len(pictures)))
+        if not len(wrong):
+            return
+        cell = tuple(wrong[0].tolist())
+        where = f", row {cell[0]}, column {cell[1]}," if len(cell) == 2 else ""
+        raise ValueError(
+            f"{self._name(number)}{where} has no picture {codes[cell]}: codes are 0 to "
+            f"{len(pictures) - 1}"
+        )
+
+    def _check_shape(self, number: int, shape: tuple[int, ...]) -> None:
+        """Refuse codes of a shape that a place does not take, and a place beyond the screen."""
+        place = self.places[number]
+        if isinstance(place, Slot) and shape:
+            raise ValueError(f"{self._name(number)} wants a single code, got shape {list(shape)}")
+        if isinstance(place, TileGrid) and len(shape) != 2:
+            raise ValueError(
+                f"{self._name(number)} wants codes [rows, columns], got shape {list(shape)}"
+            )
+        size = len(self.background)
+        for slot in place.slots(shape)[-1:]:
+            rows, across = slot.area
+            right = across.stop // 3
+            if place.x < 0 or place.y < 0 or right > size or rows.stop > size:
+                raise ValueError(
+                    f"{self._name(number)} does not fit the screen: it reaches to x {right}, "
+                    f"y {rows.stop}, of {size}"
+                )
+
+    def _name(self, number: int) -> str:
+        """A place in words."""
+        place = self.places[number]
+        return f"place {number} ({type(place).__name__} at x {place.x}, y {place.y})"
 
     def _make_tables(
         self, shapes: tuple[tuple[int, ...], ...]
@@ -151,21 +212,22 @@ class Layers:
             Lines, uint8 [M, 3 S], and uint32 [3, J, S], of J pictures in each line of the screen:
             the slot, and the numbers of the line for its code 0 and from there to the next code.
         """
-        slots = [
-            slot
-            for place, shape in zip(self.places, shapes, strict=True)
-            for slot in place.slots(shape)
-        ]
+        slots: list[Slot] = []
+        for number, (place, shape) in enumerate(zip(self.places, shapes, strict=True)):
+            self._check_shape(number, shape)
+            slots.extend(place.slots(shape))
         below = self.background.reshape(len(self.background), -1)
         on_top = np.full(below.shape, -1)
         for number, slot in enumerate(slots):
             if not slot.mixed:
                 on_top[slot.area] = number
-        known: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
-        shown: list[list[tuple[int, int, int]]] = [[] for _ in below]
+        blocks: dict[bytes, int] = {}  # blocks of lines, and the number of their first line
+        # what stands in each line of the screen: slot, line of its code 0, lines to the next code
+        entries_of: list[list[tuple[int, int, int]]] = [[] for _ in below]
 
         def add(block: npt.NDArray[np.uint8]) -> int:
-            return known.setdefault(block.tobytes(), sum(map(len, known)) // below.shape[1])
+            next_line = sum(map(len, blocks)) // below.shape[1]
+            return blocks.setdefault(block.tobytes(), next_line)
 
         for number, slot in enumerate(slots):
             rows, across = slot.area
@@ -177,26 +239,24 @@ class Layers:
             seen = np.asarray(changes.any((0, 2)))
             block = np.zeros((len(changes), *below[rows].shape), np.uint8)
             block[:, :, across] = changes
-            first = seen & [not entries for entries in shown[rows]]
+            first = seen & [not entries for entries in entries_of[rows]]
             block[:, first] ^= below[rows][first]
             start = add(block)
             for row in np.flatnonzero(seen).tolist():
-                shown[slot.y + row].append((number, start + row, len(seen)))
-        for line, entries in zip(below, shown, strict=True):
+                entries_of[slot.y + row].append((number, start + row, len(seen)))
+        for line, entries in zip(below, entries_of, strict=True):
             if not entries:
                 entries.append((0, add(line), 0))
         nothing = (0, add(np.zeros_like(below[0])), 0)
-        most = max(map(len, shown))
-        table = np.array(
-            [entries + [nothing] * (most - len(entries)) for entries in shown], np.uint32
-        )
-        return np.frombuffer(b"".join(known), np.uint8).reshape(
-            -1, below.shape[1]
-        ), table.transpose(2, 1, 0)
+        most = max(map(len, entries_of))
+        padded = [entries + [nothing] * (most - len(entries)) for entries in entries_of]
+        table = np.array(padded, np.uint32).transpose(2, 1, 0)
+        lines = np.frombuffer(b"".join(blocks), np.uint8).reshape(-1, below.shape[1])
+        return lines, table
 
 
 def number_slot(size: int, highest: int, background: Colour, colour: Colour) -> Slot:
-    """The number at the top of a screen, for values 0 to ``highest``."""
+    """The number at the top of a screen, for values 0 to ``highest``; see ``number_pictures``."""
     layout = TEXT[size]
     return Slot(
         number_pictures(size, highest, background, colour), layout.field_x[0], layout.field_y[0]
@@ -211,6 +271,9 @@ def titled_background(size: int, name: str, outer: Colour, name_colour: Colour) 
 
 
 GRID_LINE = 2
+# side of the square between number and title
+_BOARD_SIDE = {128: 98, 256: 196}
+# as published; other boards get the largest tiles that fit
 _TILE_SIDE = {
     128: {4: 21, 6: 13, 8: 9, 10: 7, 12: 6},
     256: {4: 44, 6: 28, 8: 21, 10: 17, 12: 13},
@@ -237,8 +300,28 @@ class GridLayout:
 
 
 def grid_layout(size: int, cells: int) -> GridLayout:
-    """Layout of a board with ``cells`` cells a side on a screen of ``size`` pixels."""
-    tile = _TILE_SIDE[size][cells]
+    """Layout of a board with ``cells`` cells a side on a screen of ``size`` pixels.
+
+    Args:
+        size: Side of the screen, 128 or 256.
+        cells: Cells a side, 1 to 32 on 128 pixels, 1 to 64 on 256.
+
+    Raises:
+        ValueError: Another size or number of cells.
+
+    Example:
+        >>> grid_layout(128, 3)
+        GridLayout(cells=3, tile=30, offset=15)
+    """
+    check_size(size)
+    room = _BOARD_SIDE[size] - GRID_LINE
+    most = room // (GRID_LINE + 1)
+    if not isinstance(cells, int) or not 1 <= cells <= most:
+        raise ValueError(
+            f"cells is {format_value(cells)}, a screen of {size} pixels takes 1 to {most}"
+        )
+    largest = room // cells - GRID_LINE
+    tile = _TILE_SIDE[size].get(cells, largest)
     return GridLayout(cells, tile, centred(size, cells * (tile + GRID_LINE) + GRID_LINE))
 
 
@@ -256,7 +339,16 @@ def lined_board(
 
     Returns:
         The background with the board's square filled with the line colour, and the grid of tiles.
+
+    Raises:
+        ValueError: A tile of another size.
     """
+    for code, tile in enumerate(tiles):
+        if tile.shape != (layout.tile, layout.tile, 3):
+            raise ValueError(
+                f"tile {code} is {tile.dtype} {list(tile.shape)}, the layout wants "
+                f"[{layout.tile}, {layout.tile}, 3]"
+            )
     low = layout.offset
     high = layout.offset + layout.side
     rectangle(background, low, low, high, high, line)

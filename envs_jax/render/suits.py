@@ -131,16 +131,16 @@ def history_grid(size: int, background: Colour) -> TileGrid:
     return TileGrid(suit_pictures((side, side), _SYMBOL[size], background), start, start)
 
 
-def history_codes(cards: Array, shown: Array) -> Array:
+def history_codes(cards: Array, visible: Array) -> Array:
     """Lay cards out in rows, left to right and downwards.
 
     Args:
         cards: int8 [N], suits.
-        shown: bool [N], false where the place stays empty.
+        visible: bool [N], false where the place stays empty.
 
     Returns:
         Codes for :func:`history_grid`, int8 [rows, 9].
     """
     rows = -(-len(cards) // ROW)
-    codes = jnp.where(shown, 1 + cards, NO_CARD)
+    codes = jnp.where(visible, 1 + cards, NO_CARD)
     return jnp.pad(codes, (0, rows * ROW - len(cards))).reshape(rows, ROW)

@@ -6,6 +6,7 @@ import numpy as np
 
 from arcade_torch.envs_jax.render.canvas import Picture, bitmap, blank
 from arcade_torch.envs_jax.render.palette import Colour
+from arcade_torch.envs_jax.validation import check_choice, format_value
 
 PATTERN = 5  # digits and letters are 5 x 5 patterns
 
@@ -54,6 +55,10 @@ LETTERS: dict[str, tuple[str, ...]] = {
     letter: tuple(rows.split()) for letter, rows in _LETTERS.items()
 }
 
+_BLANK = ("0" * PATTERN,) * PATTERN
+# all that a title may hold
+_CHARACTERS = {**LETTERS, **{str(digit): rows for digit, rows in enumerate(DIGITS)}, " ": _BLANK}
+
 
 @dataclass(frozen=True)
 class TextLayout:
@@ -67,6 +72,22 @@ class TextLayout:
     letter_y: int  # first row of the name
     letter_scale: int  # pixels per pattern cell, both ways
     letter_gap: int
+
+    @property
+    def letter_step(self) -> int:
+        """Distance between neighbouring letters."""
+        return PATTERN * self.letter_scale + self.letter_gap
+
+    @property
+    def digit_step(self) -> int:
+        """Distance between neighbouring digits."""
+        return PATTERN * self.digit_scale[0] + self.digit_gap
+
+    @property
+    def most_digits(self) -> int:
+        """Digits that the number field takes."""
+        width = self.field_x[1] - self.field_x[0]
+        return (width + self.digit_gap) // self.digit_step
 
 
 TEXT = {
@@ -85,17 +106,22 @@ def draw_name(picture: Picture, name: str, colour: Colour) -> Picture:
 
     Args:
         picture: uint8 [S, S, 3], S in {128, 256}.
-        name: Letters only; written in capitals.
+        name: Up to 11 letters, digits and spaces; written in capitals.
         colour: Their colour.
+
+    Raises:
+        ValueError: A picture of another size, a name that is too long, or another character.
     """
     size = picture.shape[1]
+    check_size(size)
     layout = TEXT[size]
-    step = PATTERN * layout.letter_scale + layout.letter_gap
+    _check_name(name, most=(size + layout.letter_gap) // layout.letter_step)
+    step = layout.letter_step
     x = centred(size, len(name) * step - layout.letter_gap)
-    for letter in name.upper():
+    for character in name.upper():
         bitmap(
             picture,
-            LETTERS[letter],
+            _CHARACTERS[character],
             x,
             layout.letter_y,
             layout.letter_scale,
@@ -104,6 +130,22 @@ def draw_name(picture: Picture, name: str, colour: Colour) -> Picture:
         )
         x += step
     return picture
+
+
+def _check_name(name: str, most: int) -> None:
+    """Refuse a name that cannot be written."""
+    for character in name:
+        if character.upper() not in _CHARACTERS:
+            raise ValueError(
+                f"the title {name!r} holds {character!r}, allowed: letters A to Z, digits, spaces"
+            )
+    if len(name) > most:
+        raise ValueError(f"the title {name!r} has {len(name)} characters, a screen takes {most}")
+
+
+def check_size(size: int) -> None:
+    """Raise ValueError unless there is a screen of this side."""
+    check_choice("size", size, tuple(TEXT))
 
 
 def number_pictures(size: int, highest: int, background: Colour, colour: Colour) -> Picture:
@@ -117,12 +159,21 @@ def number_pictures(size: int, highest: int, background: Colour, colour: Colour)
 
     Returns:
         uint8 [highest + 1, field height, field width, 3].
+
+    Raises:
+        ValueError: Another size, or a number that the field does not take.
     """
+    check_size(size)
     layout = TEXT[size]
+    most = 10**layout.most_digits - 1
+    if not isinstance(highest, int) or not 0 <= highest <= most:
+        raise ValueError(
+            f"highest is {format_value(highest)}, a screen of {size} pixels takes 0 to {most}"
+        )
     across, down = layout.digit_scale
     height = layout.field_y[1] - layout.field_y[0]
     width = layout.field_x[1] - layout.field_x[0]
-    step = PATTERN * across + layout.digit_gap
+    step = layout.digit_step
     pictures = []
     for value in range(highest + 1):
         field = blank(height, width, background)

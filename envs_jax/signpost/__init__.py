@@ -7,9 +7,8 @@ from typing import ClassVar
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.signpost import rules
 from arcade_torch.envs_jax.signpost.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.signpost.params import LEVELS, Params
-from arcade_torch.envs_jax.signpost.picture import Screen
-from arcade_torch.envs_jax.signpost.rules import SignpostState
+from arcade_torch.envs_jax.signpost.renderer import Screen
+from arcade_torch.envs_jax.signpost.rules import LEVELS, Params, SignpostState
 
 
 class Signpost(LevelGame[SignpostState]):

@@ -1,12 +1,32 @@
 """The rules of Signpost: read the sign, walk to the gate, press what the sign said."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import RIGHT, UNSET, Array
-from arcade_torch.envs_jax.signpost.params import Params
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty."""
+
+    corridor: int  # cells to walk before the gate; the sign has to be remembered for as many steps
+
+    @property
+    def cells(self) -> int:
+        """Cells of the corridor and the gate."""
+        return self.corridor + 1
+
+    @property
+    def max_steps(self) -> int:
+        """Steps of every episode: the walk and the answer."""
+        return self.cells
+
+
+LEVELS = {"SignpostEasy": Params(4), "SignpostMedium": Params(6), "SignpostHard": Params(9)}
 
 SIGNS = 4  # up, down, left, right, numbered like the actions
 

@@ -5,9 +5,8 @@ from typing import ClassVar
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.skittles import rules
 from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.skittles.params import LEVELS, MAX_STEPS, Params
-from arcade_torch.envs_jax.skittles.picture import Screen
-from arcade_torch.envs_jax.skittles.rules import SkittlesState
+from arcade_torch.envs_jax.skittles.renderer import Screen
+from arcade_torch.envs_jax.skittles.rules import LEVELS, MAX_STEPS, Params, SkittlesState
 from arcade_torch.envs_jax.validation import check_penalty
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UP
-from arcade_torch.envs_jax.skittles.params import CELLS, Params
-from arcade_torch.envs_jax.skittles.picture import AGENT
-from arcade_torch.envs_jax.skittles.rules import NO_BLOCK
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
+from arcade_torch.envs_jax.skittles.renderer import AGENT
+from arcade_torch.envs_jax.skittles.rules import CELLS, NO_BLOCK, Params
 
 UNSEEN = -2  # a block is in this row, nobody knows where
 MOVES = np.array([LEFT, UP, RIGHT], np.int32)
@@ -69,8 +69,8 @@ class Planner:
         lane = self.level.first + np.arange(width)
         block = column[..., None] == lane  # [N, rows, width]
         clear = 1.0 - np.where(column[..., None] == UNSEEN, 1 / width, block)
-        here = np.clip(x[:, None] + np.array([-1, 0, 1]), lane[0], lane[-1])
-        ways = here[..., None] == lane  # [N, moves, width], the columns each first move leads to
+        reached = np.clip(x[:, None] + np.array([-1, 0, 1]), lane[0], lane[-1])
+        ways = reached[..., None] == lane  # [N, moves, width], the columns each first move leads to
         alive = ways.astype(float)  # the best chance to be there alive
         # the block of this row leaves, that of the row above arrives
         for row in range(CELLS - 1, 0, -1):
@@ -97,7 +97,7 @@ class StateOracle:
         return self.planner.plan(seen.x, seen.column)
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: every block seen once is remembered while it falls.
 
     A block has nine looks before it can hit; the one in 512 that is never seen is what the player
@@ -105,19 +105,18 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any) -> None:
+        super().__init__(game)
         self.planner = Planner(game.level)
-        self.board = game.screen.board
-        self.column: npt.NDArray[np.int64] = np.zeros((0, CELLS), np.int64)
 
-    def act(
-        self, seen: npt.NDArray[np.uint8], is_init: npt.NDArray[np.bool_]
-    ) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        if len(self.column) != len(seen):
-            self.column = np.full((len(seen), CELLS), NO_BLOCK)
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
+        self.column = np.full((num_envs, CELLS), NO_BLOCK)
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
         fallen = np.pad(self.column[:, :-1], ((0, 0), (1, 0)), constant_values=UNSEEN)
         self.column = np.where(is_init[:, None], NO_BLOCK, fallen)
-        codes = self.board.read(seen, CELLS, CELLS)
+        codes = self.screen.board.read(frames, CELLS, CELLS)
         block = (codes > 0) & (codes < AGENT)
         self.column = np.where(block.any(-1), block.argmax(-1), self.column)
         return self.planner.plan((codes[:, -1] == AGENT).argmax(-1), self.column)

@@ -2,13 +2,37 @@
 dodges at the bottom.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.game import LEFT, RIGHT, UNSET, Array, Rules
-from arcade_torch.envs_jax.skittles.params import CELLS, COLOURS, MAX_STEPS, Params
+
+CELLS = 10  # rows and columns of the grid
+MAX_STEPS = 100  # time limit; each step pays 1 / MAX_STEPS
+COLOURS = 7  # blocks take turns through as many colours
+
+
+@dataclass(frozen=True)
+class Params:
+    """One difficulty: the lane, where blocks fall and the agent may stand."""
+
+    width: int  # columns of the lane
+    first: int  # its leftmost column
+
+    @property
+    def last(self) -> int:
+        """Rightmost column of the lane."""
+        return self.first + self.width - 1
+
+
+LEVELS = {
+    "SkittlesEasy": Params(8, 1),
+    "SkittlesMedium": Params(7, 2),
+    "SkittlesHard": Params(6, 2),
+}
 
 NO_BLOCK = -1
 
@@ -89,7 +113,7 @@ def step(
     return new, reward, hit, time >= MAX_STEPS
 
 
-def shown(state: SkittlesState) -> Array:
+def visible_rows(state: SkittlesState) -> Array:
     """Which blocks the POMDP shows: bool [CELLS], one for each row.
 
     At every time each cell of the grid is shown with probability 1/2, as a function of

@@ -5,9 +5,15 @@ from typing import ClassVar
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.tetris import rules
 from arcade_torch.envs_jax.tetris.oracle import FramesOracle, StateOracle
-from arcade_torch.envs_jax.tetris.params import GOAL, LEVELS, LINE_REWARD, MAX_STEPS, Params
-from arcade_torch.envs_jax.tetris.picture import Screen
-from arcade_torch.envs_jax.tetris.rules import TetrisState
+from arcade_torch.envs_jax.tetris.renderer import Screen
+from arcade_torch.envs_jax.tetris.rules import (
+    GOAL,
+    LEVELS,
+    LINE_REWARD,
+    MAX_STEPS,
+    Params,
+    TetrisState,
+)
 
 
 class Tetris(LevelGame[TetrisState]):

@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import DOWN, FIRE, LEFT, RIGHT, UP
-from arcade_torch.envs_jax.tetris.params import (
+from arcade_torch.envs_jax.oracles import Actions, Bools, Frames, FramesPlayer
+from arcade_torch.envs_jax.tetris.renderer import BAND
+from arcade_torch.envs_jax.tetris.rules import (
     BOX,
     COLUMNS,
     ROTATIONS,
@@ -17,9 +19,7 @@ from arcade_torch.envs_jax.tetris.params import (
     SPAWN_X,
     SPAWN_Y,
 )
-from arcade_torch.envs_jax.tetris.picture import BAND
 
-Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 
 BORDER = 3  # columns that a box may stand beyond the board
@@ -65,7 +65,8 @@ def plan(pile: Bools, piece: Ints, fall: int, drop: int, tunnels: bool) -> Plans
     free = room(pile, piece)
     goals = np.array([(rot, px) for rot in range(ROTATIONS) for px in range(-BORDER, COLUMNS)])
     shape = (len(pile), len(goals))
-    goal_rot, goal_px = (np.broadcast_to(goals[:, i], shape) for i in range(2))
+    goal_rot = np.broadcast_to(goals[:, 0], shape)
+    goal_px = np.broadcast_to(goals[:, 1], shape)
     rot = np.zeros(shape, np.int64)
     px = np.full(shape, SPAWN_X)
     py = np.full(shape, SPAWN_Y)
@@ -192,7 +193,7 @@ class StateOracle:
         return self.planner.act(pile, piece, is_init | seen.just_locked)
 
 
-class FramesOracle:
+class FramesOracle(FramesPlayer):
     """Sees the POMDP's frames: adds every piece to a remembered pile when it comes to lie, and
     plays as if it saw it.
 
@@ -202,23 +203,24 @@ class FramesOracle:
     """
 
     def __init__(self, game: Any) -> None:
-        self.screen = game.screen
+        super().__init__(game)
         self.planner = Planner(game)
-        self.pile = np.zeros((0, ROWS, COLUMNS), bool)
 
-    def act(self, seen: npt.NDArray[np.uint8], is_init: Bools) -> npt.NDArray[np.int32]:
-        """See :class:`~arcade_torch.envs_jax.oracles.Player`."""
-        if len(self.pile) != len(seen):
-            self.pile = np.zeros((len(seen), ROWS, COLUMNS), bool)
+    def allocate(self, num_envs: int) -> None:
+        """See :meth:`FramesPlayer.allocate`."""
+        self.pile = np.zeros((num_envs, ROWS, COLUMNS), bool)
+
+    def choose(self, frames: Frames, is_init: Bools) -> Actions:
+        """See :meth:`FramesPlayer.choose`."""
         self.pile[is_init] = False
-        codes = read_board(seen, self.screen)
+        codes = read_board(frames, self.screen)
         band = (codes == BAND).all(-1)
         cells = (codes > 0) & (codes < BAND)
-        floor = np.ones((len(seen), 1, COLUMNS), bool)
+        floor = np.ones((len(frames), 1, COLUMNS), bool)
         below = np.concatenate([self.pile[:, 1:], floor], 1)
         lies = band.any(-1) | (cells & below).any((1, 2))
         self.pile = np.where(lies[:, None, None], drop_rows(self.pile | cells, band), self.pile)
-        piece = np.where(lies, read_preview(seen, self.screen), codes.max((1, 2)) - 1)
+        piece = np.where(lies, read_preview(frames, self.screen), codes.max((1, 2)) - 1)
         return self.planner.act(self.pile, piece, is_init | lies)
 
 
@@ -241,6 +243,6 @@ def read_preview(frames: npt.NDArray[np.uint8], screen: Any, which: int = 0) -> 
     """Which piece a preview (0: the nearest) of frames [N, S, S, 3] shows: int64 [N]."""
     slot = screen.previews[which]
     height, width = slot.pictures.shape[1:3]
-    shown = frames[:, None, slot.y : slot.y + height, slot.x : slot.x + width]
-    which_piece: Ints = (shown == slot.pictures).all((2, 3, 4)).argmax(1)
+    cutout = frames[:, None, slot.y : slot.y + height, slot.x : slot.x + width]
+    which_piece: Ints = (cutout == slot.pictures).all((2, 3, 4)).argmax(1)
     return which_piece

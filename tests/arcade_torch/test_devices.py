@@ -20,13 +20,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import arcade_torch
 from arcade_torch import collector as collector_module
-from arcade_torch import compiled, dlpack
+from arcade_torch import compiled, devices, dlpack, rollout_buffer
 from arcade_torch import env as env_module
 from arcade_torch.agents import Trainer, preset
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import compiled_game
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax import registry
+from arcade_torch.frame_memory import FrameMemory
 from tests.arcade_torch.stub import GAME, MIXED, StubGame
 from tests.arcade_torch.test_collector import Recurrent, assert_same, scripted
 from tests.own_registry import forget_games
@@ -85,7 +86,7 @@ def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
     }.get(change, [])
     events: list[str] = []
     stream = type("Stream", (), {"synchronize": lambda self: events.append("torch")})()
-    monkeypatch.setattr(dlpack, "is_host", lambda value: False)
+    monkeypatch.setattr(devices, "is_host", lambda value: False)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
     monkeypatch.setattr(
         env_module, "to_torch", lambda array, device: torch.from_numpy(np.array(array))
@@ -126,7 +127,7 @@ def test_final_observations_are_drawn_on_the_device_of_the_env() -> None:
     """Two host devices: they were drawn on JAX's default device."""
     code = """
 import jax, torch
-from arcade_torch.compiled import FrameMemory
+from arcade_torch.frame_memory import FrameMemory
 from arcade_torch.env import ArcadeEnv
 from tests.arcade_torch.stub import LOCKSTEP
 used, show = set(), FrameMemory.show
@@ -202,8 +203,8 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch, env: ArcadeEnv) -> Iterator[Coun
             else original  # numpy does not ask for __array__
         )(x, *rest, **options)
 
-    monkeypatch.setattr(compiled.FrameMemory, "show", lambda self, frames: frames)
-    for module in (dlpack, env_module, collector_module):
+    monkeypatch.setattr(FrameMemory, "show", lambda self, frames: frames)
+    for module in (devices, dlpack, env_module, collector_module, rollout_buffer):
         monkeypatch.setattr(module, "is_host", lambda value: False)
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
     monkeypatch.setattr(

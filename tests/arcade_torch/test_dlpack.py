@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 import torch
 
-from arcade_torch import dlpack
+from arcade_torch import devices, dlpack
 
 
 @pytest.mark.parametrize("dtype", [jnp.bool_, jnp.uint8, jnp.int32, jnp.float32])
@@ -94,8 +94,8 @@ def test_the_warning_about_copied_frames_names_the_package_and_comes_once(
 def test_sharing_a_gpu_respects_what_the_user_has_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.delenv("XLA_PYTHON_CLIENT_PREALLOCATE", raising=False)
-    assert dlpack.share_gpu()
+    assert devices.share_gpu()
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "true")
-    assert not dlpack.share_gpu()
+    assert not devices.share_gpu()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert not dlpack.share_gpu()
+    assert not devices.share_gpu()

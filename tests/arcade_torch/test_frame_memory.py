@@ -18,8 +18,9 @@ from torchrl.envs.transforms import StepCounter
 
 from arcade_torch import make
 from arcade_torch.collector import ArcadeCollector
-from arcade_torch.compiled import CompiledGame, FrameMemory, draws_in_place
+from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.frame_memory import FrameMemory, draws_in_place
 from arcade_torch.gym.batch import NumpyBatch
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, State, StubGame
 
@@ -121,11 +122,13 @@ def test_xla_writes_the_frames_into_the_memory_that_it_is_given(
     game: CompiledGame, function: str
 ) -> None:
     """The program says so; a copy would need memory of its own."""
-    batch = ArcadeEnv(game, N)._live.batch
+    live = ArcadeEnv(game, N)._live
+    started = [live.batch, live.ended] if function == "step_only" else [live.batch]
+    arguments = [*started, jnp.zeros(N, jnp.int32)]
     spare = jax.ShapeDtypeStruct((N, 8, 8, 3), jnp.uint8)
-    lowered = getattr(game, function).lower(batch, jnp.zeros(N, jnp.int32), spare)
+    lowered = getattr(game, function).lower(*arguments, spare)
     header = lowered.compile().as_text().splitlines()[0]
-    number = len(jax.tree.leaves(batch)) + 1
+    number = len(jax.tree.leaves(arguments))
     assert re.search(
         rf"input_output_alias={{ {{\d+}}: \({number}, {{}}, m\w+-alias\) }}", header
     ), header

@@ -64,7 +64,7 @@ def batched_walk(game: Any, partial: bool) -> str:
     batch = batched.init(env_keys(golden.SEED, golden.ENVS), np.full(golden.ENVS, partial))
     arrays = leaves(batch)
     for action in golden.actions():
-        batch, stepped, outcome, frames = batched.step_auto(batch, action)
+        batch, stepped, outcome, frames = batched.step_autoreset(batch, action)
         arrays += [*leaves((batch, stepped)), *map(np.asarray, outcome), np.asarray(frames)]
     return golden.digest(arrays)
 

@@ -46,8 +46,10 @@ def test_env_i_of_512_walks_the_path_it_walks_alone(id):
     many = game.init(env_keys(5, 512), jnp.zeros(512, bool))
     alone = game.init(env_keys(5, 1, first=index), jnp.zeros(1, bool))
     for action in random_actions(40, 512, seed=1):
-        many, _, outcome, frames = game.step_auto(many, action)
-        alone, _, outcome_alone, frames_alone = game.step_auto(alone, action[index : index + 1])
+        many, _, outcome, frames = game.step_autoreset(many, action)
+        alone, _, outcome_alone, frames_alone = game.step_autoreset(
+            alone, action[index : index + 1]
+        )
         assert same(rows(many, [index]), alone)
         assert same(rows(outcome, [index]), outcome_alone)
         assert np.array_equal(np.asarray(frames)[index], np.asarray(frames_alone)[0])
@@ -59,7 +61,7 @@ def test_the_fused_step_equals_step_then_reset(id):
     fused = apart = game.init(env_keys(0, 16), jnp.arange(16) % 2 == 0)
     ends = 0
     for action in random_actions(60, 16):
-        fused, stepped, outcome, frames = game.step_auto(fused, action)
+        fused, stepped, outcome, frames = game.step_autoreset(fused, action)
         before, outcome_apart, final_frames = game.step_render(apart, action)
         apart, root_frames = game.reset_render(before, outcome_apart.done)
         ends += int(outcome.done.sum())
@@ -93,8 +95,8 @@ def test_twins_step_in_lockstep(id, rules):
     full, partial = (game.init(env_keys(2, 16), jnp.full(16, flag)) for flag in (False, True))
     hidden = 0
     for action in random_actions(50, 16):
-        full, _, outcome, frames = game.step_auto(full, action)
-        partial, _, outcome_partial, frames_partial = game.step_auto(partial, action)
+        full, _, outcome, frames = game.step_autoreset(full, action)
+        partial, _, outcome_partial, frames_partial = game.step_autoreset(partial, action)
         assert same(full._replace(partial=partial.partial), partial) and same(
             outcome, outcome_partial
         )
@@ -111,7 +113,7 @@ def test_the_frame_is_a_function_of_state_and_twin_alone(id):
     game = batched(id)
     batch = game.init(env_keys(3, 16), jnp.arange(16) % 3 == 0)
     for action in random_actions(12, 16):
-        batch, _, _, frames = game.step_auto(batch, action)
+        batch, _, _, frames = game.step_autoreset(batch, action)
         assert np.array_equal(frames, game.render(batch))
         switched = batch._replace(partial=~np.asarray(batch.partial))
         again = switched._replace(
@@ -130,7 +132,7 @@ def test_long_random_rollouts_keep_the_contract(id, rules):
     batch = game.init(env_keys(7, 64), jnp.arange(64) % 2 == 0)
     returns, longest = [], 0
     for action in random_actions(150, 64, seed=3):
-        batch, stepped, outcome, frames = game.step_auto(batch, action)
+        batch, stepped, outcome, frames = game.step_autoreset(batch, action)
         done = np.asarray(outcome.done)
         assert np.array_equal(done, np.asarray(outcome.terminated) | np.asarray(outcome.truncated))
         assert outcome.reward.dtype == np.float32 and np.isfinite(outcome.reward).all()
@@ -163,7 +165,7 @@ def test_any_play_from_any_seed_keeps_the_contract(id, seed, small, actions, par
     low, high = game.game.return_range
     batch = game.init(env_keys(seed, size), jnp.asarray(partial[:size]))
     for action in actions[:, :size]:
-        batch, stepped, outcome, frames = game.step_auto(batch, action)
+        batch, stepped, outcome, frames = game.step_autoreset(batch, action)
         done, frames = np.asarray(outcome.done), np.asarray(frames)
         assert np.array_equal(done, np.asarray(outcome.terminated) | np.asarray(outcome.truncated))
         assert outcome.reward.dtype == np.float32 and outcome.reward.shape == (size,)
@@ -190,14 +192,14 @@ def test_a_new_episode_is_what_reset_gives_for_the_key_of_its_env(id):
     game = batched(id)
     batch = game.init(env_keys(4, 16), jnp.arange(16) % 2 == 0)
     for action in random_actions(3, 16, seed=2):
-        batch, *_ = game.step_auto(batch, action)
+        batch, *_ = game.step_autoreset(batch, action)
     clock = next(name for name in LIMIT_NAMES if hasattr(batch.state, name))
     at_limit = np.arange(16) % 3 == 0
     time = jnp.where(at_limit, game.game.max_steps - 1, getattr(batch.state, clock))
     batch = batch._replace(
         state=batch.state._replace(**{clock: time.astype(getattr(batch.state, clock).dtype)})
     )
-    root, stepped, outcome, frames = game.step_auto(batch, np.zeros(16, np.int32))
+    root, stepped, outcome, frames = game.step_autoreset(batch, np.zeros(16, np.int32))
     done = np.asarray(outcome.done)
     assert (done >= at_limit).all() and not done.all()
     keep, use = jax.vmap(jax.random.split, out_axes=1)(stepped.key)
@@ -231,7 +233,7 @@ def test_equal_seeds_and_actions_give_equal_bits(seed, actions):
     def play():
         batch = game.init(env_keys(seed, 16), jnp.zeros(16, bool))
         for action in actions:
-            batch, _, _, frames = game.step_auto(batch, action)
+            batch, _, _, frames = game.step_autoreset(batch, action)
         return batch, frames
 
     assert same(play(), play())

@@ -12,9 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.battleship.oracle import ship_scores
-from arcade_torch.envs_jax.battleship.params import SHIPS
-from arcade_torch.envs_jax.battleship.picture import COVERED, HIT, KINDS, MISS
-from arcade_torch.envs_jax.battleship.rules import place_ship
+from arcade_torch.envs_jax.battleship.renderer import COVERED, HIT, KINDS, MISS
+from arcade_torch.envs_jax.battleship.rules import SHIPS, place_ship
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.render.palette import BRASS, NICKEL, RED
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from arcade_torch.envs_jax import BatchedGame, env_keys, make
-from arcade_torch.envs_jax.breakout import picture
-from arcade_torch.envs_jax.breakout.picture import KINDS
+from arcade_torch.envs_jax.breakout import renderer
+from arcade_torch.envs_jax.breakout.renderer import KINDS
 from arcade_torch.envs_jax.breakout.rules import BreakoutState
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle, play
 
@@ -311,11 +311,11 @@ def test_ball_tail_bricks_and_paddle_can_be_read_back(size):
     expected[1:7] = np.where(bricks, np.arange(1, 7)[:, None], 0)
     expected[19, 3:7] = 1  # the paddle has the colour of the uppermost bricks
     hidden = expected.copy()
-    expected[8, 5], expected[7, 6] = picture.BALL * KINDS, picture.TAIL * KINDS
+    expected[8, 5], expected[7, 6] = renderer.BALL * KINDS, renderer.TAIL * KINDS
     assert np.array_equal(codes_of(game, draw(game, state, False)[None])[0], expected)
     assert np.array_equal(codes_of(game, draw(game, state, True)[None])[0], hidden)
     upwards = state._replace(ball_dir=jnp.int32(UP_LEFT))
-    hidden[8, 5] = picture.BALL * KINDS
+    hidden[8, 5] = renderer.BALL * KINDS
     assert np.array_equal(codes_of(game, draw(game, upwards, True)[None])[0], hidden)
 
 
@@ -323,9 +323,9 @@ def test_the_literal_tail_is_where_the_ball_was():
     game = make(HARD, tail="previous", obs_size=256)  # at 128 the tail covers the ball
     render = jax.jit(game.render)
     first = one(game, ball_x=3, ball_y=9, last_x=3, last_y=9)
-    assert codes_of(game, render(first, False)[None])[0, 9, 3] == picture.BALL_TAIL * KINDS
+    assert codes_of(game, render(first, False)[None])[0, 9, 3] == renderer.BALL_TAIL * KINDS
     moved = first._replace(last_x=jnp.int32(4))
-    assert codes_of(game, render(moved, False)[None])[0, 9, 4] == picture.TAIL * KINDS
+    assert codes_of(game, render(moved, False)[None])[0, 9, 4] == renderer.TAIL * KINDS
     for direction in range(4):
         same = render(moved._replace(ball_dir=jnp.int32(direction)), False)
         assert np.array_equal(same, render(moved, False)), (
@@ -353,8 +353,8 @@ def test_in_play_the_pomdp_hides_the_ball_on_its_way_down_and_the_tail_always():
         )
         marks = partial // KINDS
         up = state.ball_dir < 2
-        assert np.array_equal(marks.sum((1, 2)), np.where(up, picture.BALL, 0))
-        assert (marks[up, state.ball_y[up], state.ball_x[up]] == picture.BALL).all()
+        assert np.array_equal(marks.sum((1, 2)), np.where(up, renderer.BALL, 0))
+        assert (marks[up, state.ball_y[up], state.ball_x[up]] == renderer.BALL).all()
         shown += up.sum()
         batch, _ = compiled.step(batch, oracle.act(state, up))
     assert 100 < shown < 400

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import make
-from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT
-from arcade_torch.envs_jax.cartpole.picture import Geometry, arrow_level, arrow_pictures, pole_span
+from arcade_torch.envs_jax.cartpole.renderer import Geometry, arrow_level, arrow_pictures, pole_span
+from arcade_torch.envs_jax.cartpole.rules import THETA_LIMIT
 from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK
 
 from .conftest import Walk, draw, one, random_actions

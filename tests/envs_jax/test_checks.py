@@ -18,6 +18,8 @@ from arcade_torch.envs_jax import (
     register,
     registered_ids,
 )
+from arcade_torch.envs_jax.game import UNSET
+from arcade_torch.envs_jax.render import Layers, blank, number_slot
 from tests.own_registry import own_registry  # noqa: F401
 
 
@@ -209,3 +211,117 @@ def test_nothing_is_compiled_by_the_check():
 @pytest.mark.parametrize("obs_size", [128, 256])
 def test_every_game_of_the_package_keeps_the_contract(id, obs_size):
     check_game(make(id, obs_size=obs_size))
+
+
+# -- playing ---------------------------------------------------------------------------------------
+
+
+class Counter(Right):
+    """Shows how many steps it has taken; the tests break it in one place each."""
+
+    highest = 5
+
+    def __init__(self):
+        slot = number_slot(128, self.highest, (0, 0, 0), (9, 9, 9))
+        self.layers = Layers(blank(128, 128, (0, 0, 0)), slot)
+
+    def render(self, state, partial):
+        return self.layers.draw(state.count)
+
+
+def counter_with(**methods):
+    return type("Wrong", (Counter,), {"id": "WrongEasy-v0", **methods})()
+
+
+def step_paying(reward=0.2, ends=True, state=lambda s: s):
+    """A step that counts, and does one thing otherwise."""
+
+    def step(self, key, before, action):
+        count = before.count + 1
+        after = state(State(count, before.seen))
+        return after, jnp.float32(reward), jnp.bool_(False), (count >= self.max_steps) & ends
+
+    return step
+
+
+PLAYED_WRONG = [
+    (
+        {"highest": 3},
+        "render after 4 steps: place 0 (Slot at x 43, y 1) has no picture 4: codes are 0 to 3",
+    ),
+    (
+        {"step": step_paying(ends=False), "highest": 9},
+        "neither terminated nor truncated after 5 steps, and max_steps is 5",
+    ),
+    (
+        {
+            "step": lambda s, key, state, action: (
+                state,
+                jnp.float32(0),
+                jnp.bool_(0),
+                ~state.seen[0],
+            )
+        },
+        "truncated after 1 steps, and max_steps is 5",
+    ),
+    (
+        {"step": step_paying(reward=0.3)},
+        "an episode returned 1.5, and return_range is (0.0, 1.0)",
+    ),
+    ({"step": step_paying(reward=jnp.nan)}, "step 1 gives the reward nan"),
+]
+
+
+@pytest.mark.parametrize(("methods", "message"), PLAYED_WRONG)
+def test_playing_finds_what_shapes_and_types_do_not_tell(methods, message):
+    game = counter_with(**methods)
+    check_game(game)
+    with pytest.raises(ValueError, match=f"^{re.escape(f'WrongEasy-v0: {message}')}$"):
+        check_game(game, play=True)
+
+
+def test_a_state_entry_that_is_no_number_is_named():
+    class Speed(NamedTuple):
+        speed: jax.Array
+
+    def step(self, key, state, action):
+        return Speed(state.speed / 0 * 0), jnp.float32(0), jnp.bool_(False), jnp.bool_(True)
+
+    methods = {
+        "id": "WrongEasy-v0",
+        "max_steps": 1,
+        "reset": lambda self, key: Speed(jnp.float32(1)),
+        "step": step,
+        "render": lambda self, state, partial: jnp.zeros((128, 128, 3), jnp.uint8),
+    }
+    game = type("Wrong", (Right,), methods)()
+    with pytest.raises(ValueError, match=r"^WrongEasy-v0: step 1 gives state entry speed as nan$"):
+        check_game(game, play=True)
+
+
+def test_a_picture_beyond_the_end_of_an_episode_is_looked_at_too():
+    class Ending(NamedTuple):
+        count: jax.Array
+        terminated: jax.Array = UNSET
+        truncated: jax.Array = UNSET
+
+    def step(self, key, state, action):
+        count = state.count + 1
+        return Ending(count), jnp.float32(0), jnp.bool_(False), count >= 5
+
+    def render(self, state, partial):
+        return self.layers.draw(jnp.where(state.truncated, 77, 0))
+
+    reset = lambda self, key: Ending(jnp.int32(0))  # noqa: E731
+    game = counter_with(reset=reset, step=step, render=render)
+    with pytest.raises(ValueError, match=r"render after 5 steps: place 0 .* has no picture 77"):
+        check_game(game, play=True)
+
+
+def test_a_game_that_plays_well_passes():
+    check_game(Counter(), play=True)
+
+
+@pytest.mark.parametrize("id", [id for id in registered_ids() + probe_ids() if "Hard" in id])
+def test_the_games_of_the_package_play_well(id):
+    check_game(make(id), play=True)

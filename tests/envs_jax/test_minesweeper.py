@@ -7,7 +7,7 @@ import pytest
 
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.minesweeper.oracle import mine_chances
-from arcade_torch.envs_jax.minesweeper.picture import KINDS
+from arcade_torch.envs_jax.minesweeper.renderer import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_MINE, SWEPT
 
 from .conftest import Walk, batched, draw, one, random_actions

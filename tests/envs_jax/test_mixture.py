@@ -20,10 +20,10 @@ GAMES = [make("CartPoleEasy"), make("MineSweeperEasy")]
 
 
 def walk(compiled, keys, actions, partial):
-    """Everything that `step_auto` gives over some steps."""
+    """Everything that `step_autoreset` gives over some steps."""
     batch = compiled.init(keys, partial)
     for action in actions:
-        batch, stepped, outcome, frames = compiled.step_auto(batch, action)
+        batch, stepped, outcome, frames = compiled.step_autoreset(batch, action)
         yield batch, stepped, outcome, frames
 
 
@@ -62,7 +62,7 @@ def test_the_fused_step_equals_step_then_reset_and_the_frame_follows_from_the_st
     mixed = MIXED.batched
     fused = apart = mixed.init(env_keys(0, 6), jnp.arange(6) % 2 == 0)
     for action in random_actions(30, 6):
-        fused, stepped, outcome, frames = mixed.step_auto(fused, action)
+        fused, stepped, outcome, frames = mixed.step_autoreset(fused, action)
         before, outcome_apart, final_frames = mixed.step_render(apart, action)
         apart, root_frames = mixed.reset_render(before, outcome_apart.done)
         assert same(fused, apart) and same(stepped, before) and same(outcome, outcome_apart)
@@ -70,13 +70,13 @@ def test_the_fused_step_equals_step_then_reset_and_the_frame_follows_from_the_st
         assert np.array_equal(final_frames, mixed.render(before))
 
 
-def test_widening_makes_every_leaf_as_long_as_the_batch_and_narrowing_undoes_it():
+def test_padding_makes_every_leaf_as_long_as_the_batch_and_unpadding_undoes_it():
     mixed = MIXED.batched
     batch = mixed.init(env_keys(3, 6), jnp.zeros(6, bool))
-    wide = mixed.wide(batch)
-    assert all(len(leaf) == 6 for leaf in jax.tree.leaves(wide))
-    assert same(mixed.narrow(wide), batch)
-    assert not np.asarray(wide.state["CoinEasy-v0"].count)[:4].any(), (
+    padded = mixed.pad(batch)
+    assert all(len(leaf) == 6 for leaf in jax.tree.leaves(padded))
+    assert same(mixed.unpad(padded), batch)
+    assert not np.asarray(padded.state["CoinEasy-v0"].count)[:4].any(), (
         "zero where another game is played"
     )
 

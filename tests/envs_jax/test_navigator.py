@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.navigator.oracle import FAR, path_lengths
-from arcade_torch.envs_jax.navigator.picture import KINDS
+from arcade_torch.envs_jax.navigator.renderer import KINDS
 from arcade_torch.envs_jax.navigator.rules import FREE, TNT, TREASURE, draw_distinct
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import MAUVE, RED, SKY, YELLOW

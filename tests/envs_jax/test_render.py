@@ -1,5 +1,7 @@
 """Drawing primitives and text."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,9 @@ from arcade_torch.envs_jax.render import (
     disc,
     draw_name,
     grid_layout,
+    lined_board,
     number_pictures,
+    number_slot,
     polygon,
     rectangle,
 )
@@ -133,6 +137,106 @@ def test_the_highest_number_of_a_game_can_be_shown(name):
 def test_boards_stand_where_the_published_ones_do(size, cells, side, tile, offset):
     layout = grid_layout(size, cells)
     assert (layout.side, layout.tile, layout.offset) == (side, tile, offset)
+
+
+@pytest.mark.parametrize(("size", "most"), [(128, 32), (256, 64)])
+def test_a_board_of_any_number_of_cells_fits_between_number_and_title(size, most):
+    for cells in range(1, most + 1):
+        layout = grid_layout(size, cells)
+        assert layout.tile >= 1
+        assert layout.offset >= TEXT[size].field_y[1]
+        assert layout.offset + layout.side <= TEXT[size].letter_y
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((128, 33), "cells is 33, a screen of 128 pixels takes 1 to 32"),
+        ((256, 0), "cells is 0, a screen of 256 pixels takes 1 to 64"),
+        ((128, 4.0), "cells is 4.0, a screen of 128 pixels takes 1 to 32"),
+        ((64, 4), "size is 64, allowed: 128, 256"),
+    ],
+)
+def test_a_board_that_no_screen_takes_is_refused_in_one_line(arguments, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        grid_layout(*arguments)
+
+
+def test_a_title_may_hold_spaces_and_digits():
+    title = ink(draw_name(blank(128, 128, BLACK), "LEVEL 2", WHITE))
+    solid = ink(draw_name(blank(128, 128, BLACK), "LEVELX2", WHITE))
+    columns = np.flatnonzero((title != solid).any(0))
+    assert 0 < len(columns) <= 10  # the place of the space, and no other
+    assert not title[:, columns].any()
+
+
+@pytest.mark.parametrize(
+    ("size", "name", "message"),
+    [
+        (128, "TWELVE WORDS", "the title 'TWELVE WORDS' has 12 characters, a screen takes 11"),
+        (256, "TWELVE WORDS", "the title 'TWELVE WORDS' has 12 characters, a screen takes 11"),
+        (128, "P_IRS", "the title 'P_IRS' holds '_', allowed: letters A to Z, digits, spaces"),
+    ],
+)
+def test_a_title_that_cannot_be_written_is_refused_in_one_line(size, name, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        draw_name(blank(size, size, BLACK), name, WHITE)
+
+
+@pytest.mark.parametrize(
+    ("size", "highest", "message"),
+    [
+        (128, 1000, "highest is 1000, a screen of 128 pixels takes 0 to 999"),
+        (256, 100_000, "highest is 100000, a screen of 256 pixels takes 0 to 99999"),
+        (128, -1, "highest is -1, a screen of 128 pixels takes 0 to 999"),
+        (128, 2.5, "highest is 2.5, a screen of 128 pixels takes 0 to 999"),
+    ],
+)
+def test_a_number_that_does_not_fit_its_field_is_refused_in_one_line(size, highest, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        number_slot(size, highest, BLACK, WHITE)
+
+
+def test_the_highest_number_of_three_digits_fits():
+    assert len(number_slot(128, 999, BLACK, WHITE).pictures) == 1000
+
+
+def test_a_tile_of_another_size_is_refused_in_one_line():
+    layout = grid_layout(128, 3)
+    tiles = [blank(layout.tile, layout.tile, BLACK), blank(4, 5, WHITE)]
+    message = f"tile 1 is uint8 [4, 5, 3], the layout wants [{layout.tile}, {layout.tile}, 3]"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        lined_board(blank(128, 128, BLACK), layout, tiles, WHITE)
+
+
+LAMP = np.stack([blank(2, 2, BLACK), blank(2, 2, WHITE)])
+
+
+@pytest.mark.parametrize(
+    ("codes", "message"),
+    [
+        ((2, [[0, 1]]), "place 0 (Slot at x 3, y 1) has no picture 2: codes are 0 to 1"),
+        ((-1, [[0, 1]]), "place 0 (Slot at x 3, y 1) has no picture -1: codes are 0 to 1"),
+        (
+            (0, [[0, 1], [7, 0]]),
+            "place 1 (TileGrid at x 0, y 4), row 1, column 0, has no picture 7: codes are 0 to 1",
+        ),
+        ((0,), "got 1 codes for 2 places"),
+        (([0, 0], [[0, 1]]), "place 0 (Slot at x 3, y 1) wants a single code, got shape [2]"),
+        (
+            (0, [0, 1]),
+            "place 1 (TileGrid at x 0, y 4) wants codes [rows, columns], got shape [2]",
+        ),
+        (
+            (0, [[0], [0], [0]]),
+            "place 1 (TileGrid at x 0, y 4) does not fit the screen: it reaches to x 2, y 10, of 8",
+        ),
+    ],
+)
+def test_codes_that_a_screen_cannot_show_are_refused_in_one_line(codes, message):
+    layers = Layers(blank(8, 8, BLACK), Slot(LAMP, 3, 1), TileGrid(LAMP, 0, 4))
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        layers.draw(*(jnp.asarray(code) for code in codes))
 
 
 @settings(max_examples=30, deadline=None)

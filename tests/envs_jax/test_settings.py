@@ -89,7 +89,7 @@ def batch_steps(game):
     batch = batched.init(env_keys(3, 4), jnp.zeros(4, bool))
     out = [batch]
     for action in range(3):
-        batch, stepped, outcome, frames = batched.step_auto(batch, jnp.full(4, action))
+        batch, stepped, outcome, frames = batched.step_autoreset(batch, jnp.full(4, action))
         out += [batch, stepped, outcome, frames]
     return jax.tree.map(np.asarray, out)
 

@@ -10,7 +10,7 @@ from arcade_torch.envs_jax import make, probe_ids, registered_ids
 from arcade_torch.envs_jax.game import RIGHT
 from arcade_torch.envs_jax.oracles import make_oracle, oracle_return, play, random_return
 from arcade_torch.envs_jax.render.palette import YELLOW
-from arcade_torch.envs_jax.signpost.picture import BLANK, GATE, KINDS, OPEN, sign_pictures
+from arcade_torch.envs_jax.signpost.renderer import BLANK, GATE, KINDS, OPEN, sign_pictures
 
 from .conftest import Walk, draw, one, random_actions
 

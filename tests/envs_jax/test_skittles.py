@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.skittles.oracle import UNSEEN, Planner, outlook
-from arcade_torch.envs_jax.skittles.picture import AGENT
-from arcade_torch.envs_jax.skittles.rules import NO_BLOCK, shown
+from arcade_torch.envs_jax.skittles.renderer import AGENT
+from arcade_torch.envs_jax.skittles.rules import NO_BLOCK, visible_rows
 
 from .conftest import Walk, batched, draw, going_on, one, random_actions
 
@@ -199,7 +199,7 @@ def masks(rules, envs=512, steps=30):
     [steps, envs, row].
     """
     states = Walk(make(HARD, rules=rules), random_actions(steps, envs, seed=6), seed=6).states
-    visible = np.asarray(jax.jit(jax.vmap(jax.vmap(shown)))(states))
+    visible = np.asarray(jax.jit(jax.vmap(jax.vmap(visible_rows)))(states))
     return visible[1:], states.column[1:]
 
 
@@ -236,7 +236,7 @@ def test_blocks_colours_and_agent_can_be_read_back_from_both_twins(size):
             expected = np.where(
                 state.column[..., None] == np.arange(10), 1 + state.colour[..., None], 0
             )
-            visible = np.asarray(jax.vmap(shown)(batch.state))[..., None]
+            visible = np.asarray(jax.vmap(visible_rows)(batch.state))[..., None]
             for partial, codes in ((False, expected), (True, expected * visible)):
                 codes = codes.copy()
                 codes[np.arange(16), 9, state.x] = AGENT

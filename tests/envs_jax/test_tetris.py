@@ -18,8 +18,8 @@ from arcade_torch.envs_jax import Batch, env_keys, make
 from arcade_torch.envs_jax.oracles import RandomPlayer, _play_block, make_oracle
 from arcade_torch.envs_jax.tetris import rules as law
 from arcade_torch.envs_jax.tetris.oracle import drop_rows, plan, put, read_board, read_preview
-from arcade_torch.envs_jax.tetris.params import LEVELS, SHAPES
-from arcade_torch.envs_jax.tetris.picture import BAND
+from arcade_torch.envs_jax.tetris.renderer import BAND
+from arcade_torch.envs_jax.tetris.rules import LEVELS, SHAPES
 
 from .conftest import Walk, batched, draw, random_actions
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from arcade_torch.envs_jax import make
 from arcade_torch.envs_jax.game import FIRE
 from arcade_torch.envs_jax.tetris import rules as tetris
-from arcade_torch.envs_jax.tetris.params import GOAL, MAX_STEPS, TOP_OUT_REWARD
+from arcade_torch.envs_jax.tetris.rules import GOAL, MAX_STEPS, TOP_OUT_REWARD
 
 Correct = Callable[[Any, Any], None]
 """``(game, fixed)``: change ``game``, a copy of the reference rules, with parts of ``fixed``, the

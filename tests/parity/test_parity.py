@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import env_keys, make, registered_ids
-from arcade_torch.envs_jax.navigator.params import LEVELS as MAPS
-from arcade_torch.envs_jax.tetris.params import SHAPES
+from arcade_torch.envs_jax.navigator.rules import LEVELS as MAPS
+from arcade_torch.envs_jax.tetris.rules import SHAPES
 from tests.parity.reference import published, resets, without_picture
 from tests.parity.translations import TASKS, translation_of
 from tests.parity.walk import STEPS, walk

@@ -5,8 +5,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.breakout.params import BRICKS, COLUMNS, ROWS, WALL_ROWS, WALL_TOP
-from arcade_torch.envs_jax.breakout.rules import BreakoutState
+from arcade_torch.envs_jax.breakout.rules import (
+    BRICKS,
+    COLUMNS,
+    ROWS,
+    WALL_ROWS,
+    WALL_TOP,
+    BreakoutState,
+)
 from tests.parity.translation import Array, Translation, any_flag, number
 
 

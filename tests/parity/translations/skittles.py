@@ -7,8 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.skittles.params import CELLS, MAX_STEPS
-from arcade_torch.envs_jax.skittles.rules import NO_BLOCK, SkittlesState
+from arcade_torch.envs_jax.skittles.rules import CELLS, MAX_STEPS, NO_BLOCK, SkittlesState
 from tests.parity.translation import Array, Translation, number
 
 

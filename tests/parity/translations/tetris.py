@@ -11,8 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.tetris.params import COLUMNS, PIECES, ROWS
-from arcade_torch.envs_jax.tetris.rules import TetrisState
+from arcade_torch.envs_jax.tetris.rules import COLUMNS, PIECES, ROWS, TetrisState
 from tests.parity.translation import Array, Translation, any_flag, number, small
 
 

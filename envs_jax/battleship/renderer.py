@@ -7,9 +7,8 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.battleship.params import SHIP_CELLS, Params
-from arcade_torch.envs_jax.battleship.rules import BattleShipState
-from arcade_torch.envs_jax.cursor import cell_mask
+from arcade_torch.envs_jax.battleship.rules import SHIP_CELLS, BattleShipState, Params
+from arcade_torch.envs_jax.boards import cell_mask
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,
@@ -82,7 +81,7 @@ class Screen:
         alone.
         """
         cursor = cell_mask(state.x, state.y, self.layout.cells)
-        shown = (state.guesses == 1) & (cursor | ~jnp.asarray(partial))
+        is_visible = (state.guesses == 1) & (cursor | ~jnp.asarray(partial))
         mark = jnp.where(state.board == 1, HIT, MISS)
-        codes = jnp.where(shown, mark, COVERED) + jnp.where(cursor, KINDS, 0)
+        codes = jnp.where(is_visible, mark, COVERED) + jnp.where(cursor, KINDS, 0)
         return self.layers.draw(state.hits, codes.T)  # boards are [x, y], pictures [row, column]

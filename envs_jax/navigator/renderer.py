@@ -6,10 +6,9 @@ import math
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask
+from arcade_torch.envs_jax.boards import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.navigator.params import Params
-from arcade_torch.envs_jax.navigator.rules import FREE, NavigatorState
+from arcade_torch.envs_jax.navigator.rules import FREE, NavigatorState, Params
 from arcade_torch.envs_jax.render import (
     Layers,
     bitmap,

@@ -4,8 +4,7 @@ named.
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.autoencode.params import Params
-from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState
+from arcade_torch.envs_jax.autoencode.rules import AutoEncodeState, Params
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import Layers, number_slot, titled_background
 from arcade_torch.envs_jax.render.palette import HOT_PINK, PALE_BLUE, SCARLET

@@ -5,8 +5,7 @@ before.
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.countrecall.params import Params
-from arcade_torch.envs_jax.countrecall.rules import CountRecallState
+from arcade_torch.envs_jax.countrecall.rules import CountRecallState, Params
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     DIGITS,
@@ -78,7 +77,9 @@ class Screen:
     def __init__(self, size: int, level: Params, counter: tuple[int, int]) -> None:
         self.level = level
         self.counter_range = counter
-        offset, side = (length * (size // 128) for length in FIELD)
+        unit = size // 128
+        offset = FIELD[0] * unit
+        side = FIELD[1] * unit
         background = titled_background(size, "COUNTRECALL", SMOKE, AZURE)
         rectangle(background, offset, offset, offset + side, offset + side, SLATE_BLUE)
         self.score = number_slot(size, level.cards, SMOKE, CRIMSON)
@@ -96,8 +97,7 @@ class Screen:
         now = index == state.timestep
         lowest, highest = self.counter_range
         answer = jnp.clip(state.answer, lowest, highest) - lowest
-        card, query = (
-            jnp.where(now, 1 + pack, NO_CARD).sum() for pack in (state.cards, state.queries)
-        )
+        card = jnp.where(now, 1 + state.cards, NO_CARD).sum()
+        query = jnp.where(now, 1 + state.queries, NO_CARD).sum()
         history = history_codes(state.cards, (index < state.timestep) & ~jnp.asarray(partial))
         return self.layers.draw(state.score, answer, card, query, history)

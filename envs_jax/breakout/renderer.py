@@ -7,16 +7,18 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax.breakout.params import (
+from arcade_torch.envs_jax.breakout.rules import (
     BRICKS,
     COLUMNS,
+    DOWN_RIGHT,
     PADDLE_ROW,
     ROWS,
     WALL_ROWS,
     WALL_TOP,
+    BreakoutState,
     Params,
+    velocity,
 )
-from arcade_torch.envs_jax.breakout.rules import DOWN_RIGHT, BreakoutState, velocity
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,

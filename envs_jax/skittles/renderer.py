@@ -26,8 +26,7 @@ from arcade_torch.envs_jax.render.palette import (
     WHITE,
     YELLOW,
 )
-from arcade_torch.envs_jax.skittles.params import CELLS, MAX_STEPS
-from arcade_torch.envs_jax.skittles.rules import SkittlesState, shown
+from arcade_torch.envs_jax.skittles.rules import CELLS, MAX_STEPS, SkittlesState, visible_rows
 
 BLOCKS = (RED, ORANGE, YELLOW, GREEN, BLUE, SKY, ULTRAVIOLET)
 AGENT = 1 + len(BLOCKS)  # tile codes: empty, then the blocks by colour, then the agent
@@ -54,9 +53,9 @@ class Screen:
         """The frame of a state: uint8 [S, S, 3]. The POMDP twin shows each block in about half of
         the frames.
         """
-        visible = shown(state) | ~jnp.asarray(partial)
+        visible = visible_rows(state) | ~jnp.asarray(partial)
         columns = np.arange(CELLS)
-        here = (columns == state.column[:, None]) & visible[:, None]
-        codes = jnp.where(here, 1 + state.colour[:, None], 0)
+        block = (columns == state.column[:, None]) & visible[:, None]
+        codes = jnp.where(block, 1 + state.colour[:, None], 0)
         agent = (columns[:, None] == CELLS - 1) & (columns == state.x)
         return self.layers.draw(state.time, jnp.where(agent, AGENT, codes))

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.cartpole.params import THETA_LIMIT, X_LIMIT
-from arcade_torch.envs_jax.cartpole.rules import CartPoleState
+from arcade_torch.envs_jax.cartpole.rules import THETA_LIMIT, X_LIMIT, CartPoleState
 from arcade_torch.envs_jax.game import Array
 from arcade_torch.envs_jax.render import (
     Layers,
@@ -220,10 +219,8 @@ class Screen:
             change = np.bitwise_xor(below, colour).astype(np.uint8)
             return TileGrid(mask[:, None, :, None] * change, geo.offset, geo.offset + y, mixed=True)
 
-        above, upon = (
-            lines(y, end, colour, COPPER)
-            for y, colour in ((geo.strip[0], CHARCOAL), (geo.cart_top, PINK))
-        )
+        above = lines(geo.strip[0], end, CHARCOAL, COPPER)
+        upon = lines(geo.cart_top, end, PINK, COPPER)
         return [lines(geo.cart_top, cart, CHARCOAL, PINK), above, above, upon, upon]
 
     def draw(self, state: CartPoleState, partial: Array | bool) -> Array:

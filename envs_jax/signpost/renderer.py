@@ -26,8 +26,7 @@ from arcade_torch.envs_jax.render.palette import (
     WHITE,
     YELLOW,
 )
-from arcade_torch.envs_jax.signpost.params import Params
-from arcade_torch.envs_jax.signpost.rules import SIGNS, SignpostState
+from arcade_torch.envs_jax.signpost.rules import SIGNS, Params, SignpostState
 
 # tile codes; the same again under the walker
 FLOOR = 0

@@ -2,10 +2,9 @@
 
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.cursor import cell_mask
+from arcade_torch.envs_jax.boards import cell_mask
 from arcade_torch.envs_jax.game import Array
-from arcade_torch.envs_jax.minesweeper.params import Params
-from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState
+from arcade_torch.envs_jax.minesweeper.rules import SWEPT, MineSweeperState, Params
 from arcade_torch.envs_jax.render import (
     DIGITS,
     PATTERN,
@@ -67,6 +66,6 @@ class Screen:
         alone.
         """
         cursor = cell_mask(state.x, state.y, self.layout.cells)
-        shown = (state.grid == SWEPT) & (cursor | ~jnp.asarray(partial))
-        codes = jnp.where(shown, 1 + state.neighbours, 0) + jnp.where(cursor, KINDS, 0)
+        is_visible = (state.grid == SWEPT) & (cursor | ~jnp.asarray(partial))
+        codes = jnp.where(is_visible, 1 + state.neighbours, 0) + jnp.where(cursor, KINDS, 0)
         return self.layers.draw(state.score, codes.T)  # boards are [x, y], pictures [row, column]

@@ -30,8 +30,17 @@ from arcade_torch.envs_jax.render.palette import (
     YELLOW,
     Colour,
 )
-from arcade_torch.envs_jax.tetris.params import BOX, COLUMNS, GOAL, ROWS, SHAPES, Params
-from arcade_torch.envs_jax.tetris.rules import TetrisState, complete_rows, covers
+from arcade_torch.envs_jax.tetris.rules import (
+    BOX,
+    COLUMNS,
+    GOAL,
+    ROWS,
+    SHAPES,
+    Params,
+    TetrisState,
+    complete_rows,
+    covers,
+)
 
 # I O T S Z J L
 PIECE_COLOURS: tuple[Colour, ...] = (LAGOON, GOLD, VIOLET, EMERALD, BLOOD, COBALT, AMBER)
@@ -109,8 +118,8 @@ class Screen:
         alone.
         """
         pile = jnp.where(jnp.asarray(partial), EMPTY, state.board)
-        shown = jnp.where(covers(state), (state.piece + 1).astype(jnp.int8), pile)
-        return jnp.where(complete_rows(state.board)[:, None], jnp.int8(BAND), shown)
+        cells = jnp.where(covers(state), (state.piece + 1).astype(jnp.int8), pile)
+        return jnp.where(complete_rows(state.board)[:, None], jnp.int8(BAND), cells)
 
     def draw(self, state: TetrisState, partial: Array | bool) -> Array:
         """The frame of a state: uint8 [S, S, 3]."""
