@@ -41,6 +41,7 @@ OF_NETWORK = (
     "num_outputs",
     "num_actions",
     "out_key",
+    "value_key",
     "state_key",
     "store",
     "encoder",

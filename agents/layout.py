@@ -191,12 +191,9 @@ def unroll(
                 step = _with_state(burn_in[:, t], state, inputs)
                 state = network(step).get("next").select(*inputs.state_keys)
             state = _with_state(extended[:, 0], state, inputs).select(*inputs.state_keys)
-    if (
-        isinstance(network, MemoryNetwork)
-        and network.store == "sequence"
-        and network.out_key == key
-    ):
-        return network.read_sequences(extended, state)  # the same without a TensorDict in between
+    if isinstance(network, MemoryNetwork) and network.store == "sequence" and key in network.heads:
+        # the same without a TensorDict in between
+        return network.read_sequences(extended, state)[key]
     extended = extended.copy()
     if state is not None:
         _begin_with(extended, state, inputs)

@@ -19,7 +19,11 @@ from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.checkpoint import find_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
+from arcade_torch.models.actor_critic import (
+    ActorCriticNetwork,
+    current_names,
+    make_actor_critic,
+)
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network
@@ -43,7 +47,7 @@ def make_policy(
         A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it
         samples. Random numbers come from torch's global generator.
     """
-    if isinstance(network, ActorCriticNetwork):
+    if "logits" in network.out_keys:
         return make_actor(network, deterministic=not explore)
     parts: list[Any] = [network, QValueModule(action_space="categorical")]
     if explore:
@@ -205,9 +209,12 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
-    _check_weights(checkpoint.path, checkpoint.weights, network.state_dict())
+    weights = checkpoint.weights
+    if isinstance(network, ActorCriticNetwork):
+        weights = current_names(weights)
+    _check_weights(checkpoint.path, weights, network.state_dict())
     try:
-        network.load_state_dict(checkpoint.weights)
+        network.load_state_dict(weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise CheckpointError(
