@@ -46,27 +46,23 @@ def check_memory(
     seed: int = 0,
     gradients: bool = True,
 ) -> dict[str, float]:
-    """Check that a module is a lawful memory model.
+    """Check that a module is a correct memory model.
 
-    Works on a copy in float64 and evaluation mode, with random inputs; takes a second or so for
-    small sizes.
+    Works on a copy in evaluation mode, with random inputs; takes a second or so for small sizes.
 
     Args:
-        module: has ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
-            ``initial_state(batch_size)``; ``replay`` is checked too where there is one. A module
-            with ``averages_values = True`` says that its outputs depend on the past through a
-            weighted mean only, as in attention, and has to keep one law more: the same input at
-            every step gives the same output at every step.
+        module: a memory model, see :class:`MemoryContract`; ``replay`` is checked too where there
+            is one. One with ``averages_values = True`` has one law more: the same input at every
+            step gives the same output at every step, as in attention.
         input_size: D; None reads ``module.input_size``.
         dtype: of parameters and inputs during the check. float64 finds the most; take float32,
             bfloat16 or float16 for kernels that know nothing else.
-        tolerance: largest difference allowed between two ways to compute the same outputs or
-            states, as a share of their largest entry where that is above 1; None for 1e-7 in
-            float64, 1e-4 in float32, 0.01 in float16 and 0.1 in bfloat16.
+        tolerance: largest difference allowed between two ways to compute the same, as a share of
+            the largest entry where that is above 1; None for 1e-7 in float64, 1e-4 in float32, 0.01
+            in float16 and 0.1 in bfloat16.
         seed: of the random inputs.
-        gradients: also compare gradients (the slowest law): in float64 with finite differences,
-            which less precise numbers cannot tell; in other types those of one call with those of a
-            call a step.
+        gradients: also compare gradients (the slowest law): in float64 with finite differences, in
+            other types those of one call with those of a call a step.
 
     Returns:
         For each law the largest discrepancy that was found (all within tolerance).
@@ -81,7 +77,20 @@ def check_memory(
         >>> sorted(check_memory(make_memory("mingru", 3, 4)))[:3]
         ['batch rows are independent', 'gradients are right', 'nothing leaks over a start']
     """
-    size = input_size if input_size is not None else getattr(module, "input_size", None)
+    subject = _subject(module, input_size, dtype, tolerance)
+    discrepancies = {}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        for name, law in _laws(module, dtype, gradients).items():
+            discrepancies[name] = law(subject, name)
+    return discrepancies
+
+
+def _subject(
+    module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
+) -> "_Subject":
+    """The copy of a module that is checked."""
+    size = getattr(module, "input_size", None) if input_size is None else input_size
     if not isinstance(size, int):
         raise ValueError(
             "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
@@ -95,25 +104,28 @@ def check_memory(
         raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
     if tolerance is None:
         tolerance = TOLERANCES[dtype]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        subject = _Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
-        laws: list[tuple[str, Callable[[_Subject, str], float]]] = [
-            ("shapes are fixed", _shapes),
-            ("scan equals step by step", _scan_equals_steps),
-            ("several calls equal one", _calls_equal_one),
-            ("packed equals apart", _packed_equals_apart),
-            ("nothing leaks over a start", _no_leak),
-            ("batch rows are independent", _rows_independent),
-        ]
-        if isinstance(module, ReplayableMemory):
-            laws.append(("replay loads stored states", _replay_loads))
-        if getattr(module, "averages_values", False):
-            laws.append(("an average of equal values is that value", _averages))
-        if gradients:
-            exact = dtype == torch.float64
-            laws.append(("gradients are right", _gradients if exact else _gradients_of_steps))
-        return {name: law(subject, name) for name, law in laws}
+    return _Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
+
+
+def _laws(module: nn.Module, dtype: torch.dtype, gradients: bool) -> dict[str, "Law"]:
+    """The laws that a module has to keep, by name."""
+    laws: dict[str, Law] = {
+        "shapes are fixed": _shapes,
+        "scan equals step by step": _scan_equals_steps,
+        "several calls equal one": _calls_equal_one,
+        "packed equals apart": _packed_equals_apart,
+        "nothing leaks over a start": _no_leak,
+        "batch rows are independent": _rows_independent,
+    }
+    if isinstance(module, ReplayableMemory):
+        laws["replay loads stored states"] = _replay_loads
+    if getattr(module, "averages_values", False):
+        laws["an average of equal values is that value"] = _averages
+    if gradients:
+        # less precise numbers are too coarse for finite differences
+        exact = dtype == torch.float64
+        laws["gradients are right"] = _gradients if exact else _gradients_of_steps
+    return laws
 
 
 @dataclass
@@ -160,6 +172,10 @@ class _Subject:
         if not worst <= (self.tolerance if tolerance is None else tolerance):
             raise MemoryLawError(law, f"{found} (largest difference {worst:.2g})", cause, worst)
         return worst
+
+
+Law = Callable[[_Subject, str], float]
+"""Called with the subject and the name of the law; gives the largest discrepancy."""
 
 
 def _difference(p: Tensor, q: Tensor) -> float:
