@@ -202,7 +202,9 @@ class PQNLoss(LossModule):
         # its masks are those of steps
         if data is not tensordict and is_stock(tensordict, self.tensor_keys.is_init):
             rows = tensordict[..., trained]
-            error, chosen, target = (x.reshape(rows.shape) for x in (error, chosen, target))
+            error = error.reshape(rows.shape)
+            chosen = chosen.reshape(rows.shape)
+            target = target.reshape(rows.shape)
         weight = self._maybe_get_priority_weight(rows)
         weight = None if weight is None else expand_as_right(weight, error)
         loss = self._reduce_loss(0.5 * error.square(), rows, weights=weight)

@@ -204,11 +204,15 @@ class QLambdaEstimator(TDLambdaEstimator):
         keys = self.tensor_keys
         if next_value is None:
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
-        names = (keys.reward, keys.done, keys.terminated)
-        reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
-        return q_lambda_return(
-            reward, next_value.squeeze(-1), terminated, done, *self._floats
-        ).unsqueeze(-1)
+        after = tensordict["next"]
+        returns = q_lambda_return(
+            after.get(keys.reward).squeeze(-1),
+            next_value.squeeze(-1),
+            after.get(keys.terminated).squeeze(-1),
+            after.get(keys.done).squeeze(-1),
+            *self._floats,
+        )
+        return returns.unsqueeze(-1)
 
 
 class SequenceGAE(nn.Module):

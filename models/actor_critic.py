@@ -232,8 +232,8 @@ def make_actor_critic(
         >>> [tuple(part.shape) for part in network.split(out)]
         [(2, 7, 5), (2, 7)]
     """
-    chosen = preset_of(preset)
-    options.setdefault("head", options.pop("actor_critic_head", chosen.actor_critic_head))
+    settings = preset_of(preset)
+    options.setdefault("head", options.pop("actor_critic_head", settings.actor_critic_head))
     options |= {
         "obs_size": obs_size,
         "num_actions": num_actions,
@@ -241,33 +241,12 @@ def make_actor_critic(
         "store": store,
     }
 
-    if options.get("towers", chosen.towers) == 1:
-        both = make_network(
-            preset,
-            memory,
-            num_outputs=num_actions,
-            out_key="logits",
-            value_key="state_value",
-            state_key=("memory", "both"),
-            **options,
-        )
-        return ActorCriticNetwork(both)
+    def tower(name: str, **more: Any) -> MemoryNetwork:
+        return make_network(preset, memory, state_key=("memory", name), **(options | more))
 
-    actor = make_network(
-        preset,
-        memory,
-        num_outputs=num_actions,
-        out_key="logits",
-        state_key=("memory", "actor"),
-        **options,
-    )
-    options["predicts"] = False
-    critic = make_network(
-        preset,
-        memory,
-        num_outputs=1,
-        out_key="state_value",
-        state_key=("memory", "critic"),
-        **options,
-    )
+    if options.get("towers", settings.towers) == 1:
+        both = tower("both", num_outputs=num_actions, out_key="logits", value_key="state_value")
+        return ActorCriticNetwork(both)
+    actor = tower("actor", num_outputs=num_actions, out_key="logits")
+    critic = tower("critic", num_outputs=1, out_key="state_value", predicts=False)
     return ActorCriticNetwork(actor, critic)
