@@ -377,11 +377,11 @@ def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: Networ
     """
     for key in inputs.state_keys:
         first = state.get(key)
-        every = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
+        states = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
         if not inputs.reads_first_state_only:
-            stored = sequences.get(key, torch.zeros_like(every))
-            every = torch.cat((every[:, :1], stored[:, 1:]), dim=1)
-        sequences[key] = every
+            stored = sequences.get(key, torch.zeros_like(states))
+            states = torch.cat((states[:, :1], stored[:, 1:]), dim=1)
+        sequences[key] = states
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:

@@ -49,16 +49,21 @@ def make_policy(
     """
     if "logits" in network.out_keys:
         return make_actor(network, deterministic=not explore)
-    parts: list[Any] = [network, QValueModule(action_space="categorical")]
-    if explore:
-        head = network.head if isinstance(network, MemoryNetwork) else nn.Identity()
-        sizes = [layer.out_features for layer in head.modules() if isinstance(layer, nn.Linear)]
-        parts.append(
-            EGreedyModule(
-                Categorical(num_actions or [5, *sizes][-1]), eps_init=float(epsilon), eps_end=0.0
-            )
-        )
-    return TensorDictSequential(*parts)
+    greedy = QValueModule(action_space="categorical")
+    if not explore:
+        return TensorDictSequential(network, greedy)
+    actions = Categorical(num_actions or _num_outputs(network))
+    exploring = EGreedyModule(actions, eps_init=float(epsilon), eps_end=0.0)
+    return TensorDictSequential(network, greedy, exploring)
+
+
+def _num_outputs(network: nn.Module) -> int:
+    """Outputs of the last linear layer in a network's head; 5 if it has none."""
+    size = 5
+    for layer in getattr(network, "head", nn.Identity()).modules():
+        if isinstance(layer, nn.Linear):
+            size = layer.out_features
+    return size
 
 
 class Agent(TensorDictModuleBase):
@@ -127,22 +132,18 @@ class Agent(TensorDictModuleBase):
             return logits.argmax(-1), {"logits": logits, "state_value": value}, state
         return out.argmax(-1), {"q_value": out}, state
 
-    def outputs(self, out: Tensor, what: str) -> Tensor:
+    def outputs(self, out: Tensor, quantity: str) -> Tensor:
         """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else
         ValueError).
 
         ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``:
         of the state, [..., 1], the best of its Q-values where it has these.
         """
-        require(
-            what in self.offers,
-            "what",
-            what,
-            f"one that this agent offers: {', '.join(self.offers)}",
-        )
+        allowed = f"one that this agent offers: {', '.join(self.offers)}"
+        require(quantity in self.offers, "quantity", quantity, allowed)
         if isinstance(self.network, ActorCriticNetwork):
-            return self.network.select(out, what)
-        return out.amax(-1, keepdim=True) if what == "value" else out
+            return self.network.select(out, quantity)
+        return out.amax(-1, keepdim=True) if quantity == "value" else out
 
 
 def build_network(config: TrainConfig) -> Network:

@@ -149,7 +149,7 @@ def _take(rows: Tensor, index: Tensor) -> Tensor:
     return taken
 
 
-def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Tensor, Tensor]:
+def _angles_from(first: Tensor, count: int, sign: int, template: Tensor) -> tuple[Tensor, Tensor]:
     """Cosine and sine [B, count, W // 2] of positions first, first + 1, ..., by the sum of angles
     (B + count of them).
 
@@ -157,10 +157,12 @@ def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Te
         first: int64 [B].
         count: how many positions.
         sign: -1 for the angles of the way back.
-        like: gives width and dtype.
+        template: gives width and dtype.
     """
-    cos, sin = angles(first.unsqueeze(-1), like.shape[-1], like.dtype)
-    cosine, sine = angles(torch.arange(count, device=first.device), like.shape[-1], like.dtype)
+    cos, sin = angles(first.unsqueeze(-1), template.shape[-1], template.dtype)
+    cosine, sine = angles(
+        torch.arange(count, device=first.device), template.shape[-1], template.dtype
+    )
     return cos * cosine - sin * sine, sign * (sin * cosine + cos * sine)
 
 

@@ -141,9 +141,9 @@ class _Subject:
 
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
-        like = next(self.module.parameters(), torch.zeros(0))
+        weight = next(self.module.parameters(), torch.zeros(0))
         return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(
-            like.device, self.dtype
+            weight.device, self.dtype
         )
 
     def inputs(
