@@ -126,11 +126,12 @@ class Agent(TensorDictModuleBase):
         last_action = obs.get("last_action").reshape(steps)
         is_init = obs.get("is_init").reshape(steps)
         out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
-        out = out.squeeze(1)
-        if isinstance(self.network, ActorCriticNetwork):
-            logits, value = self.network.split(out)
-            return logits.argmax(-1), {"logits": logits, "state_value": value}, state
-        return out.argmax(-1), {"q_value": out}, state
+        heads = self.network.by_head(out.squeeze(1))
+        if "logits" in heads:
+            extras = {"logits": heads["logits"], "state_value": heads["state_value"].squeeze(-1)}
+            return extras["logits"].argmax(-1), extras, state
+        extras = {"q_value": heads["action_value"]}
+        return extras["q_value"].argmax(-1), extras, state
 
     def outputs(self, out: Tensor, quantity: str) -> Tensor:
         """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else

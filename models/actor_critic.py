@@ -8,7 +8,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import Store, batch_shape
+from arcade_torch.models.memory import Key, Store, batch_shape
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network, preset_of
 
@@ -122,9 +122,11 @@ class ActorCriticNetwork(TensorDictModuleBase):
         return TensorDict(states, batch_size=batch_shape(batch_size))
 
     @staticmethod
-    def split(out: Tensor) -> tuple[Tensor, Tensor]:
-        """An output [..., A + 1] as (logits [..., A], value [...])."""
-        return out[..., :-1], out[..., -1]
+    def by_head(out: Tensor) -> dict[Key, Tensor]:
+        """An output [..., A + 1] cut into the heads: ``logits`` [..., A], ``state_value`` [...,
+        1].
+        """
+        return {"logits": out[..., :-1], "state_value": out[..., -1:]}
 
     @classmethod
     def select(cls, out: Tensor, quantity: str) -> Tensor:
@@ -140,13 +142,13 @@ class ActorCriticNetwork(TensorDictModuleBase):
         Raises:
             ValueError: another word.
         """
-        logits, value = cls.split(out)
+        heads = cls.by_head(out)
         if quantity == "logits":
-            return logits
+            return heads["logits"]
         if quantity == "probs":
-            return logits.softmax(-1)
+            return heads["logits"].softmax(-1)
         if quantity == "value":
-            return value.unsqueeze(-1)
+            return heads["state_value"]
         raise ValueError(f"an actor-critic offers {', '.join(cls.offers)}, not {quantity!r}")
 
     def _towers(self) -> dict[str, MemoryNetwork]:
@@ -229,8 +231,8 @@ def make_actor_critic(
         >>> is_init = torch.zeros(2, 7, dtype=torch.bool)
         >>> features = network.encode(frames)
         >>> out, state = network.remember(features, last_action, is_init, network.initial_state(2))
-        >>> [tuple(part.shape) for part in network.split(out)]
-        [(2, 7, 5), (2, 7)]
+        >>> network.by_head(out)["logits"].shape
+        torch.Size([2, 7, 5])
     """
     settings = preset_of(preset)
     options.setdefault("head", options.pop("actor_critic_head", settings.actor_critic_head))

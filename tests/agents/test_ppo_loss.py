@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
 
 import arcade_torch
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
@@ -264,6 +264,41 @@ def test_the_documented_call_works_for_one_tower_and_for_two(memory, towers):
     total(other).backward()
     for p, gradient in zip(network.parameters(), gradients, strict=True):
         torch.testing.assert_close(p.grad, gradient)
+
+
+def test_torchrls_losses_train_actor_and_critic_of_one_tower():
+    network = make_actor_critic("small", "gru", hidden_size=16)
+    env = arcade_torch.make("SkittlesEasy", num_envs=4, seed=1)
+    collector = arcade_torch.ArcadeCollector(env, make_actor(network), 48, final_frames="truncated")
+    options = {"normalize_advantage": False, "entropy_coeff": 0.01}
+    ours = PPOLoss(make_actor(network.actor), network.critic, critic_coeff=0.5, **options)
+    batch = ours.value_estimator(collector.collect())
+    collector.shutdown()
+    with torch.no_grad():  # the values move, so that clipping them is at work
+        for parameter in network.parameters():
+            parameter.add_(torch.full_like(parameter, 0.02))
+    out = ours(batch)
+    assert out["value_clip_fraction"] > 0
+
+    steps = as_steps(batch, ours.inputs, "action", "action_log_prob", *ESTIMATES).copy()
+    theirs = ClipPPOLoss(
+        make_actor(network.actor),
+        network.critic,
+        loss_critic_type="l2",
+        clip_value=True,
+        critic_coeff=0.25,
+        **options,
+    )
+    with set_recurrent_mode(True):
+        expected = theirs(steps.copy())
+        a2c = A2CLoss(make_actor(network.actor), network.critic)(steps.copy())
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        torch.testing.assert_close(out[key], expected[key])
+    a2c["loss_critic"].backward()
+    assert any(
+        parameter.grad is not None and parameter.grad.any()
+        for parameter in network.actor.block.parameters()
+    )
 
 
 def test_a_loss_without_a_critic_needs_an_actor_that_writes_the_value():

@@ -84,11 +84,11 @@ def test_each_tower_alone_gives_its_half_of_the_output(memory):
     state = network.initial_state(3)
     with torch.no_grad():
         out, after = run(network, pixels, last_action, is_init, state)
-        logits, value = network.split(out)
+        heads = network.by_head(out)
         alone, mine = run(network.actor, pixels, last_action, is_init, state["actor"])
         single, theirs = run(network.critic, pixels, last_action, is_init, state["critic"])
-    torch.testing.assert_close(logits, alone)
-    torch.testing.assert_close(value, single.squeeze(-1))
+    torch.testing.assert_close(heads["logits"], alone)
+    torch.testing.assert_close(heads["state_value"], single)
     for name, expected in (("actor", mine), ("critic", theirs)):
         for key in expected.keys(True, True):
             torch.testing.assert_close(after[name][key], expected[key])
