@@ -86,15 +86,15 @@ def insert_final_observations(
     final_steps, used = _final_places(batch, needed=cut & ~terminated)
     order, position = _order_in_time(cut.shape[1], final_steps, used, burn_in)
 
-    steps = {"terminated": terminated, "cut": cut}
-    steps["reward"] = _flat(batch, ("next", "reward"))
-    steps["action"] = _get(batch, "action")
+    outcomes = {"terminated": terminated, "cut": cut}
+    outcomes["reward"] = _flat(batch, ("next", "reward"))
+    outcomes["action"] = _get(batch, "action")
     if "stored_target" in batch:
-        steps["stored_target"] = batch["stored_target"]
+        outcomes["stored_target"] = batch["stored_target"]
 
     out = TensorDict({"position": position}, batch_size=[len(cut)])
-    for name, entry in steps.items():
-        out[name] = entry[:, burn_in:]
+    for name, outcome in outcomes.items():
+        out[name] = outcome[:, burn_in:]
     _add_observations(out, batch, inputs, final_steps, order, burn_in)
     _add_state(out, batch, inputs, burn_in)
     return out

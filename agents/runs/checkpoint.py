@@ -181,7 +181,8 @@ def load_checkpoint(
             f"checkpoint {path} is damaged: {_META} does not describe a run ({error})"
         ) from error
     weights = _read_part(path / _WEIGHTS, sums, _load_weights)
-    if expect is not None and (fields := differing_fields(config, expect)):
+    fields = [] if expect is None else differing_fields(config, expect)
+    if fields:
         raise _OtherRunError(
             f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}"
         )
