@@ -3,7 +3,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -185,6 +185,11 @@ class Memory(nn.Module):
         """Raise ValueError unless shapes and types are those of ``forward`` (``batch_ndim`` 1) or
         ``replay`` (2).
         """
+        self._check_input(x)
+        _check_start_flags(is_init, x)
+        self._check_state(state, x.shape[:batch_ndim])
+
+    def _check_input(self, x: Tensor) -> None:
         if x.ndim != 3 or x.shape[-1] != self.input_size:
             raise ValueError(
                 f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)"
@@ -201,41 +206,42 @@ class Memory(nn.Module):
                 "memory models round too much under autocast: turn it off here, as MemoryModule "
                 "does"
             )
-        if (
-            not isinstance(is_init, Tensor)
-            or is_init.dtype != torch.bool
-            or is_init.shape != x.shape[:2]
-        ):
-            given = (
-                f"{is_init.dtype} {list(is_init.shape)}"
-                if isinstance(is_init, Tensor)
-                else repr(is_init)
-            )
-            raise ValueError(
-                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {given}; [B, T, 1] needs "
-                "squeeze(-1)"
-            )
-        batch = x.shape[:batch_ndim]
-        wanted = self.state_leaves()
-        shapes = {name: (*batch, *shape) for name, (shape, _) in wanted.items()}
+
+    def _check_state(self, state: Any, batch: Sequence[int]) -> None:
         if not isinstance(state, TensorDictBase):
             raise ValueError(
                 "the state must be a TensorDict, as from initial_state(batch_size), got "
                 f"{type(state)}"
             )
-        if set(state.keys()) != set(wanted) or any(
-            state[name].shape != shape for name, shape in shapes.items()
-        ):
-            got = {name: list(leaf.shape) for name, leaf in state.items()}
+        expected = {}
+        for name, (shape, _) in self.state_leaves().items():
+            expected[name] = [*batch, *shape]
+        given = {}
+        for name, leaf in state.items():
+            given[name] = list(leaf.shape)
+        if given != expected:
             raise ValueError(
-                f"the state of {type(self).__name__} must be "
-                f"{ {k: list(v) for k, v in shapes.items()} }, got {got}: "
+                f"the state of {type(self).__name__} must be {expected}, got {given}: "
                 "it belongs to another model or batch size; begin with initial_state(batch_size)"
             )
 
     def extra_repr(self) -> str:
         """Sizes, for printing."""
         return f"input_size={self.input_size}, hidden_size={self.hidden_size}"
+
+
+def _check_start_flags(is_init: Any, x: Tensor) -> None:
+    """Raise ValueError unless start flags are bool [B, T]."""
+    expected = list(x.shape[:2])
+    if not isinstance(is_init, Tensor):
+        given = repr(is_init)
+    elif is_init.dtype != torch.bool or list(is_init.shape) != expected:
+        given = f"{is_init.dtype} {list(is_init.shape)}"
+    else:
+        return
+    raise ValueError(
+        f"is_init must be bool [B, T] = {expected}, got {given}; [B, T, 1] needs squeeze(-1)"
+    )
 
 
 class MemoryModule(TensorDictModuleBase):
