@@ -4,6 +4,7 @@ imports torch.
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import (
@@ -41,6 +42,7 @@ OF_NETWORK = (
     "num_outputs",
     "num_actions",
     "out_key",
+    "value_key",
     "state_key",
     "store",
     "encoder",
@@ -55,10 +57,8 @@ class Range(NamedTuple):
 
 
 Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
-DEVICES = ("cpu", "cpu:0", "cuda", *(f"cuda:{index}" for index in range(128)))
-Device = Annotated[
-    str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", lambda x: x in DEVICES)
-]
+DEVICE = re.compile(r"cpu(:0)?|cuda(:(0|[1-9][0-9]{0,2}))?")
+Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", DEVICE.fullmatch)]
 # Bounded, so that no slip and no file of somebody else asks for all memory there is.
 Count = Annotated[int, Range("a whole number >= 1 (and at most 10**6)", lambda x: 1 <= x <= 10**6)]
 CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: 0 <= x <= 10**15)]
@@ -76,8 +76,8 @@ def require(condition: bool, name: str, value: Any, allowed: str) -> None:
     is allowed.
     """
     if not condition:
-        found = " ".join(line.strip() for line in repr(value).splitlines())
-        raise ValueError(f"{name} must be {allowed}; got {found}")
+        one_line = " ".join(line.strip() for line in repr(value).splitlines())
+        raise ValueError(f"{name} must be {allowed}; got {one_line}")
 
 
 def coerce(name: str, value: Any, kind: Any) -> Any:
@@ -85,35 +85,46 @@ def coerce(name: str, value: Any, kind: Any) -> Any:
     :class:`Range`, forbids it.
     """
     if get_origin(kind) is Annotated:
-        kind, (allowed, holds) = get_args(kind)
+        kind, limits = get_args(kind)
         value = coerce(name, value, kind)
-        require(holds(value), name, value, allowed)
+        require(bool(limits.holds(value)), name, value, limits.allowed)
         return value
     if get_origin(kind) is Literal:
-        choices = get_args(kind)
-        allowed = " or ".join(filter(None, (", ".join(map(repr, choices[:-1])), repr(choices[-1]))))
-        require(isinstance(value, str) and value in choices, name, value, allowed)
-        return value
-    number = isinstance(value, int | float) and not isinstance(value, bool)
+        return _choice(name, value, get_args(kind))
+    if kind == Options:
+        return _options(name, value)
     if kind is int:
-        require(number and value == value // 1, name, value, "a whole number")
+        require(_is_number(value) and value == value // 1, name, value, "a whole number")
         return int(value)
     if kind is float:
-        require((number and abs(value) < 2.0**1000) or value != value, name, value, "a number")
+        too_large = _is_number(value) and abs(value) >= 2.0**1000  # float() would overflow
+        require(_is_number(value) and not too_large, name, value, "a number")
         return float(value)
-    if kind == Options:
-        require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
-        for option, given in value.items():
-            require(
-                survives_json({option: given}),
-                f"{name}.{option}",
-                given,
-                "a value that JSON gives back as it was",
-            )
-        return dict(value)
     words = {str: "a string", bool: "true or false"}
     require(isinstance(value, kind), name, value, words.get(kind, f"a {kind.__name__}"))
     return value
+
+
+def _choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
+    """One of several words."""
+    *first, last = map(repr, choices)
+    allowed = f"{', '.join(first)} or {last}" if first else last
+    require(isinstance(value, str) and value in choices, name, value, allowed)
+    return value  # type: ignore[no-any-return]
+
+
+def _options(name: str, value: Any) -> dict[str, Any]:
+    """A table of options that a config file can hold."""
+    require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
+    for option, given in value.items():
+        kept = survives_json({option: given})
+        require(kept, f"{name}.{option}", given, "a value that JSON gives back as it was")
+    return dict(value)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number, true and false not counted."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def survives_json(value: Any) -> bool:
@@ -130,6 +141,7 @@ class Checked:
     what does not fit.
     """
 
+    # what the names of its fields begin with in messages
     GROUP: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
@@ -244,6 +256,8 @@ class PQNConfig(QConfig):
     2407.04811.
     """
 
+    GROUP: ClassVar[str] = "pqn."
+
     bootstrap: Bootstrap = "next"
     """``"next"``: every step is trained, the last with the observation after it; ``"last"`` (the
     published form): the last step of a window only lends its value, and is trained in the next
@@ -265,6 +279,8 @@ class PPOConfig(LearnerConfig):
     Source: POPGym Arcade (ICML 2026), hyperparameter table of PPO; Schulman et al., arXiv
     1707.06347.
     """
+
+    GROUP: ClassVar[str] = "ppo."
 
     learning_rate: Positive = 1e-4
     """Step size at the start."""
@@ -309,6 +325,7 @@ class DQNConfig(QConfig):
     stored states and burn-in.
     """
 
+    GROUP: ClassVar[str] = "dqn."
     SPLIT: ClassVar[str] = "batch_sequences"
 
     lam: Fraction = 0.0
@@ -362,8 +379,6 @@ class DQNConfig(QConfig):
 
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}
 """The algorithms, and the class of the field with their numbers."""
-for _name, _kind in GROUPS.items():
-    _kind.GROUP = f"{_name}."
 
 
 @dataclass(frozen=True)
@@ -437,27 +452,31 @@ class TrainConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()  # names of games and models are checked when they are made
-        for name, names in (("env_options", OF_ENV), ("network_options", OF_NETWORK)):
-            found = ", ".join(option for option in getattr(self, name) if option in names)
-            self._require(not found, name, f"without {found}, which other fields decide")
-        cells = self.network_options.get("memory_options") or {}
-        require(
-            isinstance(cells, Mapping),
-            "network_options.memory_options",
-            cells,
-            "a table of options of the memory",
-        )
-        graphs = self.device.startswith("cuda") or not self.cuda_graphs
-        self._require(
-            graphs, "cuda_graphs", f"false on device {self.device!r}; it needs a CUDA device"
-        )
+        self._refuse_decided("env_options", OF_ENV)
+        self._refuse_decided("network_options", OF_NETWORK)
+        cell_options = self.network_options.get("memory_options") or {}
+        name = "network_options.memory_options"
+        is_table = isinstance(cell_options, Mapping)
+        require(is_table, name, cell_options, "a table of options of the memory")
+
+        on_cuda = self.device.startswith("cuda")
+        allowed = f"false on device {self.device!r}; it needs a CUDA device"
+        self._require(on_cuda or not self.cuda_graphs, "cuda_graphs", allowed)
+
         envs = self.learner.num_envs
         steps = self.learner.num_steps
         frames = self.learner.frames_per_update
         allowed = f"at least one update of {envs} envs x {steps} steps = {frames} frames"
         self._require(self.total_frames >= frames, "total_frames", allowed)
+
         even = envs % 2 == 0 or self.observability != "mixed"
         require(even, f"{self.algorithm}.num_envs", envs, "even with observability='mixed'")
+
+    def _refuse_decided(self, name: str, decided: tuple[str, ...]) -> None:
+        """Refuse options that other fields decide."""
+        options = getattr(self, name)
+        given = ", ".join(option for option in options if option in decided)
+        self._require(not given, name, f"without {given}, which other fields decide")
 
     @property
     def learner(self) -> LearnerConfig:
@@ -482,11 +501,9 @@ class TrainConfig(Checked):
                 allowed.
         """
         values = _fields_of(cls, plain, "")
-        groups = {
-            name: kind(**_fields_of(kind, values.get(name, {}), f"{name}."))
-            for name, kind in GROUPS.items()
-        }
-        return cls(**values | groups)
+        for name, kind in GROUPS.items():
+            values[name] = kind(**_fields_of(kind, values.get(name, {}), kind.GROUP))
+        return cls(**values)
 
 
 Settings = TrainConfig | Mapping[str, Any]  # a config, or what a ``config.json`` holds
@@ -508,18 +525,20 @@ def differing_values(
     """The same with both values; plain settings that lack a field have its default. See
     `differences`.
     """
-    plain = [
-        config.to_dict() if isinstance(config, TrainConfig) else config for config in (one, other)
-    ]
-    return differences(plain[0], plain[1], TrainConfig().to_dict(), GROUPS, free)
+    default = TrainConfig().to_dict()
+    return differences(_plain(one), _plain(other), default, GROUPS, free)
+
+
+def _plain(settings: Settings) -> Mapping[str, Any]:
+    """Settings as a ``config.json`` holds them."""
+    return settings.to_dict() if isinstance(settings, TrainConfig) else settings
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:
     """Values for the fields of a dataclass; unknown names are refused."""
     require(isinstance(values, Mapping), prefix[:-1] or "a config", values, "a table of fields")
-    known = [item.name for item in dataclasses.fields(cls)]
-    if unknown := [name for name in values if name not in known]:
-        raise ValueError(
-            f"unknown field {prefix + str(unknown[0])!r}; fields: {', '.join(sorted(known))}"
-        )
+    names = sorted(item.name for item in dataclasses.fields(cls))
+    for name in values:
+        if name not in names:
+            raise ValueError(f"unknown field {prefix + str(name)!r}; fields: {', '.join(names)}")
     return dict(values)

@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives import HardUpdate
+from torchrl.objectives.utils import TargetNetUpdater
 
 from arcade_torch.agents.config import DQNConfig
-from arcade_torch.agents.layout import unroll
+from arcade_torch.agents.layout import insert_final_observations, unroll
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.agents.replay import SequenceReplay
@@ -35,6 +35,17 @@ class DQNLoss(PQNLoss):
         return super().targets(data, q, steps) if stored is None else stored[:, :steps]
 
 
+class CopyToTarget(TargetNetUpdater):
+    """Copies the network to the target network, buffers included, which TorchRL's ``HardUpdate``
+    leaves out: the scaling of the input is one.
+    """
+
+    def step(self) -> None:
+        """Copy once."""
+        loss = self.loss_module
+        loss.target_value_network_params.data.update_(loss.value_network_params.data)
+
+
 class DQN(Learner):
     """Puts every window into the replay and learns from sequences drawn from it; arguments as in
     :class:`PQN`.
@@ -47,19 +58,16 @@ class DQN(Learner):
         self, network: TensorDictModuleBase, config: DQNConfig, training: Training
     ) -> None:
         has_target = config.target_every > 0
-        options: Any = {
-            "burn_in": config.burn_in,
-            "delay_value": has_target,
-            "functional": has_target,
-        }
-        loss = DQNLoss(network, time_limit=config.time_limit, **options)
+        loss = DQNLoss(
+            network,
+            time_limit=config.time_limit,
+            burn_in=config.burn_in,
+            delay_value=has_target,
+            functional=has_target,
+        )
         loss.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
         super().__init__(loss, config, training, optimizer="radam")
-        if has_target:
-            # the target parameters are taken care of; it leaves out buffers, so see update()
-            HardUpdate(loss)
-        self.labels = DQNLoss(network, time_limit=config.time_limit, functional=False)
-        self.labels.make_value_estimator(gamma=config.gamma, lmbda=config.lam)
+        self.copy_to_target = CopyToTarget(loss) if has_target else None
         self.replay = SequenceReplay(config.replay_sequences, training.folder)
         self.updates = 0
 
@@ -72,10 +80,8 @@ class DQN(Learner):
             batch = batch.copy().set("stored_target", self._present_targets(batch))
         self.replay.add(batch)
         if len(self.replay) >= max(config.learning_starts, config.batch_sequences):
-            if config.target_every and self.updates % config.target_every == 0:
-                self.loss.target_value_network_params.data.update_(
-                    self.loss.value_network_params.data
-                )
+            if self.copy_to_target is not None and self.updates % config.target_every == 0:
+                self.copy_to_target.step()
             self.updates += 1
             drawn = self.replay.sample(
                 config.batch_sequences, self.training.generator, self.training.device
@@ -88,12 +94,16 @@ class DQN(Learner):
 
     @torch.no_grad()
     def _present_targets(self, batch: TensorDictBase) -> Tensor:
-        """Targets float [N, L] by the present network, row by row to bound memory."""
-        data = self.labels.prepare(batch)
+        """Targets float [N, L] by the present network, row by row to bound memory.
+
+        Whole sequences: a burn-in is part of the loss alone.
+        """
+        inputs = self.loss.inputs
+        data = insert_final_observations(batch, inputs, self.loss.time_limit)
         targets = []
         for row in data.split(1):
-            q = unroll(self.labels.value_network, self.labels.inputs, row, "action_value")
-            targets.append(self.labels.targets(row, q, row["reward"].shape[1]))
+            q = unroll(self.loss.value_network, inputs, row, "action_value")
+            targets.append(self.loss.targets(row, q, row["reward"].shape[1]))
         return torch.cat(targets)
 
     def state_dict(self) -> dict[str, Any]:

@@ -31,9 +31,10 @@ class NetworkInputs:
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
         self.observation_keys = [key for key in keys if key not in self.state_keys]
-        self.stores = {
-            m.store for m in network.modules() if isinstance(m, MemoryModule | MemoryNetwork)
-        }
+        self.stores = set()
+        for module in network.modules():
+            if isinstance(module, MemoryModule | MemoryNetwork):
+                self.stores.add(module.store)
         self.reads_first_state_only = self.stores == {"sequence"}
 
 
@@ -57,15 +58,13 @@ def insert_final_observations(
         batch: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock TorchRL
             batch [..., L] with dense ``("next", ...)`` observations, read as [N, L]. Entries: what
             the network reads, ``action``, ``is_init``, ``("next", "reward" | "terminated" |
-            "truncated")``; the recurrent state before step 0 as ``initial_state`` [N], or per step
-            under the network's own keys (not needed where all rows begin with an episode).
-            TorchRL's masks of padded steps, ``mask`` and ``("collector", "mask")``, are looked at.
+            "truncated")``; the recurrent state as ``initial_state`` [N], or per step under the
+            network's keys (not needed where all rows begin with an episode).
         inputs: of the network.
         time_limit: ``"bootstrap"``: a truncated step needs its true next observation;
             ``"terminal"``: it does not.
         burn_in: first steps that only bring the recurrent state up to date; they are kept apart.
-        **names: where ``action``, ``is_init``, and under "next" ``reward``, ``terminated``,
-            ``truncated`` stand, if not under these names.
+        **names: other names of ``action``, ``is_init``, ``reward``, ``terminated``, ``truncated``.
 
     Returns:
         TensorDict [N] with ``extended`` [N, L + K] (what the network reads), ``position`` int64 [N,
@@ -79,20 +78,48 @@ def insert_final_observations(
         ValueError: a needed next observation or the state at step 0 is missing, or steps do not
             follow each other.
     """
+    batch = _as_sequences(_rename(batch, names), inputs, burn_in)
+    terminated, cut = _ends(batch, time_limit)
+    _check_order(batch, cut)
+
+    # The true next observation is needed where the record stops but the task goes on.
+    final_steps, used = _final_places(batch, needed=cut & ~terminated)
+    order, position = _order_in_time(cut.shape[1], final_steps, used, burn_in)
+
+    outcomes = {"terminated": terminated, "cut": cut}
+    outcomes["reward"] = _flat(batch, ("next", "reward"))
+    outcomes["action"] = _get(batch, "action")
+    if "stored_target" in batch:
+        outcomes["stored_target"] = batch["stored_target"]
+
+    out = TensorDict({"position": position}, batch_size=[len(cut)])
+    for name, outcome in outcomes.items():
+        out[name] = outcome[:, burn_in:]
+    _add_observations(out, batch, inputs, final_steps, order, burn_in)
+    _add_state(out, batch, inputs, burn_in)
+    return out
+
+
+def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
+    """A copy of the batch with the entries that have other names under ours as well."""
     if "steps_to_next_obs" in batch:
         raise ValueError(
             "the batch must be one without MultiStep: use lmbda; got 'steps_to_next_obs'"
         )
     batch = batch.copy()
-    for wanted, name in names.items():
-        after = wanted in ("reward", "terminated", "truncated")
-        batch[("next", wanted) if after else wanted] = _get(
-            batch, unravel_key(("next", name)) if after else name
-        )
+    for name, given in names.items():
+        if name in ("reward", "terminated", "truncated"):
+            batch["next", name] = _get(batch, unravel_key(("next", given)))
+        else:
+            batch[name] = _get(batch, given)
+    return batch
+
+
+def _as_sequences(batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> TensorDictBase:
+    """The batch with one sequence a row, entries [N, L, ...], and start flags [N, L, 1]."""
     if is_stock(batch):
         _check_stored_states(batch, inputs)
-        slices = bool(burn_in) and batch.ndim == 1 and bool(batch["is_init"][1:].any())
-        if slices:
+        if burn_in and batch.ndim == 1 and bool(batch["is_init"][1:].any()):
             raise ValueError(
                 "burn_in must be 0 for a flat batch of several slices: reshape it to [slices, "
                 f"length]; got {burn_in}"
@@ -100,71 +127,161 @@ def insert_final_observations(
         batch = batch.reshape(-1, batch.shape[-1])
     is_init = _flat(batch, "is_init")
     batch["is_init"] = is_init.unsqueeze(-1)
-    terminated = _flat(batch, ("next", "terminated"))
-    truncated = _flat(batch, ("next", "truncated"))
-    done = terminated | truncated
-    cut = done | torch.cat((is_init[:, 1:], torch.ones_like(is_init[:, :1])), dim=1)
-    for key in ("mask", ("collector", "mask")):
-        if key in batch and (mask := _flat(batch, key)).shape == cut.shape:
-            # zeros follow, up to the length of the longest trajectory
-            cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]
     if burn_in >= is_init.shape[1]:
         raise ValueError(
             f"burn_in must be less than the {is_init.shape[1]} steps of the batch; got {burn_in}"
         )
-    terminated = done if time_limit == "terminal" else terminated
-    if (
-        "final_index" not in batch
-        and "step_count" in batch
-        and (counted := ("next", "step_count")) in batch
-    ):
-        follows = cut[:, :-1] | (_flat(batch, counted)[:, :-1] == _flat(batch, "step_count")[:, 1:])
-        if not bool(follows.all()):
-            raise ValueError(
-                "step_count must be that of whole sequences, never shuffled; got a jump within a "
-                "row"
-            )
-    needed = cut & ~terminated
-    index, used = _final_places(batch, needed)
+    return batch
 
-    length = is_init.shape[1] - burn_in
-    steps = torch.arange(length, device=is_init.device).expand(len(is_init), -1)
-    times = torch.cat(
-        (2 * steps, torch.where(used & (index >= burn_in), 2 * (index - burn_in) + 1, 2 * length)),
-        dim=1,
-    )
-    # a place stands right behind its step, unused ones at the end
-    order = times.argsort(dim=1, stable=True)
-    position = order.argsort(dim=1)[:, :length]  # of each observation
 
-    whole = {"terminated": terminated, "cut": cut, "reward": _flat(batch, ("next", "reward"))}
-    whole |= {
-        key: _get(batch, key)
-        for key in ("action", "stored_target")
-        if key == "action" or key in batch
-    }
-    out = TensorDict(
-        {key: value[:, burn_in:] for key, value in whole.items()}, batch_size=[len(is_init)]
-    )
-    out["position"] = position
-    roots = {key: _get(batch, key) for key in inputs.observation_keys}
-    # states of a stock batch
-    if not inputs.reads_first_state_only and "initial_state" not in batch:
-        roots |= {key: batch[key] for key in inputs.state_keys if key in batch}
-    both = {
-        key: torch.cat((root[:, burn_in:], _next(batch, key, index, inputs)), 1)
-        for key, root in roots.items()
-    }
-    out["extended"] = TensorDict(
-        {key: _rows(value, order) for key, value in both.items()}, batch_size=order.shape
-    )
-    if burn_in:
-        out["burn_in"] = TensorDict(
-            {key: root[:, :burn_in] for key, root in roots.items()}, [len(is_init), burn_in]
+def _ends(batch: TensorDictBase, time_limit: str) -> tuple[Tensor, Tensor]:
+    """Behind which steps the task ends, and behind which an episode or its record ends; bool [N,
+    L].
+    """
+    terminated = _flat(batch, ("next", "terminated"))
+    done = terminated | _flat(batch, ("next", "truncated"))
+    is_init = _flat(batch, "is_init")
+
+    # The record ends where the next step opens an episode, and with the last step of a row.
+    last = torch.ones_like(is_init[:, :1])
+    cut = done | torch.cat((is_init[:, 1:], last), dim=1)
+
+    # TorchRL pads trajectories: zeros follow, up to the length of the longest.
+    for key in ("mask", ("collector", "mask")):
+        mask = _flat(batch, key) if key in batch else None
+        if mask is not None and mask.shape == cut.shape:
+            cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]
+
+    if time_limit == "terminal":
+        terminated = done
+    return terminated, cut
+
+
+def _check_order(batch: TensorDictBase, cut: Tensor) -> None:
+    """Refuse a stock batch of shuffled steps."""
+    counted = "step_count" in batch and ("next", "step_count") in batch
+    if "final_index" in batch or not counted:
+        return
+    before = _flat(batch, "step_count")
+    after = _flat(batch, ("next", "step_count"))
+    follows = cut[:, :-1] | (after[:, :-1] == before[:, 1:])
+    if not bool(follows.all()):
+        raise ValueError(
+            "step_count must be that of whole sequences, never shuffled; got a jump within a row"
         )
-    if inputs.state_keys:
-        _add_state(out, batch, inputs, burn_in)
-    return out
+
+
+def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
+    """Steps [N, K] whose next observation is at hand, and which of these places are needed."""
+    final_steps = batch.get("final_index", None)
+    if final_steps is None:
+        count = max(int(needed.sum(1).max()), 1)  # a stock batch has as many places as it needs
+        needed_first = (~needed).to(torch.uint8).argsort(dim=1, stable=True)
+        final_steps = needed_first[:, :count]
+    used = needed.gather(1, final_steps) & batch.get("final_mask", needed.new_ones(()))
+    missing = int(needed.sum() - used.sum())
+    if missing:
+        raise ValueError(
+            "next observations must be stored where needed: collect with final_frames='truncated' "
+            "or 'all', "
+            f"or take time_limit='terminal'; got {missing} missing"
+        )
+    return final_steps, used
+
+
+def _order_in_time(
+    steps: int, final_steps: Tensor, used: Tensor, burn_in: int
+) -> tuple[Tensor, Tensor]:
+    """Sort observations and final observations by time.
+
+    The observation of step t comes at time 2 t, the true next one, if it is used, at 2 t + 1; the
+    places that are not used come last.
+
+    Returns:
+        ``order`` int64 [N, L + K]: what stands at each position, where L and above are final
+        observations; ``position`` int64 [N, L]: where the observation of each step stands.
+    """
+    length = steps - burn_in
+    step = torch.arange(length, device=final_steps.device).expand(len(final_steps), -1)
+    final_step = final_steps - burn_in
+    final_time = torch.where(used & (final_step >= 0), 2 * final_step + 1, 2 * length)
+    time = torch.cat((2 * step, final_time), dim=1)
+    order = time.argsort(dim=1, stable=True)
+    position = order.argsort(dim=1)[:, :length]
+    return order, position
+
+
+def _add_observations(
+    out: TensorDict,
+    batch: TensorDictBase,
+    inputs: NetworkInputs,
+    final_steps: Tensor,
+    order: Tensor,
+    burn_in: int,
+) -> None:
+    """Write ``extended``, observations and final observations in the order of time, and
+    ``burn_in``, the observations before.
+    """
+    keys = list(inputs.observation_keys)
+    if not inputs.reads_first_state_only and "initial_state" not in batch:
+        # a stock batch has a state for every step
+        keys += [key for key in inputs.state_keys if key in batch]
+
+    extended = TensorDict(batch_size=order.shape)
+    before = TensorDict(batch_size=[len(order), burn_in])
+    for key in keys:
+        observation = _get(batch, key)
+        final = _next(batch, key, final_steps, inputs)
+        both = torch.cat((observation[:, burn_in:], final), dim=1)
+        extended[key] = _rows(both, order)
+        before[key] = observation[:, :burn_in]
+    out["extended"] = extended
+    if burn_in:
+        out["burn_in"] = before
+
+
+def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> None:
+    """Write ``initial_state``, the recurrent state before the first step."""
+    if not inputs.state_keys:
+        return
+    first = batch.get("initial_state", None)
+    if first is not None:
+        out["initial_state"] = first.select(*inputs.state_keys)
+        if burn_in and not inputs.reads_first_state_only:
+            _begin_with(out["burn_in"], first, inputs)
+        return
+
+    missing = [key for key in inputs.state_keys if key not in batch]
+    if not missing:
+        state = TensorDict(batch_size=out.batch_size)
+        for key in inputs.state_keys:
+            state[key] = batch[key][:, 0]
+        out["initial_state"] = state
+    elif not bool(batch["is_init"][:, 0].all()):
+        raise ValueError(
+            f"the batch begins in mid-episode but has neither 'initial_state' nor {missing[0]!r}"
+        )
+
+
+def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs) -> Tensor:
+    """An entry of the observations [N, K] behind some steps; nothing begins there, so no state is
+    read.
+    """
+    if key == "is_init":
+        return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
+    if key == "pixels" and "final_pixels" in batch:
+        return batch["final_pixels"]  # type: ignore[no-any-return]
+    value = batch.get(unravel_key(("next", key)), None)
+    if value is None and key == "last_action":
+        value = batch.get("action", None)
+    if value is None and key in inputs.state_keys:
+        value = batch.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"no next observations: neither 'final_pixels' nor ('next', {key!r}); take collect() "
+            "or 'all'"
+        )
+    return _rows(value, steps)
 
 
 def unroll(
@@ -181,22 +298,19 @@ def unroll(
     Returns:
         float [B, L + K, ...], the output along the extended sequence.
     """
-    state, burn_in, extended = (
-        sequences.get(key, None) for key in ("initial_state", "burn_in", "extended")
-    )
-    # no gradient: it only brings the state up to date (R2D2)
+    extended = sequences["extended"]
+    state = sequences.get("initial_state", None)
+    burn_in = sequences.get("burn_in", None)
     if burn_in is not None and inputs.state_keys:
+        # no gradient: it only brings the state up to date (R2D2)
         with torch.no_grad(), set_recurrent_mode(False):
             for t in range(burn_in.shape[1]):
                 step = _with_state(burn_in[:, t], state, inputs)
                 state = network(step).get("next").select(*inputs.state_keys)
             state = _with_state(extended[:, 0], state, inputs).select(*inputs.state_keys)
-    if (
-        isinstance(network, MemoryNetwork)
-        and network.store == "sequence"
-        and network.out_key == key
-    ):
-        return network.read_sequences(extended, state)  # the same without a TensorDict in between
+    if isinstance(network, MemoryNetwork) and network.store == "sequence" and key in network.heads:
+        # the same without a TensorDict in between
+        return network.read_sequences(extended, state)[key]
     extended = extended.copy()
     if state is not None:
         _begin_with(extended, state, inputs)
@@ -219,8 +333,9 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     if is_stock(batch):
         _check_stored_states(batch, inputs)
         return batch
-    entries = {key: _get(batch, key) for key in (*inputs.observation_keys, *keys)}
-    out = TensorDict(entries, batch_size=_flat(batch, "is_init").shape)
+    out = TensorDict(batch_size=_flat(batch, "is_init").shape)
+    for key in (*inputs.observation_keys, *keys):
+        out[key] = _get(batch, key)
     if inputs.state_keys:
         _begin_with(out, batch["initial_state"], inputs)
     return out
@@ -230,12 +345,12 @@ def _check_stored_states(batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored
     there get lost.
     """
-    if inputs.reads_first_state_only and "step_count" in batch:
-        within = batch["is_init"].reshape(batch.shape) & (
-            batch["step_count"].reshape(batch.shape) > 0
-        )
-        lost = any(bool(batch[key][within].any()) for key in inputs.state_keys if key in batch)
-        if lost:
+    if not inputs.reads_first_state_only or "step_count" not in batch:
+        return
+    is_init = batch["is_init"].reshape(batch.shape)
+    within_episode = batch["step_count"].reshape(batch.shape) > 0
+    for key in inputs.state_keys:
+        if key in batch and bool(batch[key][is_init & within_episode].any()):
             raise ValueError(
                 "store must be 'step' (of the network) for slices that begin within episodes; got "
                 "'sequence'"
@@ -262,73 +377,19 @@ def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: Networ
     """
     for key in inputs.state_keys:
         first = state.get(key)
-        every = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
+        states = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
         if not inputs.reads_first_state_only:
-            stored = sequences.get(key, torch.zeros_like(every))
-            every = torch.cat((every[:, :1], stored[:, 1:]), dim=1)
-        sequences[key] = every
-
-
-def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
-    """Steps [N, K] whose next observation is at hand, and which of these places are needed."""
-    index = batch.get("final_index", None)
-    if index is None:
-        count = max(int(needed.sum(1).max()), 1)  # a stock batch has as many places as it needs
-        index = (~needed).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
-    used = needed.gather(1, index) & batch.get("final_mask", needed.new_ones(()))
-    missing = int(needed.sum() - used.sum())
-    if missing:
-        raise ValueError(
-            "next observations must be stored where needed: collect with final_frames='truncated' "
-            "or 'all', "
-            f"or take time_limit='terminal'; got {missing} missing"
-        )
-    return index, used
-
-
-def _next(batch: TensorDictBase, key: Key, index: Tensor, inputs: NetworkInputs) -> Tensor:
-    """The entry of the observations [N, K] behind the steps ``index``; nothing begins there, so no
-    state is read.
-    """
-    if key == "is_init":
-        return torch.zeros_like(index, dtype=torch.bool).unsqueeze(-1)
-    if key == "pixels" and "final_pixels" in batch:
-        return batch["final_pixels"]  # type: ignore[no-any-return]
-    other = "action" if key == "last_action" else key if key in inputs.state_keys else None
-    value = batch.get(unravel_key(("next", key)), other and batch.get(other, None))
-    if value is None:
-        raise KeyError(
-            f"no next observations: neither 'final_pixels' nor ('next', {key!r}); take collect() "
-            "or 'all'"
-        )
-    return _rows(value, index)
-
-
-def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> None:
-    """The recurrent state before the first step."""
-    first = batch.get("initial_state", None)
-    if first is not None:
-        out["initial_state"] = first.select(*inputs.state_keys)
-        if burn_in and not inputs.reads_first_state_only:
-            _begin_with(out["burn_in"], first, inputs)
-    elif not (missing := [key for key in inputs.state_keys if key not in batch]):
-        out["initial_state"] = TensorDict(
-            {key: batch[key][:, 0] for key in inputs.state_keys}, out.batch_size
-        )
-    elif not bool(batch["is_init"][:, 0].all()):
-        raise ValueError(
-            f"the batch begins in mid-episode but has neither 'initial_state' nor {missing[0]!r}"
-        )
+            stored = sequences.get(key, torch.zeros_like(states))
+            states = torch.cat((states[:, :1], stored[:, 1:]), dim=1)
+        sequences[key] = states
 
 
 def _rows(value: Tensor, index: Tensor) -> Tensor:
     """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
-    first = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
-    return (
-        value.flatten(0, 1)
-        .index_select(0, (index + first).flatten())
-        .view(*index.shape, *value.shape[2:])
-    )
+    first_of_row = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
+    flat_index = (index + first_of_row).flatten()
+    chosen = value.flatten(0, 1).index_select(0, flat_index)
+    return chosen.view(*index.shape, *value.shape[2:])
 
 
 def _get(batch: TensorDictBase, key: Key) -> Tensor:

@@ -133,7 +133,8 @@ class Learner:
         ).tolist()
         for number, row in enumerate(table):
             for name, text in (("loss", "loss"), ("grad_norm", "gradient norm")):
-                if not math.isfinite(value := row[names.index(name)]):
+                value = row[names.index(name)]
+                if not math.isfinite(value):
                     raise NonFiniteError(
                         f"the {text} is {value} at gradient step {number + 1} of {len(table)}"
                     )

@@ -105,21 +105,19 @@ class EpisodeStats:
         returns = episode_reward.cpu().double().numpy()
         ends = done.cpu().numpy()
         self.finished = returns[ends]
-        # step of the last end
-        latest = np.maximum.accumulate(np.where(ends, np.arange(ends.shape[1]), -1), axis=1)
-        known = np.where(
-            latest >= 0, np.take_along_axis(returns, latest.clip(0), axis=1), self.last[:, None]
-        )
-        self.last = known[:, -1].copy()
+        end_steps = np.where(ends, np.arange(ends.shape[1]), -1)
+        latest_end = np.maximum.accumulate(end_steps, axis=1)
+        returns_at_end = np.take_along_axis(returns, latest_end.clip(0), axis=1)
+        last_returns = np.where(latest_end >= 0, returns_at_end, self.last[:, None])
+        self.last = last_returns[:, -1].copy()
         self.episodes += len(self.finished)
         if len(self.finished):
             mean = float(self.finished.mean())
-            self.smooth = (
-                mean
-                if self.smooth is None
-                else self.smooth + 2 / (EWM_SPAN + 1) * (mean - self.smooth)
-            )
-        return None if np.isnan(known).any() else float(known.mean())
+            if self.smooth is None:
+                self.smooth = mean
+            else:
+                self.smooth += 2 / (EWM_SPAN + 1) * (mean - self.smooth)
+        return None if np.isnan(last_returns).any() else float(last_returns.mean())
 
     def state_dict(self) -> dict[str, Any]:
         """Plain values for a checkpoint."""

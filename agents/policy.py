@@ -19,7 +19,11 @@ from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.checkpoint import find_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
+from arcade_torch.models.actor_critic import (
+    ActorCriticNetwork,
+    current_names,
+    make_actor_critic,
+)
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network
@@ -43,18 +47,23 @@ def make_policy(
         A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it
         samples. Random numbers come from torch's global generator.
     """
-    if isinstance(network, ActorCriticNetwork):
+    if "logits" in network.out_keys:
         return make_actor(network, deterministic=not explore)
-    parts: list[Any] = [network, QValueModule(action_space="categorical")]
-    if explore:
-        head = network.head if isinstance(network, MemoryNetwork) else nn.Identity()
-        sizes = [layer.out_features for layer in head.modules() if isinstance(layer, nn.Linear)]
-        parts.append(
-            EGreedyModule(
-                Categorical(num_actions or [5, *sizes][-1]), eps_init=float(epsilon), eps_end=0.0
-            )
-        )
-    return TensorDictSequential(*parts)
+    greedy = QValueModule(action_space="categorical")
+    if not explore:
+        return TensorDictSequential(network, greedy)
+    actions = Categorical(num_actions or _num_outputs(network))
+    exploring = EGreedyModule(actions, eps_init=float(epsilon), eps_end=0.0)
+    return TensorDictSequential(network, greedy, exploring)
+
+
+def _num_outputs(network: nn.Module) -> int:
+    """Outputs of the last linear layer in a network's head; 5 if it has none."""
+    size = 5
+    for layer in getattr(network, "head", nn.Identity()).modules():
+        if isinstance(layer, nn.Linear):
+            size = layer.out_features
+    return size
 
 
 class Agent(TensorDictModuleBase):
@@ -117,28 +126,25 @@ class Agent(TensorDictModuleBase):
         last_action = obs.get("last_action").reshape(steps)
         is_init = obs.get("is_init").reshape(steps)
         out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
-        out = out.squeeze(1)
-        if isinstance(self.network, ActorCriticNetwork):
-            logits, value = self.network.split(out)
-            return logits.argmax(-1), {"logits": logits, "state_value": value}, state
-        return out.argmax(-1), {"q_value": out}, state
+        heads = self.network.by_head(out.squeeze(1))
+        if "logits" in heads:
+            extras = {"logits": heads["logits"], "state_value": heads["state_value"].squeeze(-1)}
+            return extras["logits"].argmax(-1), extras, state
+        extras = {"q_value": heads["action_value"]}
+        return extras["q_value"].argmax(-1), extras, state
 
-    def outputs(self, out: Tensor, what: str) -> Tensor:
+    def outputs(self, out: Tensor, quantity: str) -> Tensor:
         """Read what ``network.remember`` gave, float [..., R], as one of :attr:`offers` (else
         ValueError).
 
         ``"q"``: Q-values [..., A]; ``"logits"``, ``"probs"``: of the actions [..., A]; ``"value"``:
         of the state, [..., 1], the best of its Q-values where it has these.
         """
-        require(
-            what in self.offers,
-            "what",
-            what,
-            f"one that this agent offers: {', '.join(self.offers)}",
-        )
+        allowed = f"one that this agent offers: {', '.join(self.offers)}"
+        require(quantity in self.offers, "quantity", quantity, allowed)
         if isinstance(self.network, ActorCriticNetwork):
-            return self.network.select(out, what)
-        return out.amax(-1, keepdim=True) if what == "value" else out
+            return self.network.select(out, quantity)
+        return out.amax(-1, keepdim=True) if quantity == "value" else out
 
 
 def build_network(config: TrainConfig) -> Network:
@@ -205,9 +211,12 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     checkpoint = find_checkpoint(Path(path))
     config = checkpoint.config
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
-    _check_weights(checkpoint.path, checkpoint.weights, network.state_dict())
+    weights = checkpoint.weights
+    if isinstance(network, ActorCriticNetwork):
+        weights = current_names(weights)
+    _check_weights(checkpoint.path, weights, network.state_dict())
     try:
-        network.load_state_dict(checkpoint.weights)
+        network.load_state_dict(weights)
     except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise CheckpointError(

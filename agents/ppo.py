@@ -19,7 +19,7 @@ from torchrl.modules import PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce
+from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce, require
 from arcade_torch.agents.layout import Key, NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import SequenceGAE
@@ -98,7 +98,8 @@ class PPOLoss(LossModule):
     Args:
         actor_network: a probabilistic TensorDict module (:func:`make_actor`,
             ``ProbabilisticActor``).
-        critic_network: any TensorDict module that writes ``state_value`` [*, 1].
+        critic_network: any TensorDict module that writes ``state_value`` [*, 1]; None where the
+            actor network writes it beside the logits, so that one pass gives both.
         time_limit: see :class:`SequenceGAE`.
         clip_epsilon: see :func:`ppo_objective`; a buffer, ``loss.clip_epsilon.fill_(...)`` moves
             it.
@@ -136,7 +137,7 @@ class PPOLoss(LossModule):
     functional = True  # see the argument
 
     actor_network: ProbabilisticTensorDictSequential
-    critic_network: TensorDictModuleBase
+    critic_network: TensorDictModuleBase | None
     actor_network_params: Any
     critic_network_params: Any
     target_actor_network_params: Any
@@ -145,7 +146,7 @@ class PPOLoss(LossModule):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        critic_network: TensorDictModuleBase,
+        critic_network: TensorDictModuleBase | None = None,
         *,
         time_limit: TimeLimit = "bootstrap",
         clip_epsilon: float = 0.2,
@@ -160,13 +161,24 @@ class PPOLoss(LossModule):
     ) -> None:
         super().__init__()
         self.functional = functional
-        if functional:
-            self.convert_to_functional(actor_network, "actor_network")
-            self.convert_to_functional(critic_network, "critic_network")
+        self.critic_network = None
+        if critic_network is None:
+            require(
+                self.tensor_keys.value in actor_network.out_keys,
+                "critic_network",
+                critic_network,
+                "given, unless the actor network writes state_value",
+            )
+            self.inputs = NetworkInputs(actor_network)
         else:
+            self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
+        if not functional:
             self.actor_network = actor_network
             self.critic_network = critic_network
-        self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
+        else:
+            self.convert_to_functional(actor_network, "actor_network")
+            if critic_network is not None:
+                self.convert_to_functional(critic_network, "critic_network")
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.clip_value = clip_value
         self.critic_coeff = critic_coeff
@@ -201,14 +213,14 @@ class PPOLoss(LossModule):
         Args:
             value_type: an estimator of TorchRL; None for :class:`SequenceGAE`.
             **hyperparams: of the estimator; of ours ``gamma``, ``lmbda``, ``chunks``, and
-                ``critic``, where the loss's own reads what the actor has written
-                (``ActorCriticNetwork.estimator``).
+                ``critic``, another one than that of the loss.
         """
         if value_type is None:
-            hyperparams = {
-                "critic": self.critic_network,
-                "time_limit": self.time_limit,
-            } | hyperparams
+            critic = self.critic_network
+            if critic is None:
+                critic = self.actor_network.det_part  # without its last part, which draws actions
+            hyperparams.setdefault("critic", critic)
+            hyperparams.setdefault("time_limit", self.time_limit)
             self._value_estimator = SequenceGAE(**hyperparams)
         else:
             of_torchrl = [kind for kind in ValueEstimators if kind is not ValueEstimators.VTrace]
@@ -258,8 +270,10 @@ class PPOLoss(LossModule):
 
         with self._parameters_in(self.actor_network, "actor_network_params"):
             policy = self.actor_network.get_dist(steps)
-        with self._parameters_in(self.critic_network, "critic_network_params"):
-            value = self.critic_network(steps)[keys.value]
+        if self.critic_network is not None:
+            with self._parameters_in(self.critic_network, "critic_network_params"):
+                self.critic_network(steps)
+        value = steps[keys.value]
         terms = ppo_objective(
             log_prob=policy.log_prob(steps[keys.action]).unsqueeze(-1),
             old_log_prob=steps[keys.sample_log_prob].unsqueeze(-1),
@@ -348,8 +362,7 @@ class PPO(Learner):
     """Estimates advantages once a window, then goes over it for some epochs; arguments as in
     :class:`PQN`.
 
-    The network has an ``actor`` (writes ``logits``), a ``critic`` (``state_value``) and the
-    critic's ``estimator``.
+    The network writes ``logits`` and ``state_value``; its ``critic`` writes the value alone.
     """
 
     config: PPOConfig
@@ -362,12 +375,12 @@ class PPO(Learner):
             options["advantage_norm"] = PopArtValueNorm(
                 beta=config.advantage_decay, epsilon=1e-8
             ).to(training.device)
-        loss = PPOLoss(
-            make_actor(network.actor), network.critic, clip_epsilon=config.clip, **options
-        )
-        chunks = config.minibatches
+        loss = PPOLoss(make_actor(network), clip_epsilon=config.clip, **options)
         loss.make_value_estimator(
-            gamma=config.gamma, lmbda=config.lam, chunks=chunks, critic=network.estimator
+            gamma=config.gamma,
+            lmbda=config.lam,
+            chunks=config.minibatches,
+            critic=network.critic,
         )
         super().__init__(loss, config, training, optimizer="adam")
 

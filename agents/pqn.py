@@ -3,7 +3,7 @@ without.
 """
 
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,44 +181,50 @@ class PQNLoss(LossModule):
             KeyError: an entry is missing.
             ValueError: a needed next observation or recurrent state is not in the batch.
         """
-        data = tensordict if "position" in tensordict else self.prepare(tensordict)
-        params: Any = self.value_network_params if self.functional else None
-        with (
-            nullcontext()
-            if params is None
-            else params.to_module(self.value_network, preserve_module_state=False)
-        ):
-            q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
+        prepared = "position" in tensordict
+        data = tensordict if prepared else self.prepare(tensordict)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
-        position = data["position"][:, :steps]
-        action = data["action"][:, :steps]
-        if action.ndim == 3 and action.shape[-1] == q.shape[-1]:  # one-hot
-            action = action.int().argmax(-1)
-        chosen = q.flatten(1).gather(1, position * q.shape[-1] + action.reshape(position.shape))
+        with self._with_parameters():
+            q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
+        chosen = _chosen_values(q, data["position"][:, :steps], data["action"][:, :steps])
         target = self.targets(data, q.detach(), steps)
-        error = chosen - target
+
         rows = tensordict
-        trained = slice(self.burn_in, self.burn_in + steps)
-        # its masks are those of steps
-        if data is not tensordict and is_stock(tensordict, self.tensor_keys.is_init):
-            rows = tensordict[..., trained]
-            error, chosen, target = (x.reshape(rows.shape) for x in (error, chosen, target))
+        if not prepared and is_stock(tensordict, self.tensor_keys.is_init):
+            rows = tensordict[..., self.burn_in : self.burn_in + steps]  # its masks are of steps
+            chosen = chosen.reshape(rows.shape)
+            target = target.reshape(rows.shape)
+        error = chosen - target
         weight = self._maybe_get_priority_weight(rows)
-        weight = None if weight is None else expand_as_right(weight, error)
+        if weight is not None:
+            weight = expand_as_right(weight, error)
         loss = self._reduce_loss(0.5 * error.square(), rows, weights=weight)
-        each = {"q_mean": chosen.detach(), "target_mean": target, "td_error": error.detach().abs()}
-        if data is not tensordict and not tensordict.is_locked:
-            size = each["td_error"].unsqueeze(-1)
-            length = self.burn_in + data["reward"].shape[1]
-            # what is not trained has the mean
-            every = size.mean(-2, keepdim=True).repeat_interleave(length, -2)
-            tensordict[self.tensor_keys.priority] = every.slice_scatter(
-                size, -2, trained.start, trained.stop
-            )
-        means = {
-            key: self._reduce_loss(value, rows, reduction="mean") for key, value in each.items()
-        }
-        return TensorDict(loss=loss, **means, batch_size=[])
+
+        error_size = error.detach().abs()
+        if not prepared and not tensordict.is_locked:
+            tensordict[self.tensor_keys.priority] = self._priority(error_size, data)
+        out = TensorDict({"loss": loss}, batch_size=[])
+        metrics = {"q_mean": chosen.detach(), "target_mean": target, "td_error": error_size}
+        for name, value in metrics.items():
+            out[name] = self._reduce_loss(value, rows, reduction="mean")
+        return out
+
+    def _with_parameters(self) -> AbstractContextManager[Any]:
+        """While open, the network has the loss's parameters."""
+        if not self.functional:
+            return nullcontext()
+        opened: AbstractContextManager[Any] = self.value_network_params.to_module(
+            self.value_network, preserve_module_state=False
+        )
+        return opened
+
+    def _priority(self, error_size: Tensor, data: TensorDictBase) -> Tensor:
+        """The priority of all steps [..., L, 1]: the error where it is trained, else its mean."""
+        steps = error_size.shape[-1]
+        length = self.burn_in + data["reward"].shape[1]
+        size = error_size.unsqueeze(-1)
+        mean = size.mean(-2, keepdim=True).repeat_interleave(length, -2)
+        return mean.slice_scatter(size, -2, self.burn_in, self.burn_in + steps)
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:
@@ -247,6 +253,20 @@ class PQNLoss(LossModule):
         value = q.amax(-1)
         following = (data["position"][:, :steps] + 1).clamp_max(value.shape[1] - 1)
         return value.gather(1, following)
+
+
+def _chosen_values(q: Tensor, position: Tensor, action: Tensor) -> Tensor:
+    """The Q-values of the actions that were taken, float [B, S].
+
+    Args:
+        q: float [B, L + K, A].
+        position: int64 [B, S], where the observation of each step stands.
+        action: categorical [B, S] or [B, S, 1], or one-hot [B, S, A].
+    """
+    num_actions = q.shape[-1]
+    if action.ndim == 3 and action.shape[-1] == num_actions:
+        action = action.int().argmax(-1)
+    return q.flatten(1).gather(1, position * num_actions + action.reshape(position.shape))
 
 
 class PQN(Learner):

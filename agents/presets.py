@@ -122,39 +122,49 @@ def preset(name: str, **changes: Any) -> TrainConfig:
     """
     if name not in _PRESETS:
         raise ValueError(f"unknown preset {name!r}; presets: {', '.join(preset_names())}")
-    values = dict(_PRESETS[name])
-    algorithm, env = (
-        str(changes.get(key, values.get(key, getattr(TrainConfig, key))))
-        for key in ("algorithm", "env")
-    )
+    values = {"algorithm": TrainConfig.algorithm, "env": TrainConfig.env} | _PRESETS[name]
+    algorithm = str(changes.get("algorithm", values["algorithm"]))
+    env = str(changes.get("env", values["env"]))
+    values |= _adjusted_to_game(name, algorithm, env)
+    for group in GROUPS:
+        if group in changes:
+            changes[group] = values.get(group, {}) | _group_changes(
+                group, changes[group], algorithm
+            )
+    values |= changes
+    if "total_frames" in changes:
+        total_frames = coerce("total_frames", changes["total_frames"], int)
+        for interval, parts in (("eval_every", 5), ("checkpoint_every", 10)):
+            if interval not in changes:
+                usual = values.get(interval, getattr(TrainConfig, interval))
+                values[interval] = min(usual, max(1, total_frames // parts))
+    return TrainConfig.from_dict(values)
+
+
+def _adjusted_to_game(name: str, algorithm: str, env: str) -> dict[str, Any]:
+    """The values of a preset that depend on the algorithm and the game."""
+    values: dict[str, Any] = {}
     if name == "reference" and algorithm == "ppo":
         values["network_options"] = {"skip": "none", "use_last_action": False}
     if name in ("paper", "reference"):
-        values |= _paper_budget(values, env)
-    if name == "small" and env.startswith(_AT_ONCE + _SURVIVAL):
-        values["ppo"] = values["ppo"] | {"gamma": 0.98 if env.startswith(_AT_ONCE) else 0.995}
-    for group, kind in GROUPS.items():
-        if group in changes:
-            given = changes[group]
-            require(
-                isinstance(given, kind | Mapping),
-                group,
-                given,
-                f"a {kind.__name__} or a table of its fields",
-            )
-            given = dataclasses.asdict(given) if isinstance(given, kind) else dict(given)
-            allowed = f"left out: the algorithm is {algorithm!r}, its numbers are {algorithm}.*"
-            require(group == algorithm or not given, group, given, allowed)
-            changes[group] = values.get(group, {}) | given
-    values |= changes
-    if "total_frames" in changes:
-        frames = coerce("total_frames", changes["total_frames"], int)
-        for every, parts in (("eval_every", 5), ("checkpoint_every", 10)):
-            if every not in changes:
-                values[every] = min(
-                    values.get(every, getattr(TrainConfig, every)), max(1, frames // parts)
-                )
-    return TrainConfig.from_dict(values)
+        values |= _paper_budget(_PRESETS[name], env)
+    if name == "small":
+        if env.startswith(_AT_ONCE):
+            values["ppo"] = _PRESETS[name]["ppo"] | {"gamma": 0.98}
+        elif env.startswith(_SURVIVAL):
+            values["ppo"] = _PRESETS[name]["ppo"] | {"gamma": 0.995}
+    return values
+
+
+def _group_changes(group: str, changes: Any, algorithm: str) -> dict[str, Any]:
+    """The numbers of a learner that are to be changed; only those of the algorithm may be."""
+    kind = GROUPS[group]
+    allowed = f"a {kind.__name__} or a table of its fields"
+    require(isinstance(changes, kind | Mapping), group, changes, allowed)
+    plain = dataclasses.asdict(changes) if isinstance(changes, kind) else dict(changes)
+    allowed = f"left out: the algorithm is {algorithm!r}, its numbers are {algorithm}.*"
+    require(group == algorithm or not plain, group, plain, allowed)
+    return plain
 
 
 def _paper_budget(values: Mapping[str, Any], env: str) -> dict[str, Any]:

@@ -82,7 +82,8 @@ class SequenceReplay:
             key: value.detach().to("cpu", copy=True).contiguous() for key, value in flat.items()
         }
         size = tensors["pixels"].shape[2:]
-        if self._segments and (held := self._segments[-1].data["pixels"].shape[2:]) != size:
+        held = self._segments[-1].data["pixels"].shape[2:] if self._segments else size
+        if held != size:
             raise CheckpointError(
                 f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}"
             )

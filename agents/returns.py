@@ -204,11 +204,15 @@ class QLambdaEstimator(TDLambdaEstimator):
         keys = self.tensor_keys
         if next_value is None:
             next_value = self._next_value(tensordict, target_params, kwargs=kwargs)
-        names = (keys.reward, keys.done, keys.terminated)
-        reward, done, terminated = (tensordict.get(("next", name)).squeeze(-1) for name in names)
-        return q_lambda_return(
-            reward, next_value.squeeze(-1), terminated, done, *self._floats
-        ).unsqueeze(-1)
+        after = tensordict["next"]
+        returns = q_lambda_return(
+            after.get(keys.reward).squeeze(-1),
+            next_value.squeeze(-1),
+            after.get(keys.terminated).squeeze(-1),
+            after.get(keys.done).squeeze(-1),
+            *self._floats,
+        )
+        return returns.unsqueeze(-1)
 
 
 class SequenceGAE(nn.Module):
@@ -265,25 +269,36 @@ class SequenceGAE(nn.Module):
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
-        names = {name: self.names[name] for name in ("reward", "terminated")}
-        data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
-        with (
-            nullcontext()
-            if params is None
-            else params.to_module(self.critic, preserve_module_state=False)
-        ):
-            values = [
-                unroll(self.critic, self.inputs, rows, self.names["value"])
-                for rows in data.chunk(self.chunks)
-            ]
-        value = torch.cat(values).squeeze(-1)
-        position = data["position"]
-        here = value.gather(1, position)
-        following = value.gather(1, (position + 1).clamp_max(value.shape[1] - 1))
-        advantage = gae(
-            data["reward"], here, following, data["terminated"], data["cut"], self.gamma, self.lmbda
+        data = insert_final_observations(
+            batch,
+            self.inputs,
+            self.time_limit,
+            reward=self.names["reward"],
+            terminated=self.names["terminated"],
         )
-        entries = {"advantage": advantage, "value_target": advantage + here, "value": here}
+        opened: Any = nullcontext()
+        if params is not None:
+            opened = params.to_module(self.critic, preserve_module_state=False)
+        values = []
+        with opened:
+            for rows in data.chunk(self.chunks):
+                values.append(unroll(self.critic, self.inputs, rows, self.names["value"]))
+        values_in_time = torch.cat(values).squeeze(-1)
+
+        position = data["position"]
+        value = values_in_time.gather(1, position)
+        last = values_in_time.shape[1] - 1
+        next_value = values_in_time.gather(1, (position + 1).clamp_max(last))
+        advantage = gae(
+            data["reward"],
+            value,
+            next_value,
+            data["terminated"],
+            data["cut"],
+            self.gamma,
+            self.lmbda,
+        )
+        entries = {"advantage": advantage, "value_target": advantage + value, "value": value}
         shape = batch.shape if is_stock(batch) else advantage.shape
         for key, entry in entries.items():
             batch[self.names[key]] = entry.reshape(shape).unsqueeze(-1)

@@ -227,9 +227,9 @@ class Trainer:
                 self.frames,
                 f"{checkpoint.frames}, as in its name",
             )
-            made = self.updates * self.config.learner.frames_per_update
+            updated_frames = self.updates * self.config.learner.frames_per_update
             require(
-                self.frames == made,
+                self.frames == updated_frames,
                 "updates",
                 self.updates,
                 f"as many as make {self.frames} frames",
@@ -412,10 +412,10 @@ class _Run:
         self._report("interrupted")
         return TrainResult(self.folder.path, "interrupted", trainer.frames, trainer.seconds)
 
-    def _crossed(self, every: int) -> bool:
-        """Whether the last update passed a multiple of ``every`` frames."""
+    def _crossed(self, interval: int) -> bool:
+        """Whether the last update passed a multiple of ``interval`` frames."""
         before = self.trainer.frames - self.config.learner.frames_per_update
-        return every > 0 and self.trainer.frames // every > before // every
+        return interval > 0 and self.trainer.frames // interval > before // interval
 
     def _evaluate(self) -> EvalResult:
         if self.eval_env is None:

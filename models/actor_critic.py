@@ -1,89 +1,104 @@
 """Actor and critic with memory: a network each, or one for both."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential, dispatch
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import Store
+from arcade_torch.models.memory import Key, Store, batch_shape
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network, preset_of
 
-__all__ = ["ActorCriticNetwork", "make_actor_critic"]
+__all__ = ["ActorCriticNetwork", "current_names", "make_actor_critic"]
 
 
 class ActorCriticNetwork(TensorDictModuleBase):
     """Actor and critic as one TensorDict module, which writes ``logits`` [*, A] and ``state_value``
     [*, 1].
 
-    Either two networks that share nothing but the frames, as in the paper, or one for both at half
-    the price, whose last output is the value. The plain-tensor methods are those of
-    :class:`MemoryNetwork`; their output is [..., A + 1], the value last, and their state has an
-    entry for each network.
+    Either two towers, networks that share nothing but the frames, as in the paper, or one tower
+    with both heads at half the price. The plain-tensor methods are those of :class:`MemoryNetwork`;
+    their output is [..., A + 1], the value last, and their state has an entry for each tower.
 
     Args:
-        actor: gives A logits; without a critic A + 1 outputs.
-        critic: gives one value; sees frames of the same size. Its output and state keys differ from
-            the actor's.
+        actor: writes ``logits``; without a critic ``state_value`` too (``value_key``).
+        critic: writes ``state_value``; sees frames of the same size. Its state key differs from the
+            actor's.
 
     Attributes:
-        actor, critic: TensorDict modules for the terms of a loss; where one network serves both,
-            the critic reads what the actor has written (TorchRL's ``A2CLoss`` has to be given
-            :attr:`estimator`, or it trains no critic).
+        towers: the networks by name: ``"actor"`` and ``"critic"``, or ``"both"``.
+        offers: what :meth:`select` can read an output as.
+
+    Raises:
+        ValueError: without a critic, the actor has no head ``state_value``.
 
     Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent
         actor-critic.
     """
 
     offers = ("logits", "probs", "value")
-    """What :meth:`select` can read an output as."""
 
     def __init__(self, actor: MemoryNetwork, critic: MemoryNetwork | None = None) -> None:
         super().__init__()
-        self.networks = {"both": actor} if critic is None else {"actor": actor, "critic": critic}
-        if critic is None:
-            logits = partial(self.select, what="logits")
-            value = partial(self.select, what="value")
-            self.actor = TensorDictSequential(
-                actor, TensorDictModule(logits, [actor.out_key], ["logits"])
-            )
-            self.critic = TensorDictModule(value, [actor.out_key], ["state_value"])
+        if critic is not None:
+            towers = {"actor": actor, "critic": critic}
+        elif {"logits", "state_value"} <= actor.heads.keys():
+            towers = {"both": actor}
         else:
-            self.actor = actor
-            self.critic = critic
-        self.in_keys = list(
-            dict.fromkeys(key for network in self.networks.values() for key in network.in_keys)
-        )
-        self.out_keys = [*self.actor.out_keys, *self.critic.out_keys]
+            raise ValueError(
+                "without a critic the actor must have the heads logits and state_value "
+                f"(out_key and value_key), got {', '.join(map(str, actor.heads))}"
+            )
+        self.towers = nn.ModuleDict(towers)
+        self.register_load_state_dict_pre_hook(_rename_weights)
+        in_keys: list[Any] = []
+        out_keys: list[Any] = []
+        for tower in towers.values():
+            in_keys.extend(tower.in_keys)
+            out_keys.extend(tower.out_keys)
+        self.in_keys = list(dict.fromkeys(in_keys))  # both read the frames
+        self.out_keys = out_keys
 
     @property
-    def estimator(self) -> TensorDictModuleBase:
-        """What gives ``state_value`` from frames by itself."""
-        return self if "both" in self.networks else self.critic
+    def actor(self) -> MemoryNetwork:
+        """What writes ``logits`` by itself; where one tower has both heads, a view of it."""
+        return self._head("actor", "logits")
+
+    @property
+    def critic(self) -> MemoryNetwork:
+        """What writes ``state_value`` by itself; where one tower has both heads, a view of it."""
+        return self._head("critic", "state_value")
+
+    @property
+    def estimator(self) -> MemoryNetwork:
+        """The same as :attr:`critic`: its name of before."""
+        return self.critic
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Run both, see :meth:`MemoryNetwork.forward`; the value is [*batch, 1]."""
-        return self.critic(self.actor(tensordict))
+        """Run all towers, see :meth:`MemoryNetwork.forward`; the value is [*batch, 1]."""
+        for tower in self.towers.values():
+            tower(tensordict)
+        return tensordict
 
     def compress(self, pixels: Tensor) -> Tensor:
         """What of the frames is worth storing, see :meth:`MemoryNetwork.compress`; the same for
-        both networks.
+        all towers.
         """
-        return next(iter(self.networks.values())).compress(pixels)
+        return self.actor.compress(pixels)
 
     def calibrate(self, pixels: Tensor) -> None:
         """Set the input scaling from frames of random play."""
-        for network in self.networks.values():
-            network.calibrate(pixels)
+        for tower in self._towers().values():
+            tower.calibrate(pixels)
 
     def encode(self, pixels: Tensor) -> Tensor:
-        """Frames to features, float [..., E], of two networks [..., 2 E], the actor's first."""
-        return torch.cat([network.encode(pixels) for network in self.networks.values()], dim=-1)
+        """Frames to features, float [..., E], of two towers [..., 2 E], the actor's first."""
+        features = [tower.encode(pixels) for tower in self._towers().values()]
+        return torch.cat(features, dim=-1)
 
     def remember(
         self, features: Tensor, last_action: Tensor, is_init: Tensor, state: TensorDict
@@ -91,37 +106,35 @@ class ActorCriticNetwork(TensorDictModuleBase):
         """Everything behind :meth:`encode`, see :meth:`MemoryNetwork.remember`; the output is [B,
         T, A + 1].
         """
-        parts = zip(self.networks.items(), features.chunk(len(self.networks), dim=-1), strict=True)
-        read = {
-            name: network.remember(part, last_action, is_init, state[name])
-            for (name, network), part in parts
-        }
-        after = TensorDict(
-            {name: state for name, (_, state) in read.items()}, batch_size=state.batch_size
-        )
-        return torch.cat([out for out, _ in read.values()], dim=-1), after
+        features_of_towers = features.chunk(len(self.towers), dim=-1)
+        outputs = []
+        states = {}
+        for (name, tower), part in zip(self._towers().items(), features_of_towers, strict=True):
+            out, states[name] = tower.remember(part, last_action, is_init, state[name])
+            outputs.append(out)
+        return torch.cat(outputs, dim=-1), TensorDict(states, batch_size=state.batch_size)
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """Recurrent state at the start of an episode, TensorDict [batch_size]."""
-        states = {
-            name: network.initial_state(batch_size) for name, network in self.networks.items()
-        }
-        return TensorDict(
-            states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
-        )
+        states = {}
+        for name, tower in self._towers().items():
+            states[name] = tower.initial_state(batch_size)
+        return TensorDict(states, batch_size=batch_shape(batch_size))
 
     @staticmethod
-    def split(out: Tensor) -> tuple[Tensor, Tensor]:
-        """An output [..., A + 1] as (logits [..., A], value [...])."""
-        return out[..., :-1], out[..., -1]
+    def by_head(out: Tensor) -> dict[Key, Tensor]:
+        """An output [..., A + 1] cut into the heads: ``logits`` [..., A], ``state_value`` [...,
+        1].
+        """
+        return {"logits": out[..., :-1], "state_value": out[..., -1:]}
 
     @classmethod
-    def select(cls, out: Tensor, what: str) -> Tensor:
+    def select(cls, out: Tensor, quantity: str) -> Tensor:
         """Read an output as one of :attr:`offers`.
 
         Args:
             out: float [..., A + 1].
-            what: "logits", "probs" (of the actions) or "value".
+            quantity: "logits", "probs" (of the actions) or "value".
 
         Returns:
             float [..., A], for "value" [..., 1].
@@ -129,11 +142,54 @@ class ActorCriticNetwork(TensorDictModuleBase):
         Raises:
             ValueError: another word.
         """
-        if what not in cls.offers:
-            raise ValueError(f"an actor-critic offers {', '.join(cls.offers)}, not {what!r}")
-        if what == "value":
-            return out[..., -1:]
-        return out[..., :-1].softmax(-1) if what == "probs" else out[..., :-1]
+        heads = cls.by_head(out)
+        if quantity == "logits":
+            return heads["logits"]
+        if quantity == "probs":
+            return heads["logits"].softmax(-1)
+        if quantity == "value":
+            return heads["state_value"]
+        raise ValueError(f"an actor-critic offers {', '.join(cls.offers)}, not {quantity!r}")
+
+    def _towers(self) -> dict[str, MemoryNetwork]:
+        """The towers, with their type."""
+        return dict(self.towers.items())  # type: ignore[arg-type]
+
+    def _head(self, tower: str, head: str) -> MemoryNetwork:
+        towers = self._towers()
+        return towers["both"].only(head) if "both" in towers else towers[tower]
+
+
+OLD_NAMES = {
+    "actor.module.0.": "towers.both.",
+    "actor.": "towers.actor.",
+    "critic.": "towers.critic.",
+}
+"""Names that the weights of an :class:`ActorCriticNetwork` began with up to 0.2, and today's."""
+
+
+def current_names(weights: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Weights of an :class:`ActorCriticNetwork` under the names that they have today.
+
+    Args:
+        weights: what a ``state_dict`` gave, maybe of an older version.
+        prefix: of the actor-critic in a larger module; other weights keep their names.
+    """
+    renamed = {}
+    for name, value in weights.items():
+        for old, new in OLD_NAMES.items():
+            if name.startswith(prefix + old):
+                name = prefix + new + name.removeprefix(prefix + old)
+                break
+        renamed[name] = value
+    return renamed
+
+
+def _rename_weights(network: nn.Module, weights: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Let ``load_state_dict`` take weights of older versions."""
+    renamed = current_names(weights, prefix)
+    weights.clear()
+    weights.update(renamed)
 
 
 def make_actor_critic(
@@ -175,22 +231,24 @@ def make_actor_critic(
         >>> is_init = torch.zeros(2, 7, dtype=torch.bool)
         >>> features = network.encode(frames)
         >>> out, state = network.remember(features, last_action, is_init, network.initial_state(2))
-        >>> [tuple(part.shape) for part in network.split(out)]
-        [(2, 7, 5), (2, 7)]
+        >>> network.by_head(out)["logits"].shape
+        torch.Size([2, 7, 5])
     """
-    chosen = preset_of(preset)
-    options.setdefault("head", options.pop("actor_critic_head", chosen.actor_critic_head))
-    make: Any = partial(
-        make_network, preset, memory, obs_size=obs_size, num_actions=num_actions, store=store
-    )
-    make = partial(make, memory_options=memory_options, **options)
-    if options.get("towers", chosen.towers) == 1:
-        both = make(
-            num_outputs=num_actions + 1, out_key="logits_and_value", state_key=("memory", "both")
-        )
+    settings = preset_of(preset)
+    options.setdefault("head", options.pop("actor_critic_head", settings.actor_critic_head))
+    options |= {
+        "obs_size": obs_size,
+        "num_actions": num_actions,
+        "memory_options": memory_options,
+        "store": store,
+    }
+
+    def tower(name: str, **more: Any) -> MemoryNetwork:
+        return make_network(preset, memory, state_key=("memory", name), **(options | more))
+
+    if options.get("towers", settings.towers) == 1:
+        both = tower("both", num_outputs=num_actions, out_key="logits", value_key="state_value")
         return ActorCriticNetwork(both)
-    actor = make(num_outputs=num_actions, out_key="logits", state_key=("memory", "actor"))
-    critic = make(
-        num_outputs=1, out_key="state_value", state_key=("memory", "critic"), predicts=False
-    )
+    actor = tower("actor", num_outputs=num_actions, out_key="logits")
+    critic = tower("critic", num_outputs=1, out_key="state_value", predicts=False)
     return ActorCriticNetwork(actor, critic)

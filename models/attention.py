@@ -80,7 +80,8 @@ class Attention(Memory):
         """One step: write one slot of a copy of the ring, attend to all that are in use."""
         begins = _known_starts(is_init)
         if begins is None:
-            keys, values = (rows.masked_fill(is_init.unsqueeze(-1), 0) for rows in (keys, values))
+            keys = keys.masked_fill(is_init.unsqueeze(-1), 0)
+            values = values.masked_fill(is_init.unsqueeze(-1), 0)
         step = torch.where(is_init[:, 0], 0, step)
         rotation = angles(step.unsqueeze(1), self.hidden_size, x.dtype)
         slot = (step % self.window)[:, None, None].expand(-1, 1, self.hidden_size)
@@ -107,14 +108,12 @@ class Attention(Memory):
         order = torch.arange(window, device=x.device)
         # positions of the W steps before the chunk; negative: there is none
         past = step.unsqueeze(-1) - window + order
-        keys = rotate_pairs(_take(keys, past % window), *_angles_from(past[:, 0], window, -1, keys))
         none = past < 0
-        keys, values = (
-            rows.masked_fill(none.unsqueeze(-1), 0) for rows in (keys, _take(values, past % window))
-        )
-        keys, values = (
-            torch.cat(pair, dim=1)[:, 1:] for pair in ((keys, self.key(x)), (values, self.value(x)))
-        )
+        keys = rotate_pairs(_take(keys, past % window), *_angles_from(past[:, 0], window, -1, keys))
+        keys = keys.masked_fill(none.unsqueeze(-1), 0)
+        keys = torch.cat((keys, self.key(x)), dim=1)[:, 1:]
+        values = _take(values, past % window).masked_fill(none.unsqueeze(-1), 0)
+        values = torch.cat((values, self.value(x)), dim=1)[:, 1:]
         episode = torch.cat([torch.where(none, -1, 0)[:, 1:], is_init.cumsum(1)], dim=1)
         y = window_attention(self.query(x), keys, values, episode, window)
         index = torch.arange(1, x.shape[1] + 1, device=x.device)
@@ -125,9 +124,8 @@ class Attention(Memory):
         keys = rotate_pairs(keys[:, -window:], *_angles_from(first, window, 1, keys))
         slots = (order - first.unsqueeze(-1)) % window  # which of them stands in each slot
         unused = (order >= step.unsqueeze(-1)).unsqueeze(-1)
-        keys, values = (
-            _take(rows, slots).masked_fill(unused, 0) for rows in (keys, values[:, -window:])
-        )
+        keys = _take(keys, slots).masked_fill(unused, 0)
+        values = _take(values[:, -window:], slots).masked_fill(unused, 0)
         return y, keys, values, step
 
     def replay(self, x: Tensor, stored: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
@@ -151,7 +149,7 @@ def _take(rows: Tensor, index: Tensor) -> Tensor:
     return taken
 
 
-def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Tensor, Tensor]:
+def _angles_from(first: Tensor, count: int, sign: int, template: Tensor) -> tuple[Tensor, Tensor]:
     """Cosine and sine [B, count, W // 2] of positions first, first + 1, ..., by the sum of angles
     (B + count of them).
 
@@ -159,10 +157,12 @@ def _angles_from(first: Tensor, count: int, sign: int, like: Tensor) -> tuple[Te
         first: int64 [B].
         count: how many positions.
         sign: -1 for the angles of the way back.
-        like: gives width and dtype.
+        template: gives width and dtype.
     """
-    cos, sin = angles(first.unsqueeze(-1), like.shape[-1], like.dtype)
-    cosine, sine = angles(torch.arange(count, device=first.device), like.shape[-1], like.dtype)
+    cos, sin = angles(first.unsqueeze(-1), template.shape[-1], template.dtype)
+    cosine, sine = angles(
+        torch.arange(count, device=first.device), template.shape[-1], template.dtype
+    )
     return cos * cosine - sin * sine, sign * (sin * cosine + cos * sine)
 
 
@@ -211,7 +211,9 @@ def window_attention(
     index = torch.arange(stretch, device=query.device)
     cosine, sine = angles(index, query.shape[-1], query.dtype)
     if spare:
-        query, key, value = (F.pad(x, (0, 0, 0, spare)) for x in (query, key, value))
+        query = F.pad(query, (0, 0, 0, spare))
+        key = F.pad(key, (0, 0, 0, spare))
+        value = F.pad(value, (0, 0, 0, spare))
         episode = F.pad(episode, (0, spare), value=-2)
     # acting: what is not seen has been zeroed
     bad = ~value.sum(-1).isfinite() if length > 1 else None
@@ -219,10 +221,10 @@ def window_attention(
         value = value.masked_fill(bad.unsqueeze(-1), 0)  # a weight of zero would not stop it
     queries = rotate_pairs(query.unflatten(1, (count, size)), cosine[past:], sine[past:])
     # Not unfold: its backward is slower, and a graph that is compiled with it has one length.
-    each = (torch.arange(count, device=query.device).unsqueeze(-1) * size + index).flatten()
-    keys, values, episodes = (
-        x.index_select(1, each).unflatten(1, (count, stretch)) for x in (key, value, episode)
-    )
+    stretches = (torch.arange(count, device=query.device).unsqueeze(-1) * size + index).flatten()
+    keys = key.index_select(1, stretches).unflatten(1, (count, stretch))
+    values = value.index_select(1, stretches).unflatten(1, (count, stretch))
+    episodes = episode.index_select(1, stretches).unflatten(1, (count, stretch))
     distance = index[past:, None] - index
     seen = (
         (distance >= 0)
@@ -233,7 +235,7 @@ def window_attention(
     # by row.
     score = queries / math.sqrt(query.shape[-1]) @ rotate_pairs(keys, cosine, sine).mT
     if bad is not None:
-        lost = torch.where(bad, torch.nan, 0.0).to(score.dtype).index_select(1, each)
+        lost = torch.where(bad, torch.nan, 0.0).to(score.dtype).index_select(1, stretches)
         score = score + lost.unflatten(1, (count, 1, stretch))
     y = torch.where(seen, score, -torch.inf).softmax(-1) @ values
     return y.flatten(1, 2)[:, :length]  # type: ignore[no-any-return]

@@ -31,8 +31,10 @@ class MemoryLawError(AssertionError):
         discrepancy: largest absolute difference found, NaN if the law is not about numbers.
     """
 
-    def __init__(self, law: str, found: str, cause: str, discrepancy: float = float("nan")) -> None:
-        super().__init__(f"law {law!r} is broken: {found}. Likely cause: {cause}.")
+    def __init__(
+        self, law: str, symptom: str, cause: str, discrepancy: float = float("nan")
+    ) -> None:
+        super().__init__(f"law {law!r} is broken: {symptom}. Likely cause: {cause}.")
         self.law = law
         self.discrepancy = discrepancy
 
@@ -46,27 +48,23 @@ def check_memory(
     seed: int = 0,
     gradients: bool = True,
 ) -> dict[str, float]:
-    """Check that a module is a lawful memory model.
+    """Check that a module is a correct memory model.
 
-    Works on a copy in float64 and evaluation mode, with random inputs; takes a second or so for
-    small sizes.
+    Works on a copy in evaluation mode, with random inputs; takes a second or so for small sizes.
 
     Args:
-        module: has ``forward(x [B, T, D], state, is_init [B, T]) -> (y [B, T, H], state)`` and
-            ``initial_state(batch_size)``; ``replay`` is checked too where there is one. A module
-            with ``averages_values = True`` says that its outputs depend on the past through a
-            weighted mean only, as in attention, and has to keep one law more: the same input at
-            every step gives the same output at every step.
+        module: a memory model, see :class:`MemoryContract`; ``replay`` is checked too where there
+            is one. One with ``averages_values = True`` has one law more: the same input at every
+            step gives the same output at every step, as in attention.
         input_size: D; None reads ``module.input_size``.
         dtype: of parameters and inputs during the check. float64 finds the most; take float32,
             bfloat16 or float16 for kernels that know nothing else.
-        tolerance: largest difference allowed between two ways to compute the same outputs or
-            states, as a share of their largest entry where that is above 1; None for 1e-7 in
-            float64, 1e-4 in float32, 0.01 in float16 and 0.1 in bfloat16.
+        tolerance: largest difference allowed between two ways to compute the same, as a share of
+            the largest entry where that is above 1; None for 1e-7 in float64, 1e-4 in float32, 0.01
+            in float16 and 0.1 in bfloat16.
         seed: of the random inputs.
-        gradients: also compare gradients (the slowest law): in float64 with finite differences,
-            which less precise numbers cannot tell; in other types those of one call with those of a
-            call a step.
+        gradients: also compare gradients (the slowest law): in float64 with finite differences, in
+            other types those of one call with those of a call a step.
 
     Returns:
         For each law the largest discrepancy that was found (all within tolerance).
@@ -81,7 +79,20 @@ def check_memory(
         >>> sorted(check_memory(make_memory("mingru", 3, 4)))[:3]
         ['batch rows are independent', 'gradients are right', 'nothing leaks over a start']
     """
-    size = input_size if input_size is not None else getattr(module, "input_size", None)
+    subject = _subject(module, input_size, dtype, tolerance)
+    discrepancies = {}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        for name, law in _laws(module, dtype, gradients).items():
+            discrepancies[name] = law(subject, name)
+    return discrepancies
+
+
+def _subject(
+    module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
+) -> "_Subject":
+    """The copy of a module that is checked."""
+    size = getattr(module, "input_size", None) if input_size is None else input_size
     if not isinstance(size, int):
         raise ValueError(
             "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
@@ -95,25 +106,28 @@ def check_memory(
         raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
     if tolerance is None:
         tolerance = TOLERANCES[dtype]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        subject = _Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
-        laws: list[tuple[str, Callable[[_Subject, str], float]]] = [
-            ("shapes are fixed", _shapes),
-            ("scan equals step by step", _scan_equals_steps),
-            ("several calls equal one", _calls_equal_one),
-            ("packed equals apart", _packed_equals_apart),
-            ("nothing leaks over a start", _no_leak),
-            ("batch rows are independent", _rows_independent),
-        ]
-        if isinstance(module, ReplayableMemory):
-            laws.append(("replay loads stored states", _replay_loads))
-        if getattr(module, "averages_values", False):
-            laws.append(("an average of equal values is that value", _averages))
-        if gradients:
-            exact = dtype == torch.float64
-            laws.append(("gradients are right", _gradients if exact else _gradients_of_steps))
-        return {name: law(subject, name) for name, law in laws}
+    return _Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
+
+
+def _laws(module: nn.Module, dtype: torch.dtype, gradients: bool) -> dict[str, "Law"]:
+    """The laws that a module has to keep, by name."""
+    laws: dict[str, Law] = {
+        "shapes are fixed": _shapes,
+        "scan equals step by step": _scan_equals_steps,
+        "several calls equal one": _calls_equal_one,
+        "packed equals apart": _packed_equals_apart,
+        "nothing leaks over a start": _no_leak,
+        "batch rows are independent": _rows_independent,
+    }
+    if isinstance(module, ReplayableMemory):
+        laws["replay loads stored states"] = _replay_loads
+    if getattr(module, "averages_values", False):
+        laws["an average of equal values is that value"] = _averages
+    if gradients:
+        # less precise numbers are too coarse for finite differences
+        exact = dtype == torch.float64
+        laws["gradients are right"] = _gradients if exact else _gradients_of_steps
+    return laws
 
 
 @dataclass
@@ -127,9 +141,9 @@ class _Subject:
 
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
-        like = next(self.module.parameters(), torch.zeros(0))
+        weight = next(self.module.parameters(), torch.zeros(0))
         return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(
-            like.device, self.dtype
+            weight.device, self.dtype
         )
 
     def inputs(
@@ -150,7 +164,7 @@ class _Subject:
     def compare(
         self,
         law: str,
-        found: str,
+        symptom: str,
         cause: str,
         *pairs: tuple[Tensor, Tensor],
         tolerance: float | None = None,
@@ -158,8 +172,12 @@ class _Subject:
         """Largest difference of the pairs; raises if above the tolerance or not a number."""
         worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
         if not worst <= (self.tolerance if tolerance is None else tolerance):
-            raise MemoryLawError(law, f"{found} (largest difference {worst:.2g})", cause, worst)
+            raise MemoryLawError(law, f"{symptom} (largest difference {worst:.2g})", cause, worst)
         return worst
+
+
+Law = Callable[[_Subject, str], float]
+"""Called with the subject and the name of the law; gives the largest discrepancy."""
 
 
 def _difference(p: Tensor, q: Tensor) -> float:
@@ -187,42 +205,7 @@ def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
 
 def _shapes(s: _Subject, law: str) -> float:
     for batch, steps in ((1, 1), (3, 1), (2, 5)):
-        x = s.random(batch, steps)
-        begin = s.initial(batch)
-        out = s.module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
-        parts = (begin, *(out if isinstance(out, tuple) else (out,)))
-        if [isinstance(part, TensorDictBase) for part in parts] != [True, False, True]:
-            found = (
-                f"initial_state and forward gave {', '.join(type(part).__name__ for part in parts)}"
-            )
-            raise MemoryLawError(
-                law, found, "a state is no TensorDict, or forward does not return (y, state)"
-            )
-        y, after = out
-        if (
-            y.shape[:2] != (batch, steps)
-            or y.ndim != 3
-            or y.shape[2] != getattr(s.module, "hidden_size", y.shape[2])
-        ):
-            found = f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]"
-            raise MemoryLawError(
-                law, found, "time and batch are exchanged, or hidden_size is not the width of y"
-            )
-        expected, got = (
-            {k: (list(v.shape), v.dtype) for k, v in _leaves(each).items()}
-            for each in (begin, after)
-        )
-        if expected != got:
-            found = f"initial_state({batch}) has {expected} but forward returned {got}"
-            cause = (
-                "the state grows, lacks the batch dimension, or does not take dtype and device "
-                "from the parameters"
-            )
-            raise MemoryLawError(law, found, cause)
-        if y.dtype != s.dtype:
-            raise MemoryLawError(
-                law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype"
-            )
+        _check_one_shape(s, law, batch, steps)
     x, state, flags = s.inputs(2, 5, 0.3)
     before = state.clone()
     s.module(x, state, flags)
@@ -232,6 +215,53 @@ def _shapes(s: _Subject, law: str) -> float:
         "an in-place write",
         *_pairs(before, state),
     )
+
+
+def _check_one_shape(s: _Subject, law: str, batch: int, steps: int) -> None:
+    """Types, shapes and dtypes of the outputs of ``batch`` sequences of ``steps`` steps."""
+    x = s.random(batch, steps)
+    begin = s.initial(batch)
+    out = s.module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
+    parts = (begin, *(out if isinstance(out, tuple) else (out,)))
+    if [isinstance(part, TensorDictBase) for part in parts] != [True, False, True]:
+        types = ", ".join(type(part).__name__ for part in parts)
+        raise MemoryLawError(
+            law,
+            f"initial_state and forward gave {types}",
+            "a state is no TensorDict, or forward does not return (y, state)",
+        )
+
+    y, after = out
+    width = getattr(s.module, "hidden_size", None)
+    fits = y.ndim == 3 and y.shape[:2] == (batch, steps)
+    if not fits or (width is not None and y.shape[2] != width):
+        raise MemoryLawError(
+            law,
+            f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]",
+            "time and batch are exchanged, or hidden_size is not the width of y",
+        )
+
+    expected = _layout(begin)
+    returned = _layout(after)
+    if expected != returned:
+        raise MemoryLawError(
+            law,
+            f"initial_state({batch}) has {expected} but forward returned {returned}",
+            "the state grows, lacks the batch dimension, or does not take dtype and device "
+            "from the parameters",
+        )
+    if y.dtype != s.dtype:
+        raise MemoryLawError(
+            law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype"
+        )
+
+
+def _layout(state: TensorDict) -> dict[tuple[str, ...], tuple[list[int], torch.dtype]]:
+    """Shape and dtype of the tensors of a state, by path."""
+    layout = {}
+    for path, tensor in _leaves(state).items():
+        layout[path] = (list(tensor.shape), tensor.dtype)
+    return layout
 
 
 def _steps(s: _Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
@@ -251,7 +281,7 @@ def _scan_equals_steps(s: _Subject, law: str) -> float:
             x, state, flags = s.inputs(3, steps, resets)
             y, after = s.module(x, state, flags)
             stepped, stepped_after = _steps(s, x, state, flags)
-            found = (
+            symptom = (
                 f"one call over T={steps} steps {'with' if resets else 'without'} resets and T "
                 "calls of one differ"
             )
@@ -266,7 +296,7 @@ def _scan_equals_steps(s: _Subject, law: str) -> float:
                     + cause
                 )
             worst = max(
-                worst, s.compare(law, found, cause, (y, stepped), *_pairs(after, stepped_after))
+                worst, s.compare(law, symptom, cause, (y, stepped), *_pairs(after, stepped_after))
             )
     return worst
 
@@ -341,17 +371,17 @@ def _no_leak(s: _Subject, law: str) -> float:
     with torch.no_grad():
         other, other_state, _ = s.inputs(2, 9)
         changed, _ = s.module(torch.cat([other[:, :4], x[:, 4:]], 1), other_state, flags)
-        found = "outputs after a start depend on what was before it"
-        worst = max(worst, s.compare(law, found, cause, (y[:, 4:], changed[:, 4:])))
+        symptom = "outputs after a start depend on what was before it"
+        worst = max(worst, s.compare(law, symptom, cause, (y[:, 4:], changed[:, 4:])))
         flags[:, 0] = True
         poisoned = state.apply(
             lambda v: torch.full_like(v, torch.nan) if v.is_floating_point() else v
         )
         clean, after_clean = s.module(x, s.initial(2), flags)
         survived, after_poison = s.module(x, poisoned, flags)
-        found = "a NaN in the carried state comes through a start at index 0"
+        symptom = "a NaN in the carried state comes through a start at index 0"
         pairs = ((clean, survived), *_pairs(after_clean, after_poison))
-        return max(worst, s.compare(law, found, cause, *pairs))
+        return max(worst, s.compare(law, symptom, cause, *pairs))
 
 
 @torch.no_grad()
@@ -447,7 +477,7 @@ def _gradients_of_steps(s: _Subject, law: str) -> float:
         arguments = [given, *parameters]
         gradients.append(torch.autograd.grad((weight * y).sum(), arguments, materialize_grads=True))
     pairs = zip(*gradients, strict=True)
-    found = "the gradients of one call and of a call a step differ"
+    symptom = "the gradients of one call and of a call a step differ"
     return s.compare(
-        law, found, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs
+        law, symptom, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs
     )

@@ -72,20 +72,27 @@ def gru_loop(
         (the state after each step [B, T, H], z and r [B, T, 2 H], c [B, T, H]).
     """
     size = candidate_weight.shape[0]
-    gates, candidates = (part.unbind(1) for part in steps.split([2 * size, size], dim=-1))
+    to_gates, to_candidate = steps.split([2 * size, size], dim=-1)
+    to_gates_of_step = to_gates.unbind(1)
+    to_candidate_of_step = to_candidate.unbind(1)
+    begins = start.unsqueeze(-1).unbind(1)
+    fresh = stored.unbind(1)
+
+    states = []
+    gates = []
+    candidates = []
     h = stored[:, 0]
-    kept = []
-    for t, (begins, fresh) in enumerate(
-        zip(start.unsqueeze(-1).unbind(1), stored.unbind(1), strict=True)
-    ):
-        h = torch.where(begins, fresh, h) if t else h
-        both = torch.sigmoid(torch.addmm(gates[t], h, gates_weight.t()))
-        z, r = both.chunk(2, dim=-1)
-        c = torch.tanh(torch.addmm(candidates[t], r * h, candidate_weight.t()))
+    for t in range(steps.shape[1]):
+        if t > 0:
+            h = torch.where(begins[t], fresh[t], h)
+        z_and_r = torch.sigmoid(torch.addmm(to_gates_of_step[t], h, gates_weight.t()))
+        z, r = z_and_r.chunk(2, dim=-1)
+        c = torch.tanh(torch.addmm(to_candidate_of_step[t], r * h, candidate_weight.t()))
         h = torch.lerp(h, c, z)
-        kept.append((h, both, c))
-    states, gates, candidates = (torch.stack(rows, dim=1) for rows in zip(*kept, strict=True))
-    return states, gates, candidates
+        states.append(h)
+        gates.append(z_and_r)
+        candidates.append(c)
+    return torch.stack(states, dim=1), torch.stack(gates, dim=1), torch.stack(candidates, dim=1)
 
 
 @torch.library.custom_op("arcade_torch::gru_scan", mutates_args=())
@@ -122,11 +129,12 @@ def gru_scan_backward(
     to_gates[..., :size] *= candidates - before
     to_gates[..., size:] *= before
     columns = [x.unbind(1) for x in (to_c, to_gates, 1 - z, r, begins, grad)]
+    by_step = list(zip(*columns, strict=True))
     grad_steps = grad.new_empty(*grad.shape[:2], 3 * size)
     grad_before = torch.empty_like(states)
     carried = torch.zeros_like(states[:, 0])
     for t in range(grad.shape[1] - 1, -1, -1):
-        to_c_t, to_gates_t, keep, r_t, begins_t, grad_t = (column[t] for column in columns)
+        to_c_t, to_gates_t, keep, r_t, begins_t, grad_t = by_step[t]
         d_h = grad_t + carried
         d_c = d_h * to_c_t
         d_reset = d_c @ candidate_weight
@@ -136,9 +144,11 @@ def gru_scan_backward(
         grad_steps[:, t, 2 * size :] = d_c
         grad_before[:, t] = d_before
         carried = d_before.masked_fill(begins_t, 0)
-    d_gates, d_c = (part.flatten(0, 1) for part in grad_steps.split([2 * size, size], dim=-1))
-    to_weights = d_gates.t() @ before.flatten(0, 1), d_c.t() @ (r * before).flatten(0, 1)
-    return grad_steps, *to_weights, grad_before.masked_fill(~begins, 0)
+    d_gates, d_c = grad_steps.split([2 * size, size], dim=-1)
+    grad_gates_weight = d_gates.flatten(0, 1).t() @ before.flatten(0, 1)
+    grad_candidate_weight = d_c.flatten(0, 1).t() @ (r * before).flatten(0, 1)
+    grad_stored = grad_before.masked_fill(~begins, 0)
+    return grad_steps, grad_gates_weight, grad_candidate_weight, grad_stored
 
 
 @gru_scan.register_fake
@@ -179,8 +189,10 @@ def _one_by_one(op: Any) -> Any:
             [x] * info.batch_size if d is None else x.unbind(d)
             for x, d in zip(args, in_dims, strict=True)
         ]
-        found = [op(*row) for row in zip(*rows, strict=True)]
-        return tuple(torch.stack(parts) for parts in zip(*found, strict=True)), (0,) * len(found[0])
+        results = [op(*row) for row in zip(*rows, strict=True)]
+        return tuple(torch.stack(parts) for parts in zip(*results, strict=True)), (0,) * len(
+            results[0]
+        )
 
     return rule
 

@@ -3,7 +3,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
 __all__ = [
-    "Key", "Memory", "MemoryContract", "MemoryModule", "ReplayableMemory", "Store", "replay",
-    "replay_by_steps",
+    "Key", "Memory", "MemoryContract", "MemoryModule", "Recurrence", "ReplayableMemory", "Store",
+    "batch_shape", "replay", "replay_by_steps",
 ]  # fmt: skip
 
 Key = str | tuple[str, ...]
@@ -173,19 +173,23 @@ class Memory(nn.Module):
         """Zeros: TensorDict [batch_size] with :meth:`state_leaves`, in the parameters' dtype and on
         their device.
         """
-        batch = [batch_size] if isinstance(batch_size, int) else list(batch_size)
-        leaves = {
-            name: torch.zeros(
+        batch = batch_shape(batch_size)
+        state = TensorDict({}, batch_size=batch)
+        for name, (shape, dtype) in self.state_leaves().items():
+            state[name] = torch.zeros(
                 *batch, *shape, dtype=dtype or self.like.dtype, device=self.like.device
             )
-            for name, (shape, dtype) in self.state_leaves().items()
-        }
-        return TensorDict(leaves, batch_size=batch)
+        return state
 
     def _check(self, x: Tensor, state: TensorDict, is_init: Tensor, batch_ndim: int = 1) -> None:
         """Raise ValueError unless shapes and types are those of ``forward`` (``batch_ndim`` 1) or
         ``replay`` (2).
         """
+        self._check_input(x)
+        _check_start_flags(is_init, x)
+        self._check_state(state, x.shape[:batch_ndim])
+
+    def _check_input(self, x: Tensor) -> None:
         if x.ndim != 3 or x.shape[-1] != self.input_size:
             raise ValueError(
                 f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)"
@@ -202,41 +206,42 @@ class Memory(nn.Module):
                 "memory models round too much under autocast: turn it off here, as MemoryModule "
                 "does"
             )
-        if (
-            not isinstance(is_init, Tensor)
-            or is_init.dtype != torch.bool
-            or is_init.shape != x.shape[:2]
-        ):
-            given = (
-                f"{is_init.dtype} {list(is_init.shape)}"
-                if isinstance(is_init, Tensor)
-                else repr(is_init)
-            )
-            raise ValueError(
-                f"is_init must be bool [B, T] = {list(x.shape[:2])}, got {given}; [B, T, 1] needs "
-                "squeeze(-1)"
-            )
-        batch = x.shape[:batch_ndim]
-        wanted = self.state_leaves()
-        shapes = {name: (*batch, *shape) for name, (shape, _) in wanted.items()}
+
+    def _check_state(self, state: Any, batch: Sequence[int]) -> None:
         if not isinstance(state, TensorDictBase):
             raise ValueError(
                 "the state must be a TensorDict, as from initial_state(batch_size), got "
                 f"{type(state)}"
             )
-        if set(state.keys()) != set(wanted) or any(
-            state[name].shape != shape for name, shape in shapes.items()
-        ):
-            got = {name: list(leaf.shape) for name, leaf in state.items()}
+        expected = {}
+        for name, (shape, _) in self.state_leaves().items():
+            expected[name] = [*batch, *shape]
+        given = {}
+        for name, leaf in state.items():
+            given[name] = list(leaf.shape)
+        if given != expected:
             raise ValueError(
-                f"the state of {type(self).__name__} must be "
-                f"{ {k: list(v) for k, v in shapes.items()} }, got {got}: "
+                f"the state of {type(self).__name__} must be {expected}, got {given}: "
                 "it belongs to another model or batch size; begin with initial_state(batch_size)"
             )
 
     def extra_repr(self) -> str:
         """Sizes, for printing."""
         return f"input_size={self.input_size}, hidden_size={self.hidden_size}"
+
+
+def _check_start_flags(is_init: Any, x: Tensor) -> None:
+    """Raise ValueError unless start flags are bool [B, T]."""
+    expected = list(x.shape[:2])
+    if not isinstance(is_init, Tensor):
+        given = repr(is_init)
+    elif is_init.dtype != torch.bool or list(is_init.shape) != expected:
+        given = f"{is_init.dtype} {list(is_init.shape)}"
+    else:
+        return
+    raise ValueError(
+        f"is_init must be bool [B, T] = {expected}, got {given}; [B, T, 1] needs squeeze(-1)"
+    )
 
 
 class MemoryModule(TensorDictModuleBase):
@@ -307,44 +312,29 @@ class MemoryModule(TensorDictModuleBase):
         store: Store | None = None,
     ) -> None:
         super().__init__()
-        if store not in (None, "step", "sequence"):
-            raise ValueError(f"store must be 'step', 'sequence' or None, got {store!r}")
         self.memory = memory
         self.in_key = unravel_key(in_key)
         self.out_key = unravel_key(out_key)
-        self.is_init_key = unravel_key(is_init_key)
-        self.default_recurrent_mode = default_recurrent_mode
-        prefix = (state_key,) if isinstance(state_key, str) else tuple(state_key)
-        example = memory.initial_state(1)  # type: ignore[operator]
-        paths = [
-            (key,) if isinstance(key, str) else tuple(key) for key in example.keys(True, False)
-        ]
-        leaves = [path for path in paths if isinstance(example.get(path), Tensor)]
-        self._empty = [
-            p for p in paths if p not in leaves and not any(leaf[: len(p)] == p for leaf in leaves)
-        ]
-        self._state_keys = {(*prefix, *leaf): leaf for leaf in leaves}
-        zeros = not any(
-            example.get(leaf).any() or example.get(leaf).requires_grad for leaf in leaves
-        )
-        if store == "step" and not zeros:
-            raise ValueError(
-                "store='step' needs a memory that begins with zeros and learns no start: take "
-                "'sequence'"
-            )
-        state_bytes = sum(example.get(leaf).nbytes for leaf in leaves)
-        self.store = store or ("step" if zeros and state_bytes <= LARGE_STATE else "sequence")
-        self.in_keys = [self.in_key, *self._state_keys, self.is_init_key]
-        self.out_keys = [self.out_key, *(("next", *key) for key in self._state_keys)]
+        self.recurrence = Recurrence(memory, state_key, is_init_key, default_recurrent_mode, store)
+        self.is_init_key = self.recurrence.is_init_key
+        self.store = self.recurrence.store
+        self.in_keys = [self.in_key, *self.state_keys, self.is_init_key]
+        self.out_keys = [self.out_key, *self.recurrence.next_state_keys]
 
     @property
     def recurrent_mode(self) -> bool:
         """Whether the last batch dimension is read as time."""
-        # late: a second to import, for those who want a memory alone
-        from torchrl.modules import recurrent_mode
+        return self.recurrence.recurrent_mode
 
-        mode = recurrent_mode()
-        return self.default_recurrent_mode if mode is None else bool(mode)
+    @property
+    def default_recurrent_mode(self) -> bool:
+        """The mode outside of ``set_recurrent_mode``."""
+        return self.recurrence.default_recurrent_mode
+
+    @property
+    def state_keys(self) -> Sequence[tuple[str, ...]]:
+        """Keys of the recurrent state, without "next"."""
+        return self.recurrence.state_keys
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -363,67 +353,9 @@ class MemoryModule(TensorDictModuleBase):
                 [*batch, 1].
             KeyError: no input or no start flags.
         """
-        tensordict.set(self.out_key, self.read(tensordict, tensordict[self.in_key]))
+        y = self.recurrence.read(self.memory, tensordict, tensordict[self.in_key])
+        tensordict.set(self.out_key, y)
         return tensordict
-
-    def start_flags(self, tensordict: TensorDictBase) -> Tensor:
-        """The start flags of a tensordict, bool [*batch].
-
-        Raises:
-            ValueError: they are not [*batch, 1].
-            KeyError: there are none.
-        """
-        shape = tensordict.batch_size
-        is_init = tensordict.get(self.is_init_key, None)
-        if is_init is None:
-            raise KeyError(
-                f"no {self.is_init_key!r} in the tensordict: append InitTracker() to the env"
-            )
-        if is_init.shape != (*shape, 1):
-            raise ValueError(
-                f"{self.is_init_key!r} must be bool {[*shape, 1]}, got {list(is_init.shape)}"
-            )
-        return is_init.squeeze(-1)  # type: ignore[no-any-return]
-
-    def read(self, tensordict: TensorDictBase, x: Tensor) -> Tensor:
-        """Like :meth:`forward`, with the input given and the output returned: for modules around
-        this one.
-
-        Autocast is off inside: a recurrence adds up what bfloat16 rounds away.
-
-        Args:
-            tensordict: start flags and states are read from it, next states are written to it.
-            x: float [*batch, D].
-
-        Returns:
-            float [*batch, H].
-        """
-        shape = tensordict.batch_size
-        is_init = self.start_flags(tensordict)
-        recurrent = self.recurrent_mode
-        if recurrent and not shape:
-            raise ValueError(
-                "recurrent mode reads the last batch dimension as time, but the batch shape is []"
-            )
-        rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
-        x = x.reshape(*rows, x.shape[-1])
-        is_init = is_init.reshape(rows)
-        x = x.float() if torch.is_autocast_enabled(x.device.type) else x
-        with torch.autocast(x.device.type, enabled=False):
-            if not recurrent:
-                y, after = self.memory(
-                    x.unsqueeze(1), self.stored_state(tensordict, rows), is_init.unsqueeze(1)
-                )
-            elif self.store == "step":
-                y, after = replay(self.memory, x, self.stored_state(tensordict, rows), is_init)
-            else:
-                firsts = tensordict.select(*self._state_keys, strict=False)[..., 0]
-                y, after = self.memory(x, self.stored_state(firsts, rows[:1]), is_init)
-        if not (recurrent and self.store == "sequence"):
-            for key, leaf in self._state_keys.items():
-                value = after.get(leaf)
-                tensordict.set(("next", *key), value.reshape(*shape, *value.shape[len(rows) :]))
-        return y.reshape(*shape, y.shape[-1])  # type: ignore[no-any-return]
 
     def begin_with(self, tensordict: TensorDictBase, state: TensorDictBase) -> TensorDictBase:
         """Let sequences begin with states that were stored once each.
@@ -446,31 +378,12 @@ class MemoryModule(TensorDictModuleBase):
                 "with store='step' every step needs a state of its own: make the module with "
                 "'sequence'"
             )
-        for key in self._state_keys:
+        for key in self.state_keys:
             value = state[key]
             axis = tensordict.ndim - 1
             shape = (*value.shape[:axis], tensordict.shape[-1], *value.shape[axis:])
             tensordict.set(key, value.unsqueeze(axis).expand(shape))
         return tensordict
-
-    def stored_state(self, tensordict: TensorDictBase, rows: tuple[int, ...]) -> TensorDict:
-        """The states at hand, with the batch shape of ``rows``; where one is missing, the initial
-        state.
-        """
-        state = TensorDict({}, batch_size=rows)
-        for key, leaf in self._state_keys.items():
-            value = tensordict.get(key, None)
-            if value is None:
-                value = self.memory.initial_state(rows[0]).get(leaf)  # type: ignore[operator]
-                value = (
-                    value if len(rows) == 1 else value.unsqueeze(1).expand(*rows, *value.shape[1:])
-                )
-            else:
-                value = value.reshape(*rows, *value.shape[tensordict.ndim :])
-            state.set(leaf, value)
-        for path in self._empty:
-            state.set(path, TensorDict({}, batch_size=rows))
-        return state
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
         """The transform that puts initial states into an env's resets; ``get_primers_from_module``
@@ -480,17 +393,184 @@ class MemoryModule(TensorDictModuleBase):
             ``TensorDictPrimer`` for the state keys, zeros (a memory that begins elsewhere does so
             at ``is_init``).
         """
+        return self.recurrence.make_primer(self.memory)
+
+
+class Recurrence:
+    """Where the recurrent state of a memory stands in a TensorDict, and how the memory reads it.
+
+    The part that :class:`MemoryModule` and ``MemoryNetwork`` share. It holds keys and modes but no
+    module: the memory is an argument, so that its weights are registered in one place.
+
+    Args:
+        memory: a memory model; asked once what its state looks like.
+        state_key: the keys of the state begin with it.
+        is_init_key: start flags, bool [*batch, 1].
+        default_recurrent_mode: mode outside of ``set_recurrent_mode``.
+        store: see :class:`MemoryModule`.
+
+    Attributes:
+        state_keys: keys of the tensors of the state, without "next".
+        next_state_keys: the same under "next".
+
+    Raises:
+        ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
+    """
+
+    def __init__(
+        self,
+        memory: nn.Module,
+        state_key: Key,
+        is_init_key: Key = "is_init",
+        default_recurrent_mode: bool = False,
+        store: Store | None = None,
+    ) -> None:
+        if store not in (None, "step", "sequence"):
+            raise ValueError(f"store must be 'step', 'sequence' or None, got {store!r}")
+        self.is_init_key = unravel_key(is_init_key)
+        self.default_recurrent_mode = default_recurrent_mode
+        prefix = (state_key,) if isinstance(state_key, str) else tuple(state_key)
+        example = memory.initial_state(1)  # type: ignore[operator]
+        tensors = _tensors(example)
+        self._paths = {(*prefix, *path): path for path in tensors}
+        self._empty = _empty_nodes(example)
+        self.state_keys = list(self._paths)
+        self.next_state_keys = [("next", *key) for key in self.state_keys]
+        begins_with_zeros = not any(x.any() or x.requires_grad for x in tensors.values())
+        if store == "step" and not begins_with_zeros:
+            raise ValueError(
+                "store='step' needs a memory that begins with zeros and learns no start: take "
+                "'sequence'"
+            )
+        if store is None:
+            state_bytes = sum(x.nbytes for x in tensors.values())
+            small = begins_with_zeros and state_bytes <= LARGE_STATE
+            store = "step" if small else "sequence"
+        self.store: Store = store
+
+    @property
+    def recurrent_mode(self) -> bool:
+        """Whether the last batch dimension is read as time."""
+        # late: a second to import, for those who want a memory alone
+        from torchrl.modules import recurrent_mode
+
+        mode = recurrent_mode()
+        return self.default_recurrent_mode if mode is None else bool(mode)
+
+    def start_flags(self, tensordict: TensorDictBase) -> Tensor:
+        """The start flags of a tensordict, bool [*batch].
+
+        Raises:
+            ValueError: they are not [*batch, 1].
+            KeyError: there are none.
+        """
+        shape = tensordict.batch_size
+        is_init = tensordict.get(self.is_init_key, None)
+        if is_init is None:
+            raise KeyError(
+                f"no {self.is_init_key!r} in the tensordict: append InitTracker() to the env"
+            )
+        if is_init.shape != (*shape, 1):
+            raise ValueError(
+                f"{self.is_init_key!r} must be bool {[*shape, 1]}, got {list(is_init.shape)}"
+            )
+        return is_init.squeeze(-1)  # type: ignore[no-any-return]
+
+    def read(self, memory: nn.Module, tensordict: TensorDictBase, x: Tensor) -> Tensor:
+        """Let a memory read steps, or in recurrent mode sequences.
+
+        Autocast is off inside: a recurrence adds up what bfloat16 rounds away.
+
+        Args:
+            memory: the memory model.
+            tensordict: start flags and states are read from it, next states are written to it.
+            x: float [*batch, D].
+
+        Returns:
+            float [*batch, H].
+        """
+        shape = tensordict.batch_size
+        is_init = self.start_flags(tensordict)
+        recurrent = self.recurrent_mode
+        if recurrent and not shape:
+            raise ValueError(
+                "recurrent mode reads the last batch dimension as time, but the batch shape is []"
+            )
+        rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
+        x = x.reshape(*rows, x.shape[-1])
+        is_init = is_init.reshape(rows)
+        if torch.is_autocast_enabled(x.device.type):
+            x = x.float()
+
+        with torch.autocast(x.device.type, enabled=False):
+            if not recurrent:
+                state = self._stored_state(memory, tensordict, rows)
+                y, after = memory(x.unsqueeze(1), state, is_init.unsqueeze(1))
+            elif self.store == "step":
+                states = self._stored_state(memory, tensordict, rows)
+                y, after = replay(memory, x, states, is_init)
+            else:
+                first_step = tensordict.select(*self.state_keys, strict=False)[..., 0]
+                state = self._stored_state(memory, first_step, rows[:1])
+                y, after = memory(x, state, is_init)
+
+        writes_states = not recurrent or self.store == "step"
+        if writes_states:
+            for key, path in self._paths.items():
+                value = after.get(path)
+                tensordict.set(("next", *key), value.reshape(*shape, *value.shape[len(rows) :]))
+        return y.reshape(*shape, y.shape[-1])  # type: ignore[no-any-return]
+
+    def make_primer(self, memory: nn.Module) -> "TensorDictPrimer":
+        """The transform that puts a memory's initial states into an env's resets."""
         from torchrl.data import Composite, Unbounded
         from torchrl.envs import TensorDictPrimer
 
-        example = self.memory.initial_state(1)  # type: ignore[operator]
+        example = memory.initial_state(1)  # type: ignore[operator]
         primers = Composite()
-        for key, leaf in self._state_keys.items():
-            value = example.get(leaf)
+        for key, path in self._paths.items():
+            value = example.get(path)
             primers[key] = Unbounded(shape=value.shape[1:], dtype=value.dtype)
         return TensorDictPrimer(primers, expand_specs=True)
 
-    @property
-    def state_keys(self) -> Sequence[tuple[str, ...]]:
-        """Keys of the recurrent state, without "next"."""
-        return list(self._state_keys)
+    def _stored_state(
+        self, memory: nn.Module, tensordict: TensorDictBase, rows: tuple[int, ...]
+    ) -> TensorDict:
+        """The states in a tensordict, with the batch shape ``rows``; the initial state where one is
+        missing.
+        """
+        state = TensorDict({}, batch_size=rows)
+        for key, path in self._paths.items():
+            value = tensordict.get(key, None)
+            if value is not None:
+                value = value.reshape(*rows, *value.shape[tensordict.ndim :])
+            else:
+                value = memory.initial_state(rows[0]).get(path)  # type: ignore[operator]
+                if len(rows) == 2:
+                    value = value.unsqueeze(1).expand(*rows, *value.shape[1:])
+            state.set(path, value)
+        for path in self._empty:
+            state.set(path, TensorDict({}, batch_size=rows))
+        return state
+
+
+def _tensors(state: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
+    """The tensors of a state by path."""
+    tensors = {}
+    for key, value in state.items(True, True):
+        tensors[(key,) if isinstance(key, str) else tuple(key)] = value
+    return tensors
+
+
+def _empty_nodes(state: TensorDictBase) -> list[tuple[str, ...]]:
+    """Paths of nested TensorDicts without any tensor, as layers without a state have."""
+    empty = []
+    for key, value in state.items(True, False):
+        if isinstance(value, TensorDictBase) and value.is_empty():
+            empty.append((key,) if isinstance(key, str) else tuple(key))
+    return empty
+
+
+def batch_shape(batch_size: int | Sequence[int]) -> list[int]:
+    """A batch size, one number or several, as a list."""
+    return [batch_size] if isinstance(batch_size, int) else list(batch_size)

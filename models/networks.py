@@ -1,5 +1,6 @@
 """Whole networks: encoder, last action, memory block, head; each is a TensorDict module."""
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.encoders import Encoder
-from arcade_torch.models.memory import Key, MemoryModule, Store, replay
+from arcade_torch.models.memory import Key, Recurrence, Store, batch_shape, replay
 from arcade_torch.models.registry import make_memory
 
 if TYPE_CHECKING:
@@ -63,9 +64,13 @@ class MemoryBlock(nn.Module):
         self.hidden_size = hidden_size
         self.residual = skip == "residual"
         self.linear = nn.Linear(input_size, hidden_size)
-        make = partial(make_memory, memory) if isinstance(memory, str) else memory
-        self.cells = nn.ModuleList(make(hidden_size, hidden_size, **options) for _ in range(layers))
-        self.linears = nn.ModuleList(nn.Linear(hidden_size, hidden_size) for _ in range(layers))
+        make_cell = partial(make_memory, memory) if isinstance(memory, str) else memory
+        self.cells = nn.ModuleList()
+        for _ in range(layers):
+            self.cells.append(make_cell(hidden_size, hidden_size, **options))
+        self.linears = nn.ModuleList()
+        for _ in range(layers):
+            self.linears.append(nn.Linear(hidden_size, hidden_size))
         self.names = [f"layer{i}" for i in range(layers)]
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
@@ -85,9 +90,8 @@ class MemoryBlock(nn.Module):
         """Read stored sequences, one stored state per step (see ``ReplayableMemory``); all [B,
         T].
         """
-        return self._run(
-            x, stored, is_init, [partial(replay, cell) for cell in self.cells], x.shape[:2]
-        )
+        readers = [partial(replay, cell) for cell in self.cells]
+        return self._run(x, stored, is_init, readers, x.shape[:2])
 
     def _run(
         self,
@@ -107,20 +111,17 @@ class MemoryBlock(nn.Module):
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The cells' initial states, TensorDict [batch_size] with one entry per layer."""
-        cells = zip(self.names, self.cells, strict=True)
         states = {}
-        for name, cell in cells:
+        for name, cell in zip(self.names, self.cells, strict=True):
             states[name] = cell.initial_state(batch_size)  # type: ignore[operator]
-        return TensorDict(
-            states, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
-        )
+        return TensorDict(states, batch_size=batch_shape(batch_size))
 
 
 class MemoryNetwork(TensorDictModuleBase):
-    """From frames, last actions and start flags to one number per action; a TensorDict module with
-    a recurrent state.
+    """From frames, last actions and start flags to one number per action, and a value beside them
+    on request; a TensorDict module with a recurrent state.
 
-    It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[out_key, ("next",
+    It reads ``["pixels", "last_action", "is_init", *state keys]`` and writes ``[*heads, ("next",
     *state keys)]``; a network whose block has no state has no state keys. Modes and states are
     those of :class:`MemoryModule`: one step by default, sequences in recurrent mode. With a
     predictor it then also writes ``prediction_error`` for losses to add, see the method of that
@@ -129,20 +130,23 @@ class MemoryNetwork(TensorDictModuleBase):
     Args:
         encoder: frames to features [..., E].
         block: a memory model, E + num_actions to H.
-        head: [..., H] to [..., A].
+        head: [..., H] to [..., A], with a ``value_key`` to [..., A + 1].
         num_actions: length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is
             not read.
         zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is
             set. Not with ``store="step"``: there TorchRL also sets ``is_init`` in mid-episode
             (slices, the next observations of ``GAE``).
-        out_key: where the output is written.
+        out_key: name of the head with one number per action, and where it is written:
+            ``"action_value"`` or ``"logits"``; ``"state_value"`` for a critic.
+        value_key: name of a second head, the last number of ``head``; None for no such head.
         state_key: where the recurrent state stands; give actor and critic different ones.
         store: which states a stored sequence holds, see :class:`MemoryModule`.
         predictor: what is remembered and the next one-hot action, [..., H + num_actions], to
             features [..., E].
 
     Attributes:
-        out_key, state_keys, store: those of :class:`MemoryModule`.
+        heads: by name, which part of the output of ``head`` belongs to it.
+        state_key, state_keys, store: those of :class:`MemoryModule`.
 
     Raises:
         ValueError: ``zero_action_on_reset`` with ``store="step"``.
@@ -177,6 +181,7 @@ class MemoryNetwork(TensorDictModuleBase):
         num_actions: int = 5,
         zero_action_on_reset: bool = False,
         out_key: Key = "action_value",
+        value_key: Key | None = None,
         state_key: Key = "memory",
         store: Store = "sequence",
         predictor: nn.Module | None = None,
@@ -195,31 +200,40 @@ class MemoryNetwork(TensorDictModuleBase):
         self.zero_action_on_reset = zero_action_on_reset
         self.register_buffer("actions", torch.arange(num_actions), persistent=False)
         self.actions: Tensor
-        # In a tuple, so that the block is registered once and its weights are called "block...."
-        # alone.
-        self._recurrent = (MemoryModule(block, "pixels", out_key, state_key, store=store),)
-        module = self._recurrent[0]
-        self.in_keys = [
-            "pixels",
-            *["last_action"] * bool(num_actions),
-            module.is_init_key,
-            *module.state_keys,
-        ]
-        self.out_keys = module.out_keys
-        self.out_key = module.out_key
-        self.state_keys = module.state_keys
-        self.store = module.store
         self.state_key = state_key
+        self.recurrence = Recurrence(block, state_key, store=store)
+        self.state_keys = self.recurrence.state_keys
+        self.store = self.recurrence.store
+        self.heads = {out_key: slice(None)}
+        if value_key is not None:
+            self.heads = {out_key: slice(None, -1), value_key: slice(-1, None)}
+        action_keys = ["last_action"] if num_actions else []
+        self.in_keys = ["pixels", *action_keys, "is_init", *self.state_keys]
+        self.out_keys = [*self.heads, *self.recurrence.next_state_keys]
+
+    def only(self, head: Key) -> "MemoryNetwork":
+        """The same network, with the same weights, that writes one of its heads alone."""
+        view = copy.copy(self)  # shallow: parts and weights are shared
+        view.heads = {head: self.heads[head]}
+        view.out_keys = [head, *self.recurrence.next_state_keys]
+        return view
+
+    def by_head(self, out: Tensor) -> dict[Key, Tensor]:
+        """What :meth:`remember` gave, cut into the heads, each [..., its width]."""
+        parts = {}
+        for name, part in self.heads.items():
+            parts[name] = out[..., part]
+        return parts
 
     def make_tensordict_primer(self) -> "TensorDictPrimer":
         """The transform that puts initial states into an env's resets; see
         :class:`MemoryModule`.
         """
-        return self._recurrent[0].make_tensordict_primer()
+        return self.recurrence.make_primer(self.block)
 
     @dispatch  # type: ignore[untyped-decorator]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Read one step, or in recurrent mode sequences, and write output and next state.
+        """Read one step, or in recurrent mode sequences, and write the heads and the next state.
 
         Args:
             tensordict: any batch shape (in recurrent mode [*, T]) with ``in_keys``; frames may be
@@ -235,15 +249,14 @@ class MemoryNetwork(TensorDictModuleBase):
             KeyError: an entry is missing.
         """
         x = self.encode(tensordict["pixels"])
-        recurrent = self._recurrent[0]
+        is_init = self.recurrence.start_flags(tensordict)
         if self.num_actions:
-            x = self._append(x, tensordict["last_action"], recurrent.start_flags(tensordict))
-        y = recurrent.read(tensordict, x)
-        if self.predictor is not None and recurrent.recurrent_mode:
-            tensordict.set(
-                "prediction_error", self.prediction_error(x, y, recurrent.start_flags(tensordict))
-            )
-        tensordict.set(recurrent.out_key, self.head(y))
+            x = self._append(x, tensordict["last_action"], is_init)
+        y = self.recurrence.read(self.block, tensordict, x)
+        if self.predictor is not None and self.recurrence.recurrent_mode:
+            tensordict.set("prediction_error", self.prediction_error(x, y, is_init))
+        for name, value in self.by_head(self.head(y)).items():
+            tensordict.set(name, value)
         return tensordict
 
     def compress(self, pixels: Tensor) -> Tensor:
@@ -282,7 +295,8 @@ class MemoryNetwork(TensorDictModuleBase):
             state: TensorDict [B], the recurrent state before step 0, see :meth:`initial_state`.
 
         Returns:
-            (float [B, T, A], state TensorDict [B] after the last step).
+            (float [B, T, A], with a value head [B, T, A + 1], state TensorDict [B] after the last
+            step).
         """
         if self.num_actions:
             features = self._append(features, last_action, is_init)
@@ -291,9 +305,9 @@ class MemoryNetwork(TensorDictModuleBase):
 
     def read_sequences(
         self, sequences: TensorDictBase, state: TensorDictBase | None = None
-    ) -> Tensor:
-        """What :meth:`forward` writes in recurrent mode, for sequences whose first states stand
-        apart.
+    ) -> dict[Key, Tensor]:
+        """The heads that :meth:`forward` writes in recurrent mode, for sequences whose first states
+        stand apart.
 
         Args:
             sequences: [B, T] with the observations of ``in_keys``.
@@ -301,7 +315,7 @@ class MemoryNetwork(TensorDictModuleBase):
                 episode.
 
         Returns:
-            float [B, T, A].
+            By name of the head, float [B, T, its width].
         """
         features = self.encode(sequences["pixels"])
         is_init = sequences["is_init"].squeeze(-1)
@@ -309,8 +323,8 @@ class MemoryNetwork(TensorDictModuleBase):
         first = self.initial_state(len(sequences))
         if state is not None and self.state_keys:
             first.update(state[self.state_key])
-        y, _ = self.remember(features, last_action, is_init, first)
-        return y
+        out, _ = self.remember(features, last_action, is_init, first)
+        return self.by_head(out)
 
     def prediction_error(self, x: Tensor, y: Tensor, is_init: Tensor) -> Tensor:
         """How far each next frame's features, as deviations from the batch's, are from those

@@ -114,34 +114,26 @@ def make_network(
     num_actions: int = 5,
     memory_options: dict[str, Any] | None = None,
     out_key: Key = "action_value",
+    value_key: Key | None = None,
     state_key: Key = "memory",
     store: Store = "sequence",
     **options: Any,
-) -> "MemoryNetwork":
+) -> MemoryNetwork:
     """Make a network.
 
     Args:
         preset: "paper" (1,428,613 parameters plus two cells); "small" (225,733 with MinGRU; learns
-            the easiest games in minutes on one CPU core); "small64", the same with frames of 64
-            pixels instead of 32 and patches twice as wide, which reads boards and cards better.
+            the easiest games in minutes on one CPU core); "small64", which sees 64 instead of 32
+            pixels, so that it reads boards and cards better.
         memory: a name (:func:`memory_names`), a factory ``(input_size, hidden_size, **options) ->
-            nn.Module``, or "feedforward": no memory block and no last action, the paper's
-            memory-free agent (704,901 parameters).
+            nn.Module``, or "feedforward": no memory and no last action (704,901 parameters).
         obs_size: side of the frames in pixels.
         num_outputs: A; one per action for Q-values or logits, 1 for a state value.
         num_actions: number of actions, for the one-hot last action.
         memory_options: options of the cells, over those of the preset.
-        out_key: where the output is written.
-        state_key: where the recurrent state stands.
-        store: "sequence": recurrent mode begins with the state at index 0 and starts afresh at
-            every ``is_init``; "step": every step has a stored state, see :class:`MemoryModule`;
-            without ``zero_action_on_reset``.
-        **options: any other field of :class:`NetworkPreset`: ``hidden_size``, ``layers``, ``skip``,
-            ``head``, ``towers``, ``use_last_action``, ``zero_action_on_reset``, ``predicts``,
-            ``encoder``.
-
-    Returns:
-        a :class:`MemoryNetwork`.
+        out_key, value_key, state_key, store: see :class:`MemoryNetwork`; a value head is one output
+            more. ``store="step"`` goes without ``zero_action_on_reset``.
+        **options: any other field of :class:`NetworkPreset`, such as ``hidden_size``, ``layers``.
 
     Raises:
         ValueError: unknown preset, memory, size, or value of an option.
@@ -149,8 +141,6 @@ def make_network(
 
     Example:
         >>> network = make_network("small", "mingru")
-        >>> sum(p.numel() for p in network.parameters())
-        225733
         >>> frames = torch.zeros(2, 7, 128, 128, 3, dtype=torch.uint8)
         >>> last_action = torch.zeros(2, 7, dtype=torch.int64)
         >>> is_init = torch.zeros(2, 7, dtype=torch.bool)
@@ -159,69 +149,78 @@ def make_network(
         >>> out.shape
         torch.Size([2, 7, 5])
     """
-    chosen = preset_of(preset)
-    fields = NetworkPreset.__dataclass_fields__
-    if unknown := set(options) - set(fields):
-        raise TypeError(
-            f"unknown network option {', '.join(sorted(unknown))}; allowed are {', '.join(fields)}"
-        )
-    if memory == FEED_FORWARD and memory_options:
-        raise TypeError(
-            f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got "
-            f"{memory_options}"
-        )
-    chosen = replace(chosen, **options)
-    kinds = {int: "a whole number", bool: "True or False"}
-    for name in fields:
-        value = _plain(getattr(chosen, name))
-        kind = fields[name].type
-        object.__setattr__(chosen, name, value)
-        if kind in kinds and type(value) is not kind:
-            raise ValueError(f"{name} must be {kinds[kind]}, got {value!r}")
-        if kind is int and not 1 <= value <= MOST[name]:
-            raise ValueError(f"{name} must be at least 1 and at most {MOST[name]}, got {value}")
-    _check_sizes(memory_options or {})
-    for name, allowed in {
-        "skip": SKIPS,
-        "head": HEADS,
-        "actor_critic_head": HEADS,
-        "towers": (1, 2),
-    }.items():
-        if (value := getattr(chosen, name)) not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
-    encoder = chosen.encoder(obs_size)
-    block: nn.Module
-    if memory == FEED_FORWARD:  # its two layers take the place of a deep head's as well
-        actions = 0
-        hidden_size = chosen.feedforward_size
-        block = FeedForward(encoder.feature_size, hidden_size)
-        head = make_head("linear" if chosen.head == "linear" else "plain", hidden_size, num_outputs)
+    settings = _settings(preset, options)
+    _check_memory_options(memory, memory_options or {})
+    if store == "step" and "zero_action_on_reset" not in options:
+        settings = replace(settings, zero_action_on_reset=False)
+    num_outputs += 0 if value_key is None else 1
+    parts = _parts(settings, memory, memory_options or {}, obs_size, num_outputs, num_actions)
+    names: dict[str, Any] = {"out_key": out_key, "value_key": value_key, "state_key": state_key}
+    return MemoryNetwork(**parts, **names, store=store)
+
+
+def _parts(
+    settings: NetworkPreset,
+    memory: str | Callable[..., nn.Module],
+    memory_options: dict[str, Any],
+    obs_size: int,
+    num_outputs: int,
+    num_actions: int,
+) -> dict[str, Any]:
+    """The parts of a :class:`MemoryNetwork`, by name of its arguments."""
+    encoder = settings.encoder(obs_size)
+    block: FeedForward | MemoryBlock
+    if memory == FEED_FORWARD:
+        num_actions = 0
+        block = FeedForward(encoder.feature_size, settings.feedforward_size)
+        # the two layers of the block take the place of a deep head's as well
+        head_name = "linear" if settings.head == "linear" else "plain"
     else:
-        actions = num_actions if chosen.use_last_action else 0
-        hidden_size = chosen.hidden_size
-        of_preset = chosen.memory_options.get(memory, {}) if isinstance(memory, str) else {}
-        block = MemoryBlock(
-            encoder.feature_size + actions,
-            hidden_size,
-            memory,
-            layers=chosen.layers,
-            skip=chosen.skip,  # type: ignore[arg-type]
-            memory_options=of_preset | (memory_options or {}),
+        num_actions = num_actions if settings.use_last_action else 0
+        input_size = encoder.feature_size + num_actions
+        block = _memory_block(settings, input_size, memory, memory_options)
+        head_name = settings.head
+    head = make_head(head_name, block.hidden_size, num_outputs)
+
+    predictor = None
+    if settings.predicts:
+        predictor = _predictor(block.hidden_size + num_actions, encoder.feature_size)
+
+    return {
+        "encoder": encoder,
+        "block": block,
+        "head": head,
+        "num_actions": num_actions,
+        "zero_action_on_reset": settings.zero_action_on_reset,
+        "predictor": predictor,
+    }
+
+
+def _settings(preset: str, options: dict[str, Any]) -> NetworkPreset:
+    """A preset with some fields changed, all of them checked."""
+    settings = preset_of(preset)
+    fields = NetworkPreset.__dataclass_fields__
+    unknown = sorted(set(options) - set(fields))
+    if unknown:
+        raise TypeError(
+            f"unknown network option {', '.join(unknown)}; allowed are {', '.join(fields)}"
         )
-        head = make_head(chosen.head, hidden_size, num_outputs)
-    keys: dict[str, Any] = {"out_key": out_key, "state_key": state_key, "store": store}
-    if chosen.predicts:
-        known = hidden_size + actions
-        size = encoder.feature_size
-        keys["predictor"] = nn.Sequential(
-            nn.Linear(known, size), nn.LeakyReLU(inplace=True), nn.Linear(size, size)
-        )
-    zero_action = chosen.zero_action_on_reset and (
-        store != "step" or "zero_action_on_reset" in options
-    )
-    return MemoryNetwork(
-        encoder, block, head, num_actions=actions, zero_action_on_reset=zero_action, **keys
-    )
+    plain_options = {}
+    for name, value in options.items():
+        plain_options[name] = _plain(value)
+    settings = replace(settings, **plain_options)
+
+    for name, field_ in fields.items():
+        value = getattr(settings, name)
+        if field_.type is bool and type(value) is not bool:
+            raise ValueError(f"{name} must be True or False, got {value!r}")
+        if field_.type is int:
+            _check_size(name, value)
+    _check_choice("skip", settings.skip, SKIPS)
+    _check_choice("head", settings.head, HEADS)
+    _check_choice("actor_critic_head", settings.actor_critic_head, HEADS)
+    _check_choice("towers", settings.towers, (1, 2))
+    return settings
 
 
 def _plain(value: Any) -> Any:
@@ -229,11 +228,59 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.integer | np.bool_) else value
 
 
-def _check_sizes(memory_options: dict[str, Any]) -> None:
-    """Refuse what no machine could hold, before anything is allocated."""
+def _check_size(name: str, value: Any) -> None:
+    """Refuse a size that no network has, before anything is allocated."""
+    if type(value) is not int:
+        raise ValueError(f"{name} must be a whole number, got {value!r}")
+    if not 1 <= value <= MOST[name]:
+        raise ValueError(f"{name} must be at least 1 and at most {MOST[name]}, got {value}")
+
+
+def _check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    """Refuse a value that is none of the allowed ones."""
+    if value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
+
+
+def _check_memory_options(
+    memory: str | Callable[..., nn.Module], memory_options: dict[str, Any]
+) -> None:
+    """Refuse options of a memory that is not there, and numbers that no machine could hold."""
+    if memory == FEED_FORWARD and memory_options:
+        raise TypeError(
+            f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got "
+            f"{memory_options}"
+        )
     for name, value in memory_options.items():
         if isinstance(value, int) and abs(value) > MOST_OPTION:
             raise ValueError(f"memory_options.{name} must be at most {MOST_OPTION}, got {value}")
+
+
+def _memory_block(
+    settings: NetworkPreset,
+    input_size: int,
+    memory: str | Callable[..., nn.Module],
+    memory_options: dict[str, Any],
+) -> MemoryBlock:
+    """The cells between encoder and head; options that are given go over those of the preset."""
+    preset_options = settings.memory_options.get(memory, {}) if isinstance(memory, str) else {}
+    return MemoryBlock(
+        input_size,
+        settings.hidden_size,
+        memory,
+        layers=settings.layers,
+        skip=settings.skip,  # type: ignore[arg-type]
+        memory_options=preset_options | memory_options,
+    )
+
+
+def _predictor(input_size: int, feature_size: int) -> nn.Module:
+    """From what is remembered, and the next action, to the next frame's features."""
+    return nn.Sequential(
+        nn.Linear(input_size, feature_size),
+        nn.LeakyReLU(inplace=True),
+        nn.Linear(feature_size, feature_size),
+    )
 
 
 HEADS = ("reference", "paper", "actor_critic", "linear", "plain")
@@ -261,10 +308,22 @@ def make_head(name: str, input_size: int, num_outputs: int) -> nn.Module:
     """
     if name == "reference":
         return nn.Sequential(nn.Linear(input_size, 256), nn.Linear(256, num_outputs))
-    if name in ("paper", "actor_critic"):
-        middle: list[nn.Module] = [nn.LeakyReLU(inplace=True), nn.LayerNorm(256)]
-        second = nn.Linear(256, 256), *(middle if name == "paper" else middle[::-1])
-        return nn.Sequential(nn.Linear(input_size, 256), *second, nn.Linear(256, num_outputs))
+    if name == "paper":
+        return nn.Sequential(
+            nn.Linear(input_size, 256),
+            nn.Linear(256, 256),
+            nn.LeakyReLU(inplace=True),
+            nn.LayerNorm(256),
+            nn.Linear(256, num_outputs),
+        )
+    if name == "actor_critic":
+        return nn.Sequential(
+            nn.Linear(input_size, 256),
+            nn.Linear(256, 256),
+            nn.LayerNorm(256),
+            nn.LeakyReLU(inplace=True),
+            nn.Linear(256, num_outputs),
+        )
     if name == "plain":
         return nn.Linear(input_size, num_outputs)
     if name == "linear":

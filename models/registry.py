@@ -74,10 +74,10 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     name = ALIASES.get(name, name)
     if name not in _FACTORIES:
         near = difflib.get_close_matches(str(name).lower(), _FACTORIES, n=1)
-        known = ", ".join(_FACTORIES)
+        names = ", ".join(_FACTORIES)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ValueError(
-            f"unknown memory {name!r}: {hint}known are {known}; register_memory or --import adds "
+            f"unknown memory {name!r}: {hint}known are {names}; register_memory or --import adds "
             "others"
         )
     try:

@@ -236,11 +236,11 @@ def scan_backward_doubling(
     return grad_a, grad_b
 
 
-def _closed_at_starts(start: Tensor | None, like: Tensor) -> Tensor:
+def _closed_at_starts(start: Tensor | None, steps: Tensor) -> Tensor:
     """bool [B, T, 1, ...]: True where the previous state must not be looked at."""
     if start is None:
-        start = torch.zeros(like.shape[:2], dtype=torch.bool, device=like.device)
-    return start.reshape(start.shape + (1,) * (like.ndim - 2))
+        start = torch.zeros(steps.shape[:2], dtype=torch.bool, device=steps.device)
+    return start.reshape(start.shape + (1,) * (steps.ndim - 2))
 
 
 BACK_ENDS = {
@@ -299,8 +299,8 @@ def _(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor) -> Tensor:
 def _(
     a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
 ) -> tuple[Tensor, Tensor]:
-    like = torch.empty_like(grad, memory_format=torch.contiguous_format)
-    return like, torch.empty_like(like)
+    template = torch.empty_like(grad, memory_format=torch.contiguous_format)
+    return template, torch.empty_like(template)
 
 
 def _save_scan(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -164,10 +164,17 @@ def _chunked(
     count = math.ceil(length / chunk)
     size = math.ceil(length / count)
     spare = count * size - length  # steps that write, erase and forget nothing
-    query, key, value, erase, log_decay = (
-        None if x is None else F.pad(x, (0, 0, 0, spare)).unflatten(1, (count, size)) for x in steps
-    )
-    assert query is not None and key is not None and value is not None
+
+    def in_chunks(x: Tensor) -> Tensor:
+        """[B, T, ...] as [B, count, size, ...]."""
+        padded: Tensor = F.pad(x, (0, 0, 0, spare))
+        return padded.unflatten(1, (count, size))  # type: ignore[no-any-return]
+
+    query = in_chunks(steps.query)
+    key = in_chunks(steps.key)
+    value = in_chunks(steps.value)
+    erase = None if steps.erase is None else in_chunks(steps.erase)
+    log_decay = None if steps.log_decay is None else in_chunks(steps.log_decay)
     # 0: runs when the chunk begins
     episode = F.pad(start, (0, spare)).unflatten(1, (count, size)).cumsum(-1)
     decay, fade = _decays(episode, log_decay, query.dtype)
@@ -197,7 +204,8 @@ def _chunked(
         state = torch.baddbmm(left * state, keys, u)
     u = torch.stack(written, dim=1)
     out = attention @ u + (query * fade) @ torch.stack(befores, dim=1)
-    out, u = (x.flatten(1, 2)[:, :length].masked_fill(lost, torch.nan) for x in (out, u))
+    out = out.flatten(1, 2)[:, :length].masked_fill(lost, torch.nan)
+    u = u.flatten(1, 2)[:, :length].masked_fill(lost, torch.nan)
     return out, u, state.masked_fill(lost[:, -1:], torch.nan)
 
 
@@ -224,7 +232,10 @@ def _contained(steps: MatrixSteps, start: Tensor, h0: Tensor) -> tuple[MatrixSte
     bad = bad.unsqueeze(-1)
     key = key.masked_fill(bad, 0)
     value = value.masked_fill(bad, 0)
-    erase, log_decay = (None if x is None else x.masked_fill(bad, 0) for x in (erase, log_decay))
+    if erase is not None:
+        erase = erase.masked_fill(bad, 0)
+    if log_decay is not None:
+        log_decay = log_decay.masked_fill(bad, 0)
     h0 = h0.masked_fill(bad_h0[:, None, None], 0)
     return MatrixSteps(steps.query, key, value, erase, log_decay), h0, lost.unsqueeze(-1)
 

@@ -113,17 +113,17 @@ def _launch(
     outputs: tuple[Tensor, ...],
 ) -> None:
     """Run one kernel over its tensors, in the order of its arguments."""
-    like = outputs[0]
-    if not runs_triton(like):
+    output = outputs[0]
+    if not runs_triton(output):
         raise RuntimeError(
-            f"no Triton kernel for {like.dtype}: install triton, and use one of {DTYPES}"
+            f"no Triton kernel for {output.dtype}: install triton, and use one of {DTYPES}"
         )
-    if like.numel() == 0:
+    if output.numel() == 0:
         return
-    (batch, steps) = like.shape[:2]
-    features = like[0, 0].numel()
+    (batch, steps) = output.shape[:2]
+    features = output[0, 0].numel()
     if start is None:
-        start = torch.zeros((), dtype=torch.bool, device=like.device).expand(batch, steps)
+        start = torch.zeros((), dtype=torch.bool, device=output.device).expand(batch, steps)
     flat = [
         x.resolve_conj().resolve_neg().reshape(batch, steps, features)
         for x in (*first, *then, *outputs)
@@ -134,9 +134,9 @@ def _launch(
     ]
     # of the outputs once: all are contiguous
     strides = [x.stride() for x in flat[: len(flat) - len(outputs) + 1]]
-    lanes = min(LANE_BYTES // like.element_size(), _power_of_two(features))
-    kernel = getattr(_kernels(), f"{direction}_{'complex' if like.is_complex() else 'real'}")
-    with torch.cuda.device_of(like):
+    lanes = min(LANE_BYTES // output.element_size(), _power_of_two(features))
+    kernel = getattr(_kernels(), f"{direction}_{'complex' if output.is_complex() else 'real'}")
+    with torch.cuda.device_of(output):
         kernel[(batch * -(-features // lanes),)](
             *(torch.view_as_real(x) if x.is_complex() else x for x in flat),
             steps,

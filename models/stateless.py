@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import Memory
+from arcade_torch.models.memory import Memory, batch_shape
 
 __all__ = ["FeedForward", "Stateless"]
 
@@ -73,6 +73,4 @@ class FeedForward(nn.Module):
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """An empty TensorDict [batch_size]."""
-        return TensorDict(
-            {}, batch_size=[batch_size] if isinstance(batch_size, int) else list(batch_size)
-        )
+        return TensorDict({}, batch_size=batch_shape(batch_size))

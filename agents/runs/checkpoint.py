@@ -181,7 +181,8 @@ def load_checkpoint(
             f"checkpoint {path} is damaged: {_META} does not describe a run ({error})"
         ) from error
     weights = _read_part(path / _WEIGHTS, sums, _load_weights)
-    if expect is not None and (fields := differing_fields(config, expect)):
+    fields = [] if expect is None else differing_fields(config, expect)
+    if fields:
         raise _OtherRunError(
             f"checkpoint {path} belongs to another run; differing fields: {', '.join(fields)}"
         )
@@ -212,9 +213,9 @@ def load_latest(
     problems: list[str] = []
     for path in list_checkpoints(folder):
         try:
-            found = load_checkpoint(path, expect, weights_only)
+            checkpoint = load_checkpoint(path, expect, weights_only)
             if use is not None:
-                use(found)
+                use(checkpoint)
         except _OtherRunError:
             raise
         except CheckpointError as error:
@@ -224,21 +225,20 @@ def load_latest(
             warnings.warn(
                 f"{'; '.join(problems)}; going on from {path.name}", RuntimeWarning, stacklevel=2
             )
-        return found
-    wanted, why = (
-        ("whole checkpoint", f": {'; '.join(problems)}") if problems else ("checkpoint", "")
-    )
-    raise CheckpointError(f"no {wanted} in {folder}{why}")
+        return checkpoint
+    if problems:
+        raise CheckpointError(f"no whole checkpoint in {folder}: {'; '.join(problems)}")
+    raise CheckpointError(f"no checkpoint in {folder}")
 
 
-def refuse_format(what: object, found: Any) -> str | None:
+def refuse_format(subject: str, saved: Any) -> str | None:
     """Why a checkpoint or run folder of a format is refused, in one line; None if it is ours."""
-    if found == FORMAT:
+    if saved == FORMAT:
         return None
-    origin = "was made by arcade-torch 0.1" if found == 1 else f"has format {found!r}"
+    origin = "was made by arcade-torch 0.1" if saved == 1 else f"has format {saved!r}"
     return (
-        f"{what} {origin}; this version reads format {FORMAT}: train it again, or use the version "
-        "that made it"
+        f"{subject} {origin}; this version reads format {FORMAT}: train it again, or use the "
+        "version that made it"
     )
 
 

@@ -55,12 +55,12 @@ class RunLogger:
                 for key in row
                 if key != "frames"
             }
-            found = {
+            values = {
                 f"{name}/{key}": float(row[key])
                 for key, name in names.items()
                 if row[key] is not None
             }
-            self._try(lambda: logger.log_metrics(found, step=int(row["frames"])))
+            self._try(lambda: logger.log_metrics(values, step=int(row["frames"])))
 
     def close(self) -> None:
         """Write what is left and let go."""

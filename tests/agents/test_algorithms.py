@@ -432,7 +432,10 @@ def test_stored_targets_are_those_of_the_network_that_collected_them():
         )
     )
     batch = trainer.collector.collect().clone()
-    expected = look_into(trainer.learner.labels, batch)[1]
+    numbers = trainer.config.dqn
+    whole = DQNLoss(trainer.network, time_limit=numbers.time_limit)  # without a burn-in
+    whole.make_value_estimator(gamma=numbers.gamma, lmbda=numbers.lam)
+    expected = look_into(whole, batch)[1]
     trainer.learner.update(batch, 0)
     drawn = trainer.learner.replay.sample(ENVS, torch.Generator())
     torch.testing.assert_close(drawn["stored_target"], expected, atol=1e-5, rtol=1e-5)

@@ -119,9 +119,10 @@ def test_acting_step_by_step_gives_the_outputs_of_the_whole_sequence(kind):
             torch.testing.assert_close(out["action_value"], whole[:, t])
             assert torch.equal(out["action"], whole[:, t].argmax(-1))
         else:
-            logits, value = network.split(whole[:, t])
-            torch.testing.assert_close(out["state_value"].squeeze(-1), value)
-            log_prob = logits.log_softmax(-1).gather(-1, out["action"].unsqueeze(-1)).squeeze(-1)
+            heads = network.by_head(whole[:, t])
+            torch.testing.assert_close(out["state_value"], heads["state_value"])
+            log_probs = heads["logits"].log_softmax(-1)
+            log_prob = log_probs.gather(-1, out["action"].unsqueeze(-1)).squeeze(-1)
             torch.testing.assert_close(out["action_log_prob"], log_prob)
         state = out["next"].select(*s.state.keys())
 

@@ -9,13 +9,14 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
 
+import arcade_torch
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
 from arcade_torch.agents.layout import as_steps
 from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
 from arcade_torch.agents.ppo import PPO, normalize, ppo_objective
-from arcade_torch.models import ActorCriticNetwork
+from arcade_torch.models import ActorCriticNetwork, make_actor_critic
 from tests.agents.fakes import (
     ACTIONS,
     GAMMA,
@@ -201,20 +202,24 @@ def test_objective_and_entropy_are_those_of_torchrls_own_loss(form):
         torch.testing.assert_close(found[key], wanted[key])
 
 
+@pytest.mark.parametrize("whole", [False, True], ids=["actor and critic", "whole"])
 @pytest.mark.parametrize("form", ["sequences", "stock"])
-def test_one_network_for_both_learns_as_two_with_its_weights(form):
+def test_one_network_for_both_learns_as_two_with_its_weights(form, whole):
     s = stream(3, 6, seed=10)
     h = s.state["memory", "h"]
 
-    def batch_and_loss(network, names):
+    def batch_and_loss(network, names, whole):
         state = TensorDict({"memory": {name: {"h": h} for name in names}}, s.state.batch_size)
         batch = getattr(replace(s, state=state), form)()
         batch["action_log_prob"] = torch.full(s.action.shape, -1.6)
-        loss = PPOLoss(make_actor(network.actor), network.critic, clip_epsilon=CLIP)
-        loss.make_value_estimator(gamma=GAMMA, lmbda=LAM, critic=network.estimator)
+        networks = (network,) if whole else (network.actor, network.critic)
+        loss = PPOLoss(make_actor(networks[0]), *networks[1:], clip_epsilon=CLIP)
+        loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
         return loss.value_estimator(batch), loss
 
-    both = toy_network(3, 6, out_key="outputs", state_key=("memory", "both"))
+    both = toy_network(
+        3, 6, out_key="logits", value_key="state_value", state_key=("memory", "both")
+    )
     apart = toy_actor_critic(3)
     for tower, rows in ((apart.actor, slice(0, 5)), (apart.critic, slice(5, 6))):
         tower.encoder.load_state_dict(both.encoder.state_dict())
@@ -222,8 +227,8 @@ def test_one_network_for_both_learns_as_two_with_its_weights(form):
         with torch.no_grad():
             tower.head.weight.copy_(both.head.weight[rows])
             tower.head.bias.copy_(both.head.bias[rows])
-    batch, loss = batch_and_loss(ActorCriticNetwork(both), ["both"])
-    other, wanted = batch_and_loss(apart, ["actor", "critic"])
+    batch, loss = batch_and_loss(ActorCriticNetwork(both), ["both"], whole)
+    other, wanted = batch_and_loss(apart, ["actor", "critic"], whole)
     for key in ESTIMATES:
         torch.testing.assert_close(batch[key], other[key])
     found, parts = loss(batch), wanted(other)
@@ -236,6 +241,70 @@ def test_one_network_for_both_learns_as_two_with_its_weights(form):
         joined = torch.cat((mine, theirs)) if name.startswith("head") else mine + theirs
         torch.testing.assert_close(parameter.grad, joined)
     assert {id(p) for p in loss.parameters()} == {id(p) for p in both.parameters()}
+
+
+@pytest.mark.parametrize("memory", ["gru", "attention", "mlp"])
+@pytest.mark.parametrize("towers", [1, 2])
+def test_the_documented_call_works_for_one_tower_and_for_two(memory, towers):
+    network = make_actor_critic("small", memory, towers=towers, hidden_size=16)
+    env = arcade_torch.make("SkittlesEasy", num_envs=2, seed=1)
+    collector = arcade_torch.ArcadeCollector(env, make_actor(network), 12, final_frames="truncated")
+    batch = collector.collect()
+    collector.shutdown()
+    parts = PPOLoss(make_actor(network.actor), network.critic)
+    whole = PPOLoss(make_actor(network))
+    assert {id(p) for p in parts.parameters()} == {id(p) for p in whole.parameters()}
+    one = parts(batch.copy())
+    other = whole(batch.copy())
+    for key in parts.out_keys:
+        torch.testing.assert_close(one[key], other[key])
+    total(one).backward()
+    gradients = [p.grad.clone() for p in network.parameters()]
+    network.zero_grad()
+    total(other).backward()
+    for p, gradient in zip(network.parameters(), gradients, strict=True):
+        torch.testing.assert_close(p.grad, gradient)
+
+
+def test_torchrls_losses_train_actor_and_critic_of_one_tower():
+    network = make_actor_critic("small", "gru", hidden_size=16)
+    env = arcade_torch.make("SkittlesEasy", num_envs=4, seed=1)
+    collector = arcade_torch.ArcadeCollector(env, make_actor(network), 48, final_frames="truncated")
+    options = {"normalize_advantage": False, "entropy_coeff": 0.01}
+    ours = PPOLoss(make_actor(network.actor), network.critic, critic_coeff=0.5, **options)
+    batch = ours.value_estimator(collector.collect())
+    collector.shutdown()
+    with torch.no_grad():  # the values move, so that clipping them is at work
+        for parameter in network.parameters():
+            parameter.add_(torch.full_like(parameter, 0.02))
+    out = ours(batch)
+    assert out["value_clip_fraction"] > 0
+
+    steps = as_steps(batch, ours.inputs, "action", "action_log_prob", *ESTIMATES).copy()
+    theirs = ClipPPOLoss(
+        make_actor(network.actor),
+        network.critic,
+        loss_critic_type="l2",
+        clip_value=True,
+        critic_coeff=0.25,
+        **options,
+    )
+    with set_recurrent_mode(True):
+        expected = theirs(steps.copy())
+        a2c = A2CLoss(make_actor(network.actor), network.critic)(steps.copy())
+    for key in ("loss_objective", "loss_critic", "loss_entropy"):
+        torch.testing.assert_close(out[key], expected[key])
+    a2c["loss_critic"].backward()
+    assert any(
+        parameter.grad is not None and parameter.grad.any()
+        for parameter in network.actor.block.parameters()
+    )
+
+
+def test_a_loss_without_a_critic_needs_an_actor_that_writes_the_value():
+    actor = make_actor(toy_actor_critic(3).actor)
+    with pytest.raises(ValueError, match="critic_network must be given, unless"):
+        PPOLoss(actor)
 
 
 def test_the_entropy_bonus_fades_over_the_run():

@@ -19,6 +19,7 @@ from torchrl.objectives import SoftUpdate
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, SequenceGAE, make_actor
 from arcade_torch.agents.layout import unroll
 from arcade_torch.models import make_actor_critic, make_network
+from arcade_torch.models.actor_critic import current_names
 from tests.agents.data.tiny import NETWORK
 
 DATA = Path(__file__).parent / "data"
@@ -30,7 +31,6 @@ GAMES, ALGORITHMS, MEMORIES = (
 TOLERANCE = 1e-5
 OVERLAP = 4  # of the stored window; its last steps are the window without overlap
 MENDED = {"burn_in"}  # here the old loss was wrong: see test_burn_in_takes_no_gradient
-RENAMED: dict[str, str] = {}  # prefix of a weight's old name -> the new one
 
 
 # -- the stored experience, in both forms a loss takes ---------------------------------------------
@@ -140,18 +140,11 @@ def network_of(name, weights="weights"):
     algorithm, memory = name.split("-")[1:]
     network = (make_actor_critic if algorithm == "ppo" else make_network)(memory=memory, **NETWORK)
     tensors = part(name, "weights/") | (part(name, "other/") if weights == "other" else {})
-    shapes = {key: value.shape for key, value in network.state_dict().items()}
-    network.load_state_dict(
-        {new_name(key): value.reshape(shapes[new_name(key)]) for key, value in tensors.items()}
-    )
+    tensors = current_names(tensors)
+    for key, value in network.state_dict().items():
+        tensors[key] = tensors[key].reshape(value.shape)
+    network.load_state_dict(tensors)
     return network.double()
-
-
-def new_name(key):
-    for old, new in RENAMED.items():
-        if key.startswith(old):
-            return new + key.removeprefix(old)
-    return key
 
 
 def cases(algorithm):
@@ -293,11 +286,11 @@ def compare(name, case, form):
         if key == "next_value":
             found, wanted = counted(name, case, found), counted(name, case, wanted)
         assert_close(found, wanted, key)
-    gradients = {
-        new_name(key.removeprefix("grad/")): value
-        for key, value in recorded.items()
-        if key not in outputs
-    }
+    gradients = {}
+    for key, value in recorded.items():
+        if key not in outputs:
+            gradients[key.removeprefix("grad/")] = value
+    gradients = current_names(gradients)
     parameters = dict(network.named_parameters())
     assert gradients.keys() == parameters.keys()
     for key, wanted in gradients.items():
@@ -344,7 +337,7 @@ def test_burn_in_takes_no_gradient(name, form):
     parameters = dict(network.named_parameters())
     differs = [
         not torch.allclose(
-            parameters[new_name(key)].grad.reshape(wanted.shape),
+            parameters[key].grad.reshape(wanted.shape),
             wanted.double(),
             rtol=1e-3,
             atol=1e-6,

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from arcade_torch.models import make_network
-from arcade_torch.models.actor_critic import make_actor_critic
+from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
 from arcade_torch.models.presets import make_head
 from arcade_torch.models.stateless import FeedForward
 
@@ -84,18 +84,18 @@ def test_each_tower_alone_gives_its_half_of_the_output(memory):
     state = network.initial_state(3)
     with torch.no_grad():
         out, after = run(network, pixels, last_action, is_init, state)
-        logits, value = network.split(out)
+        heads = network.by_head(out)
         alone, mine = run(network.actor, pixels, last_action, is_init, state["actor"])
         single, theirs = run(network.critic, pixels, last_action, is_init, state["critic"])
-    torch.testing.assert_close(logits, alone)
-    torch.testing.assert_close(value, single.squeeze(-1))
+    torch.testing.assert_close(heads["logits"], alone)
+    torch.testing.assert_close(heads["state_value"], single)
     for name, expected in (("actor", mine), ("critic", theirs)):
         for key in expected.keys(True, True):
             torch.testing.assert_close(after[name][key], expected[key])
 
 
 @pytest.mark.parametrize("memory", ["gru", "mlp"])
-def test_one_tower_gives_both_and_the_critic_reads_what_the_actor_left(memory):
+def test_one_tower_gives_both_and_each_half_alone(memory):
     network = make_actor_critic("small", memory)
     pixels, last_action, is_init = inputs(3, 6)
     state = network.initial_state(3)
@@ -108,13 +108,42 @@ def test_one_tower_gives_both_and_the_critic_reads_what_the_actor_left(memory):
         )
         whole = network(step.copy())
         acted = network.actor(step.copy())
-        alone = network.estimator(step.copy())
-        assert "state_value" not in acted and set(network.critic.in_keys) <= set(acted.keys())
-        valued = network.critic(acted)
-    for found in (whole, valued):
-        torch.testing.assert_close(found["logits"], out[:, 0, :5])
-        torch.testing.assert_close(found["state_value"], out[:, 0, 5:])
-    torch.testing.assert_close(alone["state_value"], out[:, 0, 5:])
+        valued = network.critic(step.copy())
+    assert "state_value" not in acted and "logits" not in valued
+    for logits in (whole["logits"], acted["logits"]):
+        torch.testing.assert_close(logits, out[:, 0, :5])
+    for value in (whole["state_value"], valued["state_value"]):
+        torch.testing.assert_close(value, out[:, 0, 5:])
+    for half in (network.actor, network.critic, network.estimator):
+        assert [id(p) for p in half.parameters()] == [id(p) for p in network.parameters()]
+
+
+def test_one_network_alone_needs_both_heads():
+    with pytest.raises(ValueError, match=r"heads logits and state_value .* got action_value"):
+        ActorCriticNetwork(make_network("small", "mlp"))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize(
+    ("towers", "old_names"),
+    [
+        (1, {"towers.both.": "actor.module.0."}),
+        (2, {"towers.actor.": "actor.", "towers.critic.": "critic."}),
+    ],
+)
+def test_weights_of_the_first_design_still_load(towers, old_names, nested):
+    one = make_actor_critic("small", "gru", towers=towers)
+    other = make_actor_critic("small", "gru", towers=towers)
+    weights = {}
+    for name, value in one.state_dict().items():
+        for new, old in old_names.items():
+            name = name.replace(new, old)
+        assert "towers" not in name
+        weights[f"0.{name}" if nested else name] = value
+    target = nn.Sequential(other) if nested else other
+    target.load_state_dict(weights)
+    for mine, theirs in zip(one.parameters(), other.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
 
 
 def test_an_output_is_read_by_name():
