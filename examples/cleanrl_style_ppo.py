@@ -129,7 +129,7 @@ def main(frames: int = 40_000) -> list[float]:
 
 def stable_baselines3(frames: int = 10_000) -> float:
     """The same with Stable-Baselines3's PPO and its own CNN; needs ``pip install
-    'arcade-torch[sb3]'``.
+    '.[sb3]'``.
 
     Args:
         frames: environment steps, in windows of 640.

@@ -203,7 +203,7 @@ def test_the_comment_behind_a_field_is_its_docstring_in_the_reference(
 
 def test_every_formula_becomes_mathml() -> None:
     pytest.importorskip(
-        "latex2mathml", reason="needs the docs extra: pip install 'arcade-torch[docs]'"
+        "latex2mathml", reason="needs the docs extra: pip install '.[docs]'"
     )
     for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
@@ -264,7 +264,7 @@ class Page(html.parser.HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
     """The site, built strictly: a warning is an error."""
-    pytest.importorskip("mkdocs", reason="needs the docs extra: pip install 'arcade-torch[docs]'")
+    pytest.importorskip("mkdocs", reason="needs the docs extra: pip install '.[docs]'")
     target = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(target)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}

@@ -29,12 +29,12 @@ class MissingPackage(ImportError):
 
     Example:
         >>> str(MissingPackage("jinja2"))
-        "the package jinja2 is missing: pip install 'arcade-torch[tools]'"
+        "the package jinja2 is missing: pip install '.[tools]'"
     """
 
     def __init__(self, name: str) -> None:
         top = name.partition(".")[0]
-        wanted = f"'arcade-torch[{EXTRA_OF[top]}]'" if top in EXTRA_OF else top
+        wanted = f"'.[{EXTRA_OF[top]}]'" if top in EXTRA_OF else top
         super().__init__(f"the package {top} is missing: pip install {wanted}")
 
 

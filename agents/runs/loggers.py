@@ -25,7 +25,7 @@ def check_logger(name: str) -> None:
     """
     if name != "none" and importlib.util.find_spec(name) is None:
         raise LoggerError(
-            f"logger={name!r} needs a package that is missing: pip install 'arcade-torch[loggers]'"
+            f"logger={name!r} needs a package that is missing: pip install '.[loggers]'"
         )
 
 

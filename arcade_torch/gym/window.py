@@ -24,7 +24,7 @@ class Window:
             import pygame
         except ModuleNotFoundError as error:
             raise ImportError(
-                "a window needs the package pygame: pip install 'arcade-torch[play]'"
+                "a window needs the package pygame: pip install '.[play]'"
             ) from error
         self.pygame: Any = pygame
         self._scale = scale

@@ -275,7 +275,7 @@ def test_render_gives_the_frame_that_is_seen() -> None:
 
 def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip(
-        "pygame", reason="needs the play extra: pip install 'arcade-torch[play]'"
+        "pygame", reason="needs the play extra: pip install '.[play]'"
     )
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env = gymnasium.make(GAME, render_mode="human")
@@ -292,7 +292,7 @@ def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.Monke
 
 def test_a_window_without_pygame_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(ImportError, match=r"pip install 'arcade-torch\[play\]'"):
+    with pytest.raises(ImportError, match=r"pip install '.\[play\]'"):
         gymnasium.make(GAME, render_mode="human")
 
 

@@ -9,7 +9,7 @@ from arcade_torch import registered_ids
 from tests.contracts.test_gymnasium import COVER, SIZES, TWINS
 
 pytest.importorskip(
-    "stable_baselines3", reason="needs the sb3 extra: pip install 'arcade-torch[sb3]'"
+    "stable_baselines3", reason="needs the sb3 extra: pip install '.[sb3]'"
 )
 
 from stable_baselines3 import PPO

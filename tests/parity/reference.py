@@ -17,7 +17,7 @@ def missing() -> str:
     try:
         found = version(PACKAGE)
     except PackageNotFoundError:
-        return f"needs the parity extra: pip install 'arcade-torch[parity]' ({PACKAGE}=={WANTED})"
+        return f"needs the parity extra: pip install '.[parity]' ({PACKAGE}=={WANTED})"
     return "" if found == WANTED else f"compares with {PACKAGE} {WANTED}, and {found} is installed"
 
 

@@ -177,7 +177,7 @@ def test_a_missing_package_is_named_with_its_extra(
 ) -> None:
     write_study(tmp_path / "s", small_study())
     monkeypatch.setitem(sys.modules, "jinja2", None)
-    assert "pip install 'arcade-torch[tools]'" in one_error(capsys, ["report", str(tmp_path / "s")])
+    assert "pip install '.[tools]'" in one_error(capsys, ["report", str(tmp_path / "s")])
     with pytest.raises(MissingPackage, match="the package jinja2 is missing"):
         need("jinja2")
 
@@ -193,7 +193,7 @@ def test_a_missing_option_parser_is_named_too() -> None:
     assert result.returncode == 2
     assert (
         result.stderr
-        == "arcade-torch: the package tyro is missing: pip install 'arcade-torch[tools]'\n"
+        == "arcade-torch: the package tyro is missing: pip install '.[tools]'\n"
     )
 
 

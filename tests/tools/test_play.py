@@ -248,7 +248,7 @@ def test_the_analyses_read_the_scores(tmp_path: Path) -> None:
 def pygame(monkeypatch: pytest.MonkeyPatch) -> object:
     """pygame without a screen."""
     module = pytest.importorskip(
-        "pygame", reason="needs the play extra: pip install 'arcade-torch[play]'"
+        "pygame", reason="needs the play extra: pip install '.[play]'"
     )
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     module.display.init()
@@ -297,7 +297,7 @@ def test_without_display_or_pygame_there_is_a_reason(monkeypatch: pytest.MonkeyP
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setitem(sys.modules, "pygame", None)
-    assert "pip install 'arcade-torch[play]'" in str(screens.why_no_window())
+    assert "pip install '.[play]'" in str(screens.why_no_window())
 
 
 def test_without_a_display_there_is_a_reason(

@@ -196,7 +196,7 @@ def test_frames_of_many_colours_are_written_too(tmp_path: Path) -> None:
 )  # reading through imageio_ffmpeg forks; writing does not
 def test_an_mp4_holds_the_frames_nearly(tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip(
-        "imageio_ffmpeg", reason="needs the video extra: pip install 'arcade-torch[video]'"
+        "imageio_ffmpeg", reason="needs the video extra: pip install '.[video]'"
     )
     player, _ = session(seed=2)
     frames = list(
@@ -328,7 +328,7 @@ def test_missing_writers_are_named_with_their_extras(
         assert (
             cli.main(["record", GAME, "--out", str(tmp_path / f"x{suffix}")]) == cli.EXIT_BAD_INPUT
         )
-        assert f"pip install 'arcade-torch[{extra}]'" in capsys.readouterr().err
+        assert f"pip install '.[{extra}]'" in capsys.readouterr().err
 
 
 def test_every_evaluation_of_a_training_is_filmed_and_changes_nothing(tmp_path: Path) -> None:
