@@ -15,15 +15,26 @@ def share_reached(training_return: float | None, return_range: tuple[float, floa
     return min(1.0, max(0.0, (training_return - low) / (high - low)))
 
 
+def window_share(training_return: float | None, return_range: tuple[float, float]) -> float:
+    """How much of the longest window the mean goes over: 0 at the lowest return, 1 at the highest.
+
+    A game that pays from 0 on has the fourth power of the share that is reached. Where returns
+    below 0 are possible the exponent is larger, four times the range over its part above 0: near
+    the highest return, the window then depends on the return as in a game without them.
+    """
+    low, high = return_range
+    exponent = 4 * (high - low) / high if low < 0 < high else 4
+    return share_reached(training_return, return_range) ** exponent
+
+
 def check_return_range(game: str, return_range: tuple[float, float]) -> None:
     """Raise ValueError if no share of the range can be told."""
     low, high = return_range
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(
             f"average_share goes by how much of a game's return is reached, but {game} has "
-            "return_range "
-            f"({low}, {high}): give the game two finite numbers, the lowest and the highest "
-            "return, or set it to 0"
+            f"return_range ({low}, {high}): give the game two finite numbers, the lowest and the "
+            "highest return, or set it to 0"
         )
 
 

@@ -189,9 +189,10 @@ class LearnerConfig(Checked):
     """Limit on the joint norm of the gradients."""
     average_share: Fraction = 0.0
     """The weights that act and are saved are a mean of those that learn, over about this share of
-    the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824) times the fourth power of
-    the training return, which counts from 0 at the lowest that the game can pay to 1 at the
-    highest; 0: no mean."""
+    the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824). The share grows with the
+    training return: none at the lowest that the game can pay, all of it at the highest, a fourth
+    power between (``agents.averaging.window_share``). 0: no mean.
+    """
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the
     input scaling.

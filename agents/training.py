@@ -20,7 +20,7 @@ from tensordict.nn import CudaGraphModule
 from torchrl.modules import EGreedyModule
 
 import arcade_torch
-from arcade_torch.agents.averaging import check_return_range, move_mean, share_reached
+from arcade_torch.agents.averaging import check_return_range, move_mean, window_share
 from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
@@ -169,8 +169,8 @@ class Trainer:
         self.frames += numbers.frames_per_update
         self.updates += 1
         if self.acting is not self.network:
-            share = share_reached(self.stats.smooth, self.return_range)
-            move_mean(self.acting, self.network, share**4 * numbers.average_share * self.updates)
+            share = window_share(self.stats.smooth, self.return_range)
+            move_mean(self.acting, self.network, share * numbers.average_share * self.updates)
         took = time.perf_counter() - began
         self.seconds += took
         row = {

@@ -181,6 +181,16 @@ def test_a_return_counts_as_a_share_of_what_the_game_can_pay(training_return, sp
     assert averaging.share_reached(training_return, span) == share
 
 
+@pytest.mark.parametrize("training_return", [0.5, 0.7, 0.9, 1.0])
+def test_the_window_grows_alike_near_the_highest_return_of_all_games(training_return):
+    """Navigator, whose returns begin at -1, lost with a window by the bare share, which is longer."""
+    positive = averaging.window_share(training_return, (0.0, 1.0))
+    assert positive == training_return**4
+    assert averaging.window_share(training_return, (-1.0, 1.0)) == pytest.approx(positive, abs=0.05)
+    assert averaging.window_share(-0.9, (-1.0, 0.0)) == pytest.approx(0.1**4)
+    assert averaging.window_share(None, (-1.0, 1.0)) == 0
+
+
 def test_the_mean_goes_by_the_range_of_the_runs_own_game():
     trainer = Trainer(config("pqn", env="NavigatorEasy", pqn={"average_share": 0.5}))
     assert trainer.return_range == trainer.env.game.return_range and trainer.return_range[0] < -0.9

@@ -106,8 +106,7 @@ def test_a_logger_that_is_not_installed_is_named_before_anything_is_written(
     words = ["--preset", "smoke", "--logger", "wandb", "--out", str(tmp_path / "run")]
     assert cli.main(["train", *words]) == cli.EXIT_BAD_INPUT
     said = (
-        "arcade-torch: logger='wandb' needs a package that is missing: pip install "
-        "'.[loggers]'\n"
+        "arcade-torch: logger='wandb' needs a package that is missing: pip install '.[loggers]'\n"
     )
     assert capsys.readouterr().err == said
     assert not (tmp_path / "run").exists()
@@ -126,9 +125,7 @@ def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
 def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(
     plain: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip(
-        "tensorboard", reason="needs the loggers extra: pip install '.[loggers]'"
-    )
+    pytest.importorskip("tensorboard", reason="needs the loggers extra: pip install '.[loggers]'")
 
     def stop() -> None:
         raise KeyboardInterrupt
@@ -150,9 +147,7 @@ def test_tensorboard_shows_the_rows_and_after_going_on_no_step_twice(
 def test_weights_and_biases_keeps_one_offline_run_over_both_parts(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip(
-        "wandb", reason="needs the loggers extra: pip install '.[loggers]'"
-    )
+    pytest.importorskip("wandb", reason="needs the loggers extra: pip install '.[loggers]'")
     monkeypatch.delenv("WANDB_MODE", raising=False)
     config, folder = dataclasses.replace(CONFIG, logger="wandb"), tmp_path / "run"
 
