@@ -29,12 +29,21 @@ SUGGESTION = "Perhaps you meant:"
 """What tyro writes in front of the nearest option."""
 
 
-def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> Any:
-    """Read options of a command into a dataclass; ``default`` is an instance with values where no
-    option is given.
+def parse(
+    kind: Any, words: Sequence[str], prog: str, default: Any = None, description: str | None = None
+) -> Any:
+    """Read options of a command into a dataclass.
 
-    An option that is unknown, missing or malformed is a ``ValueError`` in one line; help is a
-    ``SystemExit``.
+    Args:
+        kind: the dataclass.
+        words: the command line behind the command.
+        prog: the command, as the help and messages name it.
+        default: an instance, with the values where no option is given.
+        description: what the help says of the command; by default the docstring of ``kind``.
+
+    Raises:
+        ValueError: an option is unknown, missing or malformed; says so in one line.
+        SystemExit: the help was asked for, and is printed.
     """
     tyro = need("tyro")
     message = StringIO()
@@ -44,6 +53,7 @@ def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> An
                 kind,
                 args=list(words),
                 prog=prog,
+                description=description,
                 default=tyro.MISSING_NONPROP if default is None else default,
                 config=(tyro.conf.FlagCreatePairsOff,),
                 registry=_whole_numbers(),
