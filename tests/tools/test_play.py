@@ -23,7 +23,7 @@ from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.play import screens
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay, score_row
 from arcade_torch.tools.play.session import KEYS, Attempt, Session
-from arcade_torch.tools.runs import read_scores
+from arcade_torch.tools.scores import read_scores
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "MineSweeperEasy"
