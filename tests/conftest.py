@@ -57,9 +57,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
     if needing_ray and importlib.util.find_spec("ray") is None:
         for item in needing_ray:
-            item.add_marker(
-                pytest.mark.skip(reason="needs the ray extra: pip install '.[ray]'")
-            )
+            item.add_marker(pytest.mark.skip(reason="needs the ray extra: pip install '.[ray]'"))
 
 
 def _has_cuda() -> bool:

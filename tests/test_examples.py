@@ -69,9 +69,7 @@ def test_one_line_makes_our_environment_instead_of_theirs(
     theirs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if theirs:
-        pytest.importorskip(
-            "pygame", reason="needs the play extra: pip install '.[play]'"
-        )
+        pytest.importorskip("pygame", reason="needs the play extra: pip install '.[play]'")
     script = example("stock_pixels_ppo")
     monkeypatch.setattr(script, "EPOCHS", 1)
     monkeypatch.setattr(script, "WINDOW", 32)
@@ -109,9 +107,7 @@ def test_ppo_in_one_file_begins_with_the_policy_that_acted(monkeypatch: pytest.M
 
 @pytest.mark.slow
 def test_stable_baselines3_takes_the_environment() -> None:
-    pytest.importorskip(
-        "stable_baselines3", reason="needs the sb3 extra: pip install '.[sb3]'"
-    )
+    pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install '.[sb3]'")
     assert -1 <= example("cleanrl_style_ppo").stable_baselines3(frames=640) <= 1
 
 

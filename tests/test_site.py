@@ -202,9 +202,7 @@ def test_the_comment_behind_a_field_is_its_docstring_in_the_reference(
 
 
 def test_every_formula_becomes_mathml() -> None:
-    pytest.importorskip(
-        "latex2mathml", reason="needs the docs extra: pip install '.[docs]'"
-    )
+    pytest.importorskip("latex2mathml", reason="needs the docs extra: pip install '.[docs]'")
     for page in sorted(DOCS.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         assert text.count("$$") % 2 == 0, page

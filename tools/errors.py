@@ -1,9 +1,8 @@
-"""Which errors are bad input, told in one line, and which are faults of ours; optional packages,
-imported when used.
+"""Which errors are bad input, printed in one line, and which are faults of ours, printed with their
+traceback; optional packages, imported on first use.
 """
 
 import errno
-import opcode
 import sys
 from importlib import import_module
 from typing import Any
@@ -12,14 +11,16 @@ from arcade_torch.process import missing_platform
 from arcade_torch.tools.text import printable
 
 EXTRA_OF = {
-    **dict.fromkeys(("tyro", "rich", "matplotlib", "jinja2", "PIL"), "tools"),
-    **{
-        "pygame": "play",
-        "imageio_ffmpeg": "video",
-        "wandb": "loggers",
-        "tensorboard": "loggers",
-        "ray": "ray",
-    },
+    "tyro": "tools",
+    "rich": "tools",
+    "matplotlib": "tools",
+    "jinja2": "tools",
+    "PIL": "tools",
+    "pygame": "play",
+    "imageio_ffmpeg": "video",
+    "wandb": "loggers",
+    "tensorboard": "loggers",
+    "ray": "ray",
 }
 """Import name -> the extra of arcade-torch that brings it."""
 
@@ -37,6 +38,9 @@ class MissingPackage(ImportError):
         wanted = f"'.[{EXTRA_OF[top]}]'" if top in EXTRA_OF else top
         super().__init__(f"the package {top} is missing: pip install {wanted}")
 
+
+WITH_OPTIONS = ("arcade_torch.envs_jax.", "arcade_torch.models.")
+"""Packages whose functions take options by name: a ``TypeError`` that they raise is about one."""
 
 FILES = (FileNotFoundError, FileExistsError, PermissionError, NotADirectoryError, IsADirectoryError)
 
@@ -76,25 +80,33 @@ def need(name: str) -> Any:
 
 
 def is_told(error: BaseException) -> bool:
-    """Whether an error is told in one line: one of our own types, something about a file, or a
-    refusal of ours.
+    """Whether an error is told in one line: one of our own types, something about a file, or an
+    argument that our code refuses.
 
-    A ``ValueError`` or ``TypeError`` is a refusal only if a ``raise`` statement of this package
-    raised it; one that comes out of an operation, or out of a library, is a fault.
+    All layers refuse arguments with a ``ValueError``, because all are used without the command line
+    too. Games and memory models refuse options with a ``TypeError``, as Python does. The same types
+    raised by a library, and a ``TypeError`` anywhere else, are faults.
     """
     if type(error).__module__.startswith("arcade_torch."):
         return True
     if isinstance(error, OSError) and not isinstance(error, ValueError):
-        named = error.errno is not None and error.filename is not None
-        return isinstance(error, FILES) or named or error.errno in MACHINE
-    if not isinstance(error, ValueError | TypeError):
-        return False
-    at = error.__traceback__
-    while at is not None and at.tb_next is not None:
-        at = at.tb_next
-    if at is None or not str(at.tb_frame.f_globals.get("__name__")).startswith("arcade_torch."):
-        return False
-    return at.tb_frame.f_code.co_code[at.tb_lasti] == opcode.opmap["RAISE_VARARGS"]
+        is_named = error.errno is not None and error.filename is not None
+        return isinstance(error, FILES) or is_named or error.errno in MACHINE
+    if isinstance(error, ValueError):
+        return _raising_module(error).startswith("arcade_torch.")
+    if isinstance(error, TypeError):
+        return _raising_module(error).startswith(WITH_OPTIONS)
+    return False
+
+
+def _raising_module(error: BaseException) -> str:
+    """The name of the module whose code raised an error."""
+    place = error.__traceback__
+    if place is None:
+        return ""
+    while place.tb_next is not None:
+        place = place.tb_next
+    return str(place.tb_frame.f_globals.get("__name__"))
 
 
 def is_of_the_machine(error: BaseException) -> bool:

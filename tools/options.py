@@ -25,65 +25,89 @@ those of PATH.
 """
 LARGEST = 2**53
 """No option that counts something goes beyond; up to here every whole number is a float as well."""
-_FRAME = re.compile(r"\x1b\[[0-9;]*m|^ *[│╭╰|+] ?| ?[│╮╯|+] *$", re.MULTILINE)
-_RULE = re.compile(r"^ *[─-](?: |[─-]{3}).*$", re.MULTILINE)
-_TITLES = (
-    "Unrecognized options",
-    "Value error",
-    "Required options",
-    "Invalid choice",
-    "Parsing error",
-)
+SUGGESTION = "Perhaps you meant:"
+"""What tyro writes in front of the nearest option."""
 
 
-def parse(kind: Any, words: Sequence[str], prog: str, default: Any = None) -> Any:
-    """Read options of a command into a dataclass; ``default`` is an instance with values where no
-    option is given.
+def parse(
+    kind: Any, words: Sequence[str], prog: str, default: Any = None, description: str | None = None
+) -> Any:
+    """Read options of a command into a dataclass.
 
-    An option that is unknown, missing or malformed is a ``ValueError`` in one line; help is a
-    ``SystemExit``.
+    Args:
+        kind: the dataclass.
+        words: the command line behind the command.
+        prog: the command, as the help and messages name it.
+        default: an instance, with the values where no option is given.
+        description: what the help says of the command; by default the docstring of ``kind``.
+
+    Raises:
+        ValueError: an option is unknown, missing or malformed; says so in one line.
+        SystemExit: the help was asked for, and is printed.
     """
     tyro = need("tyro")
+    message = StringIO()
+    try:
+        with redirect_stderr(message):
+            return tyro.cli(
+                kind,
+                args=list(words),
+                prog=prog,
+                description=description,
+                default=tyro.MISSING_NONPROP if default is None else default,
+                config=(tyro.conf.FlagCreatePairsOff,),
+                registry=_whole_numbers(),
+            )
+    except SystemExit as stop:
+        if not stop.code:  # the help was printed
+            raise
+    raise ValueError(f"{_in_one_line(message.getvalue())} (see {prog} --help)")
+
+
+def _whole_numbers() -> Any:
+    """tyro's rules for types, and one of ours: options that count take 2e7 and 40_000."""
     constructors = need("tyro.constructors")
     registry = constructors.ConstructorRegistry()
-    captured = StringIO()
 
     @registry.primitive_rule  # type: ignore[untyped-decorator]
     def whole(info: Any) -> Any:
-        """Let options that count take 2e7 and 40_000."""
-        spec = constructors.PrimitiveConstructorSpec(
+        if info.type is not int:
+            return None
+        return constructors.PrimitiveConstructorSpec(
             nargs=1,
             metavar="INT",
             instance_from_str=lambda parts: whole_number(parts[0]),
             is_instance=lambda value: type(value) is int,
             str_from_instance=lambda value: [str(value)],
         )
-        return spec if info.type is int else None
 
-    how: dict[str, Any] = {"config": (tyro.conf.FlagCreatePairsOff,), "registry": registry}
-    try:
-        with redirect_stderr(captured):
-            return tyro.cli(
-                kind,
-                args=list(words),
-                prog=prog,
-                **how,
-                **({"default": default} if default else {}),
-            )
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-    # The framed message that tyro wrote, in one line.
-    parts = [" ".join(part.split()) for part in _RULE.split(_FRAME.sub("", captured.getvalue()))]
-    said = [part for part in parts if part and part not in _TITLES] or [
-        "the options could not be read"
-    ]
-    near = [
-        f"; perhaps you meant {part.split()[3]}"
-        for part in said
-        if part.startswith("Perhaps you meant: ")
-    ]
-    raise ValueError(f"{said[0].rstrip('.')}{''.join(near)} (see {prog} --help)")
+    return registry
+
+
+def _in_one_line(message: str) -> str:
+    """What a message of tyro says is wrong, and the option that it suggests.
+
+    tyro only prints: a title, then parts between rules, in a frame that depends on the terminal.
+    The first part says what is wrong. Its error events are private, and version 1.0 has none.
+    """
+    text = need("rich.text").Text.from_ansi(message).plain  # without colours
+    parts = [""]
+    for framed in text.splitlines()[1:]:  # the first line is the title
+        line = framed.strip("│╰╯ ")
+        is_rule = line != "" and not line.strip("─-")
+        if is_rule:
+            parts.append("")
+        else:
+            parts[-1] = f"{parts[-1]} {line}".strip()
+    parts = [part for part in parts if part]
+    if not parts:
+        return "the options could not be read"
+    wrong = parts[0].rstrip(".")
+    for part in parts:
+        if part.startswith(SUGGESTION):
+            option = part.removeprefix(SUGGESTION).split()[0]
+            return f"{wrong}; perhaps you meant {option}"
+    return wrong
 
 
 def at_least(options: Any, **least: float) -> None:

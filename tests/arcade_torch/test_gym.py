@@ -274,9 +274,7 @@ def test_render_gives_the_frame_that_is_seen() -> None:
 
 
 def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    pygame = pytest.importorskip(
-        "pygame", reason="needs the play extra: pip install '.[play]'"
-    )
+    pygame = pytest.importorskip("pygame", reason="needs the play extra: pip install '.[play]'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env = gymnasium.make(GAME, render_mode="human")
     for look in (lambda: env.reset(seed=0), lambda: env.step(4)):

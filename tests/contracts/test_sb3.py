@@ -8,9 +8,7 @@ import pytest
 from arcade_torch import registered_ids
 from tests.contracts.test_gymnasium import COVER, SIZES, TWINS
 
-pytest.importorskip(
-    "stable_baselines3", reason="needs the sb3 extra: pip install '.[sb3]'"
-)
+pytest.importorskip("stable_baselines3", reason="needs the sb3 extra: pip install '.[sb3]'")
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env

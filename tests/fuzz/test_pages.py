@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 
 from arcade_torch.tools.bench.registry import compare, page, read_results
+from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import Part, ScoreOptions, make_figure
 from arcade_torch.tools.reports import report
-from arcade_torch.tools.runs import find_runs
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.fuzz.contract import attempt, content, fuzz

@@ -23,7 +23,7 @@ from arcade_torch.tools.play.scores import (
     read_scores_file,
     replay,
 )
-from arcade_torch.tools.runs import METRICS, read_scores
+from arcade_torch.tools.scores import METRICS, read_scores
 from tests.fuzz.contract import attempt, fuzz
 from tests.fuzz.hostile import FLOATS, NAMES, NUMBERS, mutated, names, seeds
 

@@ -6,20 +6,19 @@ import pytest
 import torch
 
 from arcade_torch.agents.runs.files import read_csv
-from arcade_torch.models import linear_scan, lru, scan
+from arcade_torch.models import linear_scan, scan
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.harness import KINDS, REST, op_breakdown
+from arcade_torch.tools.bench.loops import LOOPS, unbind_loop
 from arcade_torch.tools.bench.memory import (
     COPY,
     LOOP,
-    LOOPS,
     TORCH_GRU,
     bench_saliency,
     forms,
     scan_forms,
     solve,
     time_passes,
-    unbind_loop,
 )
 from tests.tools.test_cli import one_error
 
@@ -71,13 +70,6 @@ def test_a_model_and_the_same_with_its_loop_agree(name: str) -> None:
         compared[name, "scan"](x, is_init), compared[name, "loop"](x, is_init)
     )
     assert compared[TORCH_GRU, "torch"](x, is_init).shape == (2, 20, 9)
-
-
-def test_a_loop_that_fails_leaves_the_scan_as_it_was() -> None:
-    loop = forms(["lru"], 1, 9)["lru", "loop"]
-    with pytest.raises(ValueError, match="must be"):
-        loop(torch.randn(2, 20, 8), torch.zeros(2, 20, dtype=torch.bool))
-    assert lru.linear_scan is linear_scan
 
 
 def test_saliency_is_timed_in_two_stages_and_through_the_whole_network() -> None:

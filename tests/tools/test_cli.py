@@ -191,14 +191,19 @@ def test_a_missing_option_parser_is_named_too() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
     )
     assert result.returncode == 2
-    assert (
-        result.stderr
-        == "arcade-torch: the package tyro is missing: pip install '.[tools]'\n"
-    )
+    assert result.stderr == "arcade-torch: the package tyro is missing: pip install '.[tools]'\n"
 
 
 @pytest.mark.parametrize(
-    "fault", [lambda: 1 // 0, lambda: whole_number(None), lambda: int("x"), lambda: {}["x"]]
+    "fault",
+    [
+        lambda: 1 // 0,
+        lambda: int("x"),
+        lambda: {}["x"],
+        lambda: whole_number(None),  # a TypeError out of a library
+        lambda: cli.split_command(None),  # a TypeError in our own code
+        lambda: json.loads("x"),  # a ValueError out of a library
+    ],
 )
 def test_a_fault_of_ours_shows_its_traceback_and_exits_with_1(
     fault: Callable[[], Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -11,11 +11,12 @@ import pytest
 from arcade_torch.agents.config import TrainConfig, differing_fields
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools import gap_and_bias
+from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import CurveOptions, PaperOptions, make_figure
 from arcade_torch.tools.figures.logs import curves
 from arcade_torch.tools.figures.style import drawing
 from arcade_torch.tools.reports import report
-from arcade_torch.tools.runs import find_runs, read_scores
+from arcade_torch.tools.scores import read_scores
 from tests.tools.fabricated import small_study, write_study
 from tests.tools.test_runs import GAME, write
 from tests.tools.test_study import change_config

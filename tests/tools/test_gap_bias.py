@@ -18,7 +18,8 @@ from arcade_torch.tools.analysis.bootstrap import (
 from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
 from arcade_torch.tools.figures import ScoreOptions
 from arcade_torch.tools.figures.style import drawing
-from arcade_torch.tools.runs import Score, read_scores
+from arcade_torch.tools.runs import Score
+from arcade_torch.tools.scores import read_scores
 
 PAPER = Path(__file__).resolve().parents[2] / "tools" / "data" / "paper_returns.csv"
 

@@ -8,11 +8,13 @@ import pytest
 
 from arcade_torch.agents.runs.files import is_final, read_csv
 from arcade_torch.agents.runs.folder import RunFolder
+from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures.logs import Rate, curves_of_runs
 from arcade_torch.tools.files import read_rows, write_between
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay
-from arcade_torch.tools.runs import Run, find_runs, read_scores
+from arcade_torch.tools.runs import Run
+from arcade_torch.tools.scores import read_scores
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import small_study, write_study

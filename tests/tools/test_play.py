@@ -23,7 +23,7 @@ from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.play import screens
 from arcade_torch.tools.play.scores import COLUMNS, append_score, replay, score_row
 from arcade_torch.tools.play.session import KEYS, Attempt, Session
-from arcade_torch.tools.runs import read_scores
+from arcade_torch.tools.scores import read_scores
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "MineSweeperEasy"
@@ -247,9 +247,7 @@ def test_the_analyses_read_the_scores(tmp_path: Path) -> None:
 @pytest.fixture
 def pygame(monkeypatch: pytest.MonkeyPatch) -> object:
     """pygame without a screen."""
-    module = pytest.importorskip(
-        "pygame", reason="needs the play extra: pip install '.[play]'"
-    )
+    module = pytest.importorskip("pygame", reason="needs the play extra: pip install '.[play]'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     module.display.init()
     yield module

@@ -12,10 +12,12 @@ from arcade_torch.tools import cli, report, reports
 from arcade_torch.tools.analysis.checkpoints import Label
 from arcade_torch.tools.analysis.contamination import Contamination
 from arcade_torch.tools.analysis.recall_density import RecallDensity
+from arcade_torch.tools.comparable import Runs
 from arcade_torch.tools.figures.style import drawing
+from arcade_torch.tools.names import AgentKey
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import representatives, select_cells
-from arcade_torch.tools.runs import AgentKey, Runs, open_run
+from arcade_torch.tools.runs import open_run
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import write_run

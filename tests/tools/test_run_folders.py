@@ -11,8 +11,9 @@ import pytest
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, gap_and_bias
+from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.run_folders import MOST_DEPTH
-from arcade_torch.tools.runs import find_runs, read_scores
+from arcade_torch.tools.scores import read_scores
 from tests.tools.fabricated import small_study, write_run, write_study
 from tests.tools.test_runs import write
 

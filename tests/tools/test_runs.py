@@ -9,8 +9,10 @@ import pytest
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, gap_and_bias
 from arcade_torch.tools.commands.figure import Figure
+from arcade_torch.tools.comparable import find_runs
+from arcade_torch.tools.names import AgentKey, agent_names
 from arcade_torch.tools.play.scores import COLUMNS
-from arcade_torch.tools.runs import AgentKey, agent_names, find_runs, read_scores
+from arcade_torch.tools.scores import read_scores
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import write_run
 

@@ -16,9 +16,10 @@ import arcade_torch
 from arcade_torch.agents import load
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.tools.analysis.policy import Progress
+from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
-from arcade_torch.tools.runs import Run, Runs, check_comparable, described, find_runs
+from arcade_torch.tools.runs import Run, described
 
 Found = TypeVar("Found")
 SETTINGS_FILES = ("config.json", "meta.json")

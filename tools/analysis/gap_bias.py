@@ -22,7 +22,8 @@ from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis import bootstrap
 from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
 from arcade_torch.tools.names import find_baselines
-from arcade_torch.tools.runs import Score, Source, read_scores
+from arcade_torch.tools.runs import Score
+from arcade_torch.tools.scores import Source, read_scores
 
 TWINS = ("full", "partial")
 BOTH_TWINS = ("mixed", "both")

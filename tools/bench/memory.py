@@ -7,24 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple, TypeVar
-from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from arcade_torch.models import (
-    fast_weights,
-    linear_scan,
-    lru,
-    make_memory,
-    matrix_scan_loop,
-    memory_names,
-    mingru,
-)
+from arcade_torch.models import linear_scan, make_memory, memory_names
 from arcade_torch.models.scan import back_end
 from arcade_torch.models.scan_triton import runs_triton
 from arcade_torch.tools.bench.harness import Measure, interleaved
+from arcade_torch.tools.bench.loops import LOOPS, unbind_loop
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
@@ -49,43 +41,6 @@ MINIBATCH_STEPS = 132
 Run = Callable[..., Tensor]
 Key = TypeVar("Key")
 T = TypeVar("T")
-
-
-def unbind_loop(
-    a: Tensor, b: Tensor, start: Tensor | None = None, h0: Tensor | None = None
-) -> Tensor:
-    """The loop that is fastest under autograd; the function of ``linear_scan`` for one state ``h0``
-    or none.
-
-    Indexing ``b[:, t]`` instead makes the backward pass quadratic in T.
-    """
-    h = b.new_zeros(b[:, 0].shape) if h0 is None else h0
-    begins = (
-        [None] * b.shape[1]
-        if start is None
-        else start.reshape(*start.shape, *[1] * (b.ndim - 2)).unbind(1)
-    )
-    states = []
-    for a_t, b_t, begins_t in zip(a.expand(b.shape).unbind(1), b.unbind(1), begins, strict=True):
-        h = torch.addcmul(b_t, a_t, h if begins_t is None else h.masked_fill(begins_t, 0))
-        states.append(h)
-    return torch.stack(states, dim=1)
-
-
-def _matrix_loop(*args: Any) -> tuple[Tensor, Tensor]:
-    out, states = matrix_scan_loop(*args)
-    return out, states[:, -1]
-
-
-LOOPS: dict[str, tuple[Any, str, Callable[..., Any]]] = {
-    "lru": (lru, "linear_scan", unbind_loop),
-    "mingru": (mingru, "linear_scan", unbind_loop),
-    **{
-        name: (fast_weights, "matrix_scan", _matrix_loop)
-        for name in ("linear_transformer", "gdn", "ttt")
-    },
-}
-"""Models that scan, and the plain loop over time in place of their scan: module, name, loop."""
 
 
 @dataclass
@@ -153,20 +108,32 @@ def forms(
     A model is a number of cells one above the other and nothing between, as in ``torch.nn.GRU``.
     """
 
-    def run(cells: Iterable[Any], x: Tensor, is_init: Tensor) -> Tensor:
-        for cell in cells:
-            x, _ = cell(x, cell.initial_state(len(x)), is_init)
-        return x
-
-    found: dict[tuple[str, str], Run] = {}
+    compared: dict[tuple[str, str], Run] = {}
     for name in names:
-        stack = partial(run, [make_memory(name, size, size).to(device) for _ in range(layers)])
-        found[name, "scan" if name in LOOPS else "own"] = stack
+        cells = _cells(partial(make_memory, name), layers, size, device)
+        compared[name, "scan" if name in LOOPS else "own"] = partial(_through, cells)
         if name in LOOPS:
-            found[name, "loop"] = patch.object(*LOOPS[name])(stack)
+            loops = _cells(LOOPS[name], layers, size, device)
+            loops.load_state_dict(cells.state_dict())
+            compared[name, "loop"] = partial(_through, loops)
     gru = nn.GRU(size, size, num_layers=layers, batch_first=True).to(device)
-    found[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
-    return found
+    compared[TORCH_GRU, "torch"] = lambda x, is_init: gru(x)[0]
+    return compared
+
+
+def _cells(
+    make: Callable[[int, int], nn.Module], layers: int, size: int, device: torch.device | str
+) -> nn.ModuleList:
+    """Cells of one model, as wide as they are told."""
+    cells = [make(size, size) for _ in range(layers)]
+    return nn.ModuleList(cells).to(device)
+
+
+def _through(cells: Iterable[Any], x: Tensor, is_init: Tensor) -> Tensor:
+    """The output of the last of some cells one above the other."""
+    for cell in cells:
+        x, _ = cell(x, cell.initial_state(len(x)), is_init)
+    return x
 
 
 def _repeated(work: Callable[[], object], device: torch.device) -> Measure:

@@ -97,17 +97,19 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
 
 def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
     config = trainer.config.learner
-    window = [trainer.collector.collect()]
+    learner: Any = trainer.learner
+    window = trainer.collector.collect()
 
     def collect() -> None:
-        window[:] = [trainer.collector.collect()]  # overwrites the window before
-
-    learner = trainer.learner
-    every = trainer.learner.minibatches
-    learner.__dict__["minibatches"] = lambda rows: itertools.islice(every(rows), options.grad_steps)
+        nonlocal window
+        window = trainer.collector.collect()
 
     def learn() -> None:
-        learner.update(window[0], 0)
+        """PQN's update, of which only some gradient steps are made."""
+        data = learner.loss.prepare(window)
+        for minibatch in itertools.islice(learner.minibatches(data), options.grad_steps):
+            learner.gradient_step(minibatch, frames=0)
+        learner.take_metrics()
 
     frames = config.frames_per_update
     every_step = config.grad_steps_per_update

@@ -7,9 +7,9 @@ the analysis folder of the first run.
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
@@ -21,6 +21,16 @@ from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 
+FigureOptions = TypeVar("FigureOptions", bound=Options)
+
+
+@dataclass
+class Arguments(Generic[FigureOptions]):
+    """What is written behind the name of a figure."""
+
+    options: Annotated[FigureOptions, tyro.conf.arg(name="")]
+    paths: tyro.conf.Positional[tuple[Path, ...]] = ()  # The same as --runs.
+
 
 @dataclass
 class Figure(Command):
@@ -31,33 +41,19 @@ class Figure(Command):
 
     @classmethod
     def parse(cls, words: Sequence[str], prog: str) -> "Figure":
-        """Read the options of one figure; runs are named with or without ``--runs``, which goes in
-        front.
-        """
+        """Read the options of one figure; runs are named with or without ``--runs``."""
         _, group, name = prog.split()
         entry = FIGURES[name]
-        starts = [
-            0,
-            *(place for place, word in enumerate(words) if word.startswith("--")),
-            len(words),
-        ]
-        parts = sorted(
-            (words[a:b] for a, b in pairwise(starts)),
-            key=lambda one: not "".join(one).startswith("--runs"),
+        summary = f"{entry.summary[0].upper()}{entry.summary[1:]}."
+        example = f"Example: {prog} {entry.example}"
+        kind: Any = Arguments
+        arguments = parse_options(
+            kind[entry.options], words, prog, description=f"{summary}\n\n{example}"
         )
-        words = [
-            word.removeprefix("--runs=") for part in parts for word in part if word != "--runs"
-        ]
-        Options.__annotations__["runs"] = tyro.conf.Positional[tuple[Path, ...]]
-        entry.options.__doc__ = (
-            f"{entry.summary[0].upper()}{entry.summary[1:]}.\n\nExample: {prog} {entry.example}"
-        )
-        options: Any = parse_options(entry.options, words, prog)
+        options: Options = arguments.options
+        options = replace(options, runs=(*options.runs, *arguments.paths))
         if group == "analyze" and options.out is None and options.runs and options.runs[0].is_dir():
-            first = options.runs[0]
-            # of a checkpoint
-            run = first.parent.parent if (first / "meta.json").is_file() else first
-            options = replace(options, out=run / "analysis")
+            options = replace(options, out=_run_folder(options.runs[0]) / "analysis")
         return cls(name, options)
 
     def run(self) -> int:
@@ -67,14 +63,23 @@ class Figure(Command):
         keep_freed_memory()
         import_matplotlib()
         with Bars() as bars:
-            made = make_figure(self.name, self.options, bars.update)
+            result = make_figure(self.name, self.options, bars.update)
         if self.options.csv:
-            for line in made.notes:
-                print(line, file=sys.stderr)
-            print(csv_text([row for picture in made.pictures for row in picture.rows]), end="")
+            for note in result.notes:
+                print(note, file=sys.stderr)
+            rows = chain.from_iterable(picture.rows for picture in result.pictures)
+            print(csv_text(list(rows)), end="")
             return 0
-        for table in made.tables:
+        for table in result.tables:
             table.show()
-        for line in [*made.notes, *map(str, made.files)]:
-            say(line)
+        for note in result.notes:
+            say(note)
+        for file in result.files:
+            say(file)
         return 0
+
+
+def _run_folder(folder: Path) -> Path:
+    """The folder of the run that a checkpoint belongs to; any other folder is its own."""
+    is_checkpoint = (folder / "meta.json").is_file()
+    return folder.parent.parent if is_checkpoint else folder

@@ -12,6 +12,7 @@ from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.analysis.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.analysis.gap_bias import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
 from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
+from arcade_torch.tools.comparable import Runs, find_runs
 from arcade_torch.tools.figures import (
     Made,
     PaperOptions,
@@ -32,7 +33,8 @@ from arcade_torch.tools.figures.style import (
 )
 from arcade_torch.tools.files import Table, read_csv
 from arcade_torch.tools.names import agent_names, memory_free
-from arcade_torch.tools.runs import Runs, Score, find_runs, read_scores, table_of
+from arcade_torch.tools.runs import Score
+from arcade_torch.tools.scores import read_scores, table_of
 
 PANELS = {
     "mdp": ("MDP return", "normalised return"),

@@ -10,13 +10,13 @@ import numpy as np
 from arcade_torch.tools.analysis import recall_density as measure
 from arcade_torch.tools.analysis.bootstrap import Pooled, pooled
 from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_runs
+from arcade_torch.tools.comparable import listed
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.options import at_least
-from arcade_torch.tools.runs import listed
 
 BARS_UP_TO = 6  # so many bins are drawn as stacked bars, more as curves
 MEMORY_FREE = ("mlp", "feedforward")

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
+from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, SaliencyOptions
 from arcade_torch.tools.figures.style import TWIN_NAMES, new_figure, rows_of
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.options import at_least
-from arcade_torch.tools.runs import find_runs
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
 

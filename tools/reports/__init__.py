@@ -13,6 +13,7 @@ from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
+from arcade_torch.tools.comparable import Runs, check_comparable
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
@@ -21,7 +22,8 @@ from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import Finals, select_cells
-from arcade_torch.tools.runs import METRICS, Runs, check_comparable, open_run
+from arcade_torch.tools.runs import open_run
+from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 

@@ -18,6 +18,7 @@ from arcade_torch.tools.analysis.bootstrap import pooled
 from arcade_torch.tools.analysis.checkpoints import by_task, measure_run
 from arcade_torch.tools.analysis.gap_bias import GapBias, normalise
 from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
+from arcade_torch.tools.comparable import Runs
 from arcade_torch.tools.figures import (
     Progress,
     contamination,
@@ -29,7 +30,6 @@ from arcade_torch.tools.figures import (
 )
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours
 from arcade_torch.tools.names import memory_free
-from arcade_torch.tools.runs import Runs
 
 # inches; small ones for many tasks
 FULL = (4.9, 3.0)

@@ -37,7 +37,8 @@ from arcade_torch.tools.figures import (
 )
 from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
-from arcade_torch.tools.runs import AgentKey, Run, Score
+from arcade_torch.tools.names import AgentKey
+from arcade_torch.tools.runs import Run, Score
 from arcade_torch.tools.studies.grid import RunSpec
 from tests.tools.fabricated import small_study, write_run, write_study
 
