@@ -1,5 +1,6 @@
 """Stratified bootstrap of means over tasks, and how often its intervals really hold the truth."""
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -16,6 +17,11 @@ class Interval(NamedTuple):
     value: float
     low: float
     high: float
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is an interval: whether its ends are numbers."""
+        return not math.isnan(self.low)
 
     @property
     def excludes_zero(self) -> bool:
