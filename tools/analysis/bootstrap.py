@@ -36,7 +36,8 @@ def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> l
 
 def mean_over_tasks(cells: Sequence[Array]) -> Array:
     """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...]."""
-    return np.asarray(sum(cell.mean(axis=-1) for cell in cells) / len(cells))
+    means = [cell.mean(axis=-1) for cell in cells]
+    return np.asarray(sum(means) / len(means))
 
 
 def iqm(cells: Sequence[Array]) -> Array:
@@ -90,8 +91,9 @@ def pooled(
         drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
         return np.array(percentile_interval(known.mean(), drawn, confidence))
 
-    every = np.array(values, dtype=np.float64)
-    return Pooled(every, *np.apply_along_axis(cell, 0, every))
+    all_seeds = np.array(values, dtype=np.float64)
+    mean, low, high = np.apply_along_axis(cell, 0, all_seeds)
+    return Pooled(all_seeds, mean, low, high)
 
 
 @lru_cache(maxsize=64)
