@@ -101,7 +101,7 @@ def measure_run(
     twin = options.get("observability") or config.observability
     key = AgentKey.of(config.to_dict())
     label = Label(key, config.env, twin, config.seed, path, key.memory, config.observability)
-    arguments = _arguments(measure, {**options, "progress": progress})
+    arguments = _arguments(measure, dict(options) | {"progress": progress})
 
     def compute() -> dict[str, Any]:
         result = measure(agent, **arguments)
