@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, NamedTuple, TypeVar
 
@@ -45,30 +46,45 @@ class Table:
         """Print it to stdout; a table that is wider than the terminal is cut into several, each
         with the names.
         """
-        lines = [[_lines(cell) for cell in line] for line in (self.columns, *self.rows)]
-        widths = [
-            max(map(len, "\n".join(cells).split("\n"))) + 3 for cells in zip(*lines, strict=True)
-        ]
+        lines = list[list[str]]()
+        for line in (self.columns, *self.rows):
+            lines.append([_lines(cell) for cell in line])
+        widths = [_width(cells) for cells in zip(*lines, strict=True)]
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
         width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
-        parts = [list(range(self.left))]
-        for i in range(self.left, len(self.columns)):
-            if len(parts[-1]) > self.left and sum(widths[j] for j in (*parts[-1], i)) + 1 > width:
-                parts.append(list(range(self.left)))
-            parts[-1].append(i)
+        parts = self._parts(widths, width)
         for part in parts:
             title = _lines(self.title) if part is parts[0] else ""
             caption = _lines(self.caption) if part is parts[-1] else ""
             table = need("rich.table").Table(title=title or None, caption=caption or None)
-            table.title_justify = table.caption_justify = "left"
-            for i in part:
-                table.add_column(
-                    lines[0][i], justify="left" if i < self.left else "right", overflow="fold"
-                )
+            table.title_justify = "left"
+            table.caption_justify = "left"
+            for column in part:
+                side = "left" if column < self.left else "right"
+                table.add_column(lines[0][column], justify=side, overflow="fold")
             for line in lines[1:]:
-                table.add_row(*(line[i] for i in part))
+                table.add_row(*(line[column] for column in part))
             console(highlight=False, markup=False, emoji=False, width=width).print(table)
+
+    def _parts(self, widths: Sequence[int], width: int) -> list[list[int]]:
+        """The columns of tables that are no wider than a terminal; those that name a row are in
+        all of them.
+        """
+        names = list(range(self.left))
+        parts = [list(names)]
+        for column in range(self.left, len(widths)):
+            wider = sum(widths[other] for other in parts[-1]) + widths[column] + 1
+            if wider > width and len(parts[-1]) > self.left:
+                parts.append(list(names))
+            parts[-1].append(column)
+        return parts
+
+
+def _width(cells: Sequence[str]) -> int:
+    """Letters that a column takes, with its frame."""
+    lines = "\n".join(cells).split("\n")
+    return max(map(len, lines)) + 3
 
 
 def _lines(cell: object) -> str:
@@ -88,8 +104,11 @@ def markdown_table(
 ) -> str:
     """A Markdown table; columns after the first ``left`` are aligned right."""
     left = len(columns) if left is None else left
-    lines = ["| " + " | ".join(map(markdown_cell, line)) + " |" for line in (columns, *rows)]
-    return "\n".join([lines[0], "|---" * left + "|---:" * (len(columns) - left) + "|", *lines[1:]])
+    lines = []
+    for cells in (columns, *rows):
+        lines.append("| " + " | ".join(map(markdown_cell, cells)) + " |")
+    lines.insert(1, "|---" * left + "|---:" * (len(columns) - left) + "|")
+    return "\n".join(lines)
 
 
 def write_between(page: Path, begin: str, end: str, text: str) -> Path:
@@ -103,9 +122,9 @@ def write_between(page: Path, begin: str, end: str, text: str) -> Path:
             f"{page} needs one line {begin!r} and below it one line {end!r}; the table goes "
             "between them"
         )
-    return write_atomic(
-        page, f"{old.partition(begin)[0]}{begin}\n\n{text}\n\n{end}{old.partition(end)[2]}"
-    )
+    before = old.partition(begin)[0]
+    after = old.partition(end)[2]
+    return write_atomic(page, f"{before}{begin}\n\n{text}\n\n{end}{after}")
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> Path:
@@ -118,8 +137,7 @@ def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> 
     cell.
     """
     buffer = io.StringIO()
-    known = dict.fromkeys(name for row in rows for name in row)
-    names = list(columns or known)
+    names = list(columns or dict.fromkeys(chain.from_iterable(rows)))
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([csv_cell(name) for name in names])
     for row in rows:
@@ -129,14 +147,15 @@ def csv_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> 
 
 def read_rows(path: Path, kind: type[Row]) -> list[Row]:
     """Rows of a CSV file as named tuples of a kind; a ``ValueError`` if it is no table of them."""
+    rows = list[Row]()
     try:
-        return [
-            kind(*(of(row[name]) for name, of in kind.__annotations__.items()))
-            for row in read_csv(path)
-        ]
+        for cells in read_csv(path):
+            values = [convert(cells[name]) for name, convert in kind.__annotations__.items()]
+            rows.append(kind(*values))
     except (KeyError, ValueError) as error:
         wanted = ", ".join(kind._fields)
         raise ValueError(f"{path} is no table with columns {wanted} ({error})") from None
+    return rows
 
 
 def measured_rows(
@@ -147,13 +166,14 @@ def measured_rows(
 
     ``measure`` is called with the cells of a key; without a ``path`` nothing is kept.
     """
-    known = read_rows(path, kind) if path is not None and path.exists() else []
+    rows = read_rows(path, kind) if path is not None and path.exists() else []
     for key in keys:
-        row = next((row for row in known if row[: len(key)] == key), None)
+        row = next((row for row in rows if row[: len(key)] == key), None)
         if row is None:
-            known.append(row := measure(*key))
+            row = measure(*key)
+            rows.append(row)
             if path is not None:
-                write_csv(path, [each._asdict() for each in known], kind._fields)
+                write_csv(path, [other._asdict() for other in rows], kind._fields)
         yield row
 
 
@@ -186,7 +206,7 @@ def read_npz(path: Path) -> dict[str, Any]:
                         _check_header(member, entry.file_size)
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as arrays:
-                return {key: arrays[key] for key in arrays.files}
+                return dict(arrays)
         except (
             zipfile.BadZipFile,
             zlib.error,
@@ -233,10 +253,11 @@ def cached_arrays(
     kept = _kept_arrays(file, text)
     if kept is not None:
         return kept
-    arrays = {**compute(), "options": np.array(text)}
+    arrays = compute()
+    arrays["options"] = np.array(text)
     if (run / "config.json").is_file() and os.access(run, os.W_OK) and not file.parent.is_symlink():
         try:
-            write_npz(file, {**arrays, "layout": np.array(_layout(arrays))})
+            write_npz(file, arrays | {"layout": np.array(_layout(arrays))})
         # a full disk, for one: what took minutes to compute is still of use
         except OSError as error:
             warnings.warn(f"the numbers could not be kept for another time: {error}", stacklevel=2)
@@ -258,7 +279,7 @@ def _kept_arrays(file: Path, options: str) -> dict[str, Any] | None:
 
 def _layout(arrays: Mapping[str, Any]) -> str:
     """Names, types and shapes of arrays as text."""
-    described = {
-        name: [str(np.asarray(value).dtype), np.shape(value)] for name, value in arrays.items()
-    }
-    return json.dumps(described, sort_keys=True)
+    layout = dict[str, Any]()
+    for name, value in arrays.items():
+        layout[name] = [str(np.asarray(value).dtype), np.shape(value)]
+    return json.dumps(layout, sort_keys=True)

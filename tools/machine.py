@@ -37,9 +37,8 @@ def _commit() -> str:
     try:
         # another repository may hold an installed copy
         git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("rev-parse", "--short=12", "HEAD") + (
-            "+changes" if git("status", "--porcelain") else ""
-        )
+        commit = git("rev-parse", "--short=12", "HEAD")
+        return f"{commit}+changes" if git("status", "--porcelain") else commit
     except (OSError, subprocess.SubprocessError):
         return ""
 
@@ -56,17 +55,14 @@ def machine() -> dict[str, Any]:
         "processor": platform.processor() or platform.machine(),
         "cores": len(available_cores()),
         "torch_threads": torch.get_num_threads(),
-        **versions(),
-    }
+    } | versions()
 
 
 def available_cores() -> list[int]:
     """Numbers of the processor cores this process may use, at least one."""
-    return (
-        sorted(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else [*range(os.cpu_count() or 1)]
-    )
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 @contextmanager

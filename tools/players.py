@@ -58,14 +58,12 @@ def measure(
     require(player in PLAYERS, "player", player, f"one of {', '.join(PLAYERS)}")
     started = time.monotonic()
     game = make(id, **options)
-    who = (
-        RandomPlayer(0)
-        if player == "random"
-        else make_oracle(game, "state" if player == "state" else "frames")
-    )
+    actor: Any = RandomPlayer(0)
+    if player != "random":
+        actor = make_oracle(game, "state" if player == "state" else "frames")
     played = play(
         game,
-        who,
+        actor,
         episodes,
         0,
         frames=player == "frames",
@@ -73,12 +71,14 @@ def measure(
         seconds=seconds,
     )
     returns = played.returns.astype(np.float64)
-    half_width = student_half_width(returns)
-    mean, half_width, steps = (
-        round(float(each), 5) for each in (returns.mean(), half_width, played.lengths.mean())
-    )
     return Baseline(
-        game.id, player, returns.size, mean, half_width, steps, round(time.monotonic() - started, 1)
+        id=game.id,
+        player=player,
+        episodes=returns.size,
+        mean=round(float(returns.mean()), 5),
+        half_width=round(float(student_half_width(returns)), 5),
+        steps=round(float(played.lengths.mean()), 5),
+        seconds=round(time.monotonic() - started, 1),
     )
 
 
@@ -95,35 +95,51 @@ def references(
     A game without an oracle lacks that player.
     """
     file = folder / f"references-{game}-{rules}.json"
-    how: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
+    settings: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
     try:
-        kept = read_json(file)
-        if kept["how"] == how:
-            return {row["player"]: Baseline(**row) for row in kept["players"]}
+        return _kept_references(file, settings)
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass  # there is none, or it is damaged or older: it is made anew
-    settings = {"rules": rules, **how["options"]}
-    there = players_of(game, **settings)
-    found = {
-        player: measure(game, player, episodes, block=EPISODES, **settings) for player in there
-    }
-    write_json(file, {"how": how, "players": [row._asdict() for row in found.values()]})
-    return found
+    of_game = {"rules": rules} | settings["options"]
+    baselines = dict[str, Baseline]()
+    for player in players_of(game, **of_game):
+        baselines[player] = measure(game, player, episodes, block=EPISODES, **of_game)
+    rows = [baseline._asdict() for baseline in baselines.values()]
+    write_json(file, {"how": settings, "players": rows})
+    return baselines
+
+
+def _kept_references(file: Path, settings: Mapping[str, Any]) -> dict[str, Baseline]:
+    """The baselines that a file holds; a ``ValueError`` if they were measured otherwise."""
+    kept = read_json(file)
+    if kept["how"] != settings:
+        raise ValueError("other settings")
+    baselines = [Baseline(**row) for row in kept["players"]]
+    return {baseline.player: baseline for baseline in baselines}
 
 
 def players_of(game: str, **settings: Any) -> list[str]:
     """Those of `PLAYERS` that a game has: a game of your own may lack an oracle."""
-    return [player for player in PLAYERS if player in ("random", *make(game, **settings).oracles)]
+    oracles = make(game, **settings).oracles
+    return [player for player in PLAYERS if player == "random" or player in oracles]
 
 
 def measure_all(ids: Sequence[str], episodes: int, seconds: float, out: Path) -> Iterator[Baseline]:
     """Every player in every game, one row after another; rows that ``out`` holds already are not
     measured again.
     """
-    keys = ((id, player) for id in ids for player in players_of(id))
-    return measured_rows(
-        out, Baseline, keys, lambda id, player: measure(id, player, episodes, seconds)
-    )
+
+    def measure_row(id: str, player: str) -> Baseline:
+        return measure(id, player, episodes, seconds)
+
+    return measured_rows(out, Baseline, _games_and_players(ids), measure_row)
+
+
+def _games_and_players(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Every player of every game."""
+    for id in ids:
+        for player in players_of(id):
+            yield id, player
 
 
 def _mean_cell(row: Baseline | None) -> str:
@@ -151,9 +167,15 @@ def markdown(rows: Iterable[Baseline]) -> str:
     )
     lines = []
     for id, by_player in games.items():
-        found = [by_player.get(player) for player in PLAYERS]
-        returns = [_mean_cell(row) for row in found]
-        steps = ", ".join(f"{r.steps:.0f}" if r else "" for r in found)
-        count = ", ".join(dict.fromkeys(f"{r.episodes}" for r in found if r))
-        lines.append([f"`{id}`", *returns, f"{make(id).return_range[1]:.4g}", steps, count])
+        returns = list[str]()
+        steps = list[str]()
+        episodes = dict[str, None]()
+        for player in PLAYERS:
+            baseline = by_player.get(player)
+            returns.append(_mean_cell(baseline))
+            steps.append("" if baseline is None else f"{baseline.steps:.0f}")
+            if baseline is not None:
+                episodes[f"{baseline.episodes}"] = None
+        highest = f"{make(id).return_range[1]:.4g}"
+        lines.append([f"`{id}`", *returns, highest, ", ".join(steps), ", ".join(episodes)])
     return markdown_table(columns, lines)

@@ -36,14 +36,16 @@ class Bars:
         self, stream: Any = None, unit: str = "", first_line_s: float = LINE_EVERY_S
     ) -> None:
         self.stream = sys.stderr if stream is None else stream
-        self.unit, self.terminal = unit, self.stream.isatty()
+        self.unit = unit
+        self.terminal = self.stream.isatty()
         rich = need("rich.progress")
         console = need("rich.console").Console(file=self.stream)
         columns = [
             rich.TextColumn("{task.description}", markup=False),
             rich.BarColumn(bar_width=24),
+            rich.TaskProgressColumn(),
+            rich.TextColumn("{task.fields[text]}", markup=False),
         ]
-        columns += [rich.TaskProgressColumn(), rich.TextColumn("{task.fields[text]}", markup=False)]
         self._bars = rich.Progress(
             *columns, console=console, refresh_per_second=4, speed_estimate_period=WINDOW_S
         )
@@ -72,15 +74,24 @@ class Bars:
             self._tasks[name] = self._bars.add_task(printable(name), total=None, text="")
         self._bars.update(self._tasks[name], completed=done, total=total or None)
         task = next(task for task in self._bars.tasks if task.id == self._tasks[name])
-        parts = [text]
+        words = []
         if self.unit and task.speed:
-            left = [f"{timedelta(seconds=task.time_remaining)} left"] if task.time_remaining else []
-            parts = [f"{task.speed:,.0f} {self.unit}/s", *left, text]
-        task.fields["text"] = said = printable(", ".join(filter(None, parts)))
-        of, share = (f" of {total:,}", f"({task.percentage:.0f} %)") if total else ("", "")
-        self._line = " ".join(filter(None, [f"{name}: {done:,}{of}", self.unit, share])) + (
-            f", {said}" if said else ""
-        )
+            words.append(f"{task.speed:,.0f} {self.unit}/s")
+            if task.time_remaining:
+                words.append(f"{timedelta(seconds=task.time_remaining)} left")
+        if text:
+            words.append(text)
+        said = printable(", ".join(words))
+        task.fields["text"] = said
+        self._line = f"{name}: {done:,}"
+        if total:
+            self._line += f" of {total:,}"
+        if self.unit:
+            self._line += f" {self.unit}"
+        if total:
+            self._line += f" ({task.percentage:.0f} %)"
+        if said:
+            self._line += f", {said}"
         if not self.terminal and time.monotonic() >= self._next_line_s:
             self.note(self._line)
             self._next_line_s = time.monotonic() + LINE_EVERY_S
@@ -98,7 +109,7 @@ class Bars:
             self._bars.remove_task(self._tasks.pop(name))
 
 
-_SHOWN = {
+_FORMATS = {
     "train_return_ewm": "return {:.3f}",
     "train_return_last": "of last episodes {:.3f}",
     "eval_return": "greedy {:.3f}",
@@ -118,6 +129,8 @@ def standing(row: Mapping[str, Any]) -> str:
         >>> standing({**row, "epsilon": 0.2})
         'return 0.500, loss 0.0123, epsilon 0.20, lr 5.0e-05'
     """
-    return ", ".join(
-        words.format(float(row[key])) for key, words in _SHOWN.items() if row.get(key) is not None
-    )
+    parts = []
+    for column, words in _FORMATS.items():
+        if row.get(column) is not None:
+            parts.append(words.format(float(row[column])))
+    return ", ".join(parts)

@@ -29,7 +29,7 @@ def printable(text: object) -> str:
     given = str(text)
     if given.isascii() and given.isprintable():
         return given
-    return "".join(_written_out(char) for char in given)
+    return "".join(map(_written_out, given))
 
 
 def _written_out(char: str) -> str:

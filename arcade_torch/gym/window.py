@@ -23,9 +23,7 @@ class Window:
         try:
             import pygame
         except ModuleNotFoundError as error:
-            raise ImportError(
-                "a window needs the package pygame: pip install '.[play]'"
-            ) from error
+            raise ImportError("a window needs the package pygame: pip install '.[play]'") from error
         self.pygame: Any = pygame
         self._scale = scale
         self._screen: Any = None

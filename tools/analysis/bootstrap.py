@@ -1,5 +1,6 @@
 """Stratified bootstrap of means over tasks, and how often its intervals really hold the truth."""
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,6 +19,11 @@ class Interval(NamedTuple):
     high: float
 
     @property
+    def exists(self) -> bool:
+        """Whether there is an interval: whether its ends are numbers."""
+        return not math.isnan(self.low)
+
+    @property
     def excludes_zero(self) -> bool:
         """Whether there is an interval and zero lies outside it."""
         return bool(self.low > 0 or self.high < 0)
@@ -30,7 +36,8 @@ def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> l
 
 def mean_over_tasks(cells: Sequence[Array]) -> Array:
     """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...]."""
-    return np.asarray(sum(cell.mean(axis=-1) for cell in cells) / len(cells))
+    means = [cell.mean(axis=-1) for cell in cells]
+    return np.asarray(sum(means) / len(means))
 
 
 def iqm(cells: Sequence[Array]) -> Array:
@@ -84,8 +91,9 @@ def pooled(
         drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
         return np.array(percentile_interval(known.mean(), drawn, confidence))
 
-    every = np.array(values, dtype=np.float64)
-    return Pooled(every, *np.apply_along_axis(cell, 0, every))
+    all_seeds = np.array(values, dtype=np.float64)
+    mean, low, high = np.apply_along_axis(cell, 0, all_seeds)
+    return Pooled(all_seeds, mean, low, high)
 
 
 @lru_cache(maxsize=64)

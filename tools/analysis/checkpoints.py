@@ -21,7 +21,7 @@ from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
 from arcade_torch.tools.runs import Run, described
 
-Found = TypeVar("Found")
+Measure = TypeVar("Measure")
 SETTINGS_FILES = ("config.json", "meta.json")
 """Files with the settings: of a run folder, and of a single checkpoint."""
 
@@ -48,11 +48,13 @@ class Label:
         return f"{self.agent} on {self.game} ({self.observability}), seed {self.seed}"
 
 
-def by_task(measured: Sequence[tuple[Label, Found]]) -> dict[tuple[str, str, str], list[Found]]:
+def by_task(
+    measured: Sequence[tuple[Label, Measure]],
+) -> dict[tuple[str, str, str], list[Measure]]:
     """(agent, game, observability) -> the measures of its seeds, by seed."""
-    tasks: dict[tuple[str, str, str], list[Found]] = {label.task: [] for label, _ in measured}
-    for label, found in sorted(measured, key=lambda pair: pair[0].seed):
-        tasks[label.task].append(found)
+    tasks: dict[tuple[str, str, str], list[Measure]] = {label.task: [] for label, _ in measured}
+    for label, measure in sorted(measured, key=lambda pair: pair[0].seed):
+        tasks[label.task].append(measure)
     return tasks
 
 
@@ -60,30 +62,34 @@ def checkpoints_of(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Run folders and checkpoints as they are, and the finished runs below other folders; notes on
     the rest.
     """
-    found = list[Path]()
+    checkpoints = list[Path]()
     notes = list[str]()
     for path in paths:
-        if list_checkpoints(path / "checkpoints") or any(
-            (path / name).exists() for name in SETTINGS_FILES
-        ):
-            found.append(path)
+        if list_checkpoints(path / "checkpoints") or _described_by(path):
+            checkpoints.append(path)
         else:
             runs = find_runs([path])
-            found += [run.path for run in runs.runs]
+            checkpoints += [run.path for run in runs.runs]
             notes += runs.notes
-    stated = [
-        Run(path, name) for path in found for name in SETTINGS_FILES if (path / name).exists()
-    ]
-    check_comparable(Runs(tuple(described(run) for run in stated)))
-    return found, notes
+    described_runs = list[Run]()
+    for path in checkpoints:
+        for name in _described_by(path):
+            described_runs.append(described(Run(path, name)))
+    check_comparable(Runs(tuple(described_runs)))
+    return checkpoints, notes
+
+
+def _described_by(path: Path) -> list[str]:
+    """Which of `SETTINGS_FILES` are there."""
+    return [name for name in SETTINGS_FILES if (path / name).exists()]
 
 
 def measure_run(
     path: Path,
-    measure: Callable[..., Found],
+    measure: Callable[..., Measure],
     options: Mapping[str, Any],
     progress: Progress | None = None,
-) -> tuple[Label, Found]:
+) -> tuple[Label, Measure]:
     """A measure of a checkpoint, kept under everything that it depends on: the very weights, the
     game, all options.
 
@@ -92,69 +98,84 @@ def measure_run(
     on.
     """
     agent = load(path)
-    how = signature(measure)
-    given = {**options, "progress": progress}
     config = agent.config
-    key = AgentKey.of(agent.config.to_dict())
     twin = options.get("observability") or config.observability
+    key = AgentKey.of(config.to_dict())
     label = Label(key, config.env, twin, config.seed, path, key.memory, config.observability)
-    known = {
-        name: given.get(name, one.default)
-        for name, one in how.parameters.items()
-        if name not in ("agent", "env")
-    }
-    weights = hashlib.sha256()
-    for name, value in sorted(agent.network.state_dict().items()):
-        weights.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    own = {
-        name: list(x) if isinstance(x, tuple) else x
-        for name, x in known.items()
-        if name != "progress"
-    }
-    own |= {"game": label.game, "rules": config.rules, "observability": twin, "format": 2}
-    own |= {
-        "frames": agent.frames,
-        "weights": weights.hexdigest()[:16],
-        "version": arcade_torch.__version__,
-    }
+    arguments = _arguments(measure, dict(options) | {"progress": progress})
 
     def compute() -> dict[str, Any]:
-        return {name: np.asarray(value) for name, value in vars(measure(agent, **known)).items()}
+        result = measure(agent, **arguments)
+        return {name: np.asarray(value) for name, value in vars(result).items()}
 
-    arrays = cached_arrays(path, measure.__name__, own, compute)
-    values = {
-        name: array.item() if array.ndim == 0 else array
-        for name, array in arrays.items()
-        if name != "options"
-    }
-    return label, how.return_annotation(**values)
+    settings = dict(arguments)
+    settings.pop("progress", None)
+    settings["game"] = config.env
+    settings["rules"] = config.rules
+    settings["observability"] = twin
+    settings["format"] = 2
+    settings["frames"] = agent.frames
+    settings["weights"] = _hash_of_weights(agent.network)
+    settings["version"] = arcade_torch.__version__
+    arrays = cached_arrays(path, measure.__name__, settings, compute)
+    values = dict[str, Any]()
+    for name, array in arrays.items():
+        if name != "options":
+            values[name] = array.item() if array.ndim == 0 else array
+    return label, signature(measure).return_annotation(**values)
+
+
+def _arguments(measure: Callable[..., Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a measure behind agent and env: from options, or their defaults."""
+    arguments = {}
+    for name, parameter in signature(measure).parameters.items():
+        if name not in ("agent", "env"):
+            arguments[name] = options.get(name, parameter.default)
+    return arguments
+
+
+def _hash_of_weights(network: Any) -> str:
+    """Sixteen hex digits that tell the weights of one network from those of another."""
+    weights = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        weights.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return weights.hexdigest()[:16]
 
 
 def measure_runs(
     paths: Sequence[Path],
-    measure: Callable[..., Found],
+    measure: Callable[..., Measure],
     options: Mapping[str, Any],
     progress: Callable[[str, int, int], None] | None = None,
-) -> list[tuple[Label, Found]]:
+) -> list[tuple[Label, Measure]]:
     """`measure_run` of every path, with names that tell the agents apart."""
-    each = [(path, partial(progress, path.name) if progress else None) for path in paths]
-    measured = [measure_run(path, measure, options, tell) for path, tell in each]
+    measured = list[tuple[Label, Measure]]()
+    for path in paths:
+        tell = partial(progress, path.name) if progress else None
+        measured.append(measure_run(path, measure, options, tell))
     names = agent_names(label.key for label, _ in measured)
-    seen = dict[Any, Path]()
     games = game_names(label.game for label, _ in measured)
-    named = [
-        (replace(label, agent=names[label.key], game=games[label.game]), found)
-        for label, found in measured
-    ]
-    twins = dict[Any, str]()
-    for label, _ in named:
-        if (learned := twins.setdefault(label.task, label.trained_on)) != label.trained_on:
+    named = list[tuple[Label, Measure]]()
+    for label, result in measured:
+        label = replace(label, agent=names[label.key], game=games[label.game])
+        named.append((label, result))
+    _check_seeds([label for label, _ in named])
+    return named
+
+
+def _check_seeds(labels: Sequence[Label]) -> None:
+    """Refuse a seed that is there twice, and seeds of one task that learned different twins."""
+    twins = dict[tuple[str, str, str], str]()
+    paths = dict[tuple[tuple[str, str, str], int], Path]()
+    for label in labels:
+        learned = twins.setdefault(label.task, label.trained_on)
+        if learned != label.trained_on:
             task = f"{label.agent} on {label.game}"
             raise ValueError(
                 f"seeds of {task} learned the twins {learned} and {label.trained_on}: give runs of "
                 "one"
             )
-        if (cell := (label.task, label.seed)) in seen:
-            raise ValueError(f"{seen[cell]} and {label.path} are both {label}: give one of them")
-        seen[cell] = label.path
-    return named
+        cell = (label.task, label.seed)
+        if cell in paths:
+            raise ValueError(f"{paths[cell]} and {label.path} are both {label}: give one of them")
+        paths[cell] = label.path

@@ -14,9 +14,10 @@ Source: POPGym Arcade (ICML 2026), recurrent state contamination. Its code adds 
 deviation 1 to pixels in 0..255, which is sigma = 1/255 here.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -107,9 +108,6 @@ def contamination(
         seed: of episodes, start points and noise.
         progress: called with (start points done, starts).
 
-    Returns:
-        Arrays.
-
     Raises:
         ValueError: an option is out of range, or no episode was long enough.
     """
@@ -117,89 +115,193 @@ def contamination(
     require(min(delays, default=-1) >= 0, "delays", list(delays), "whole numbers of at least 0")
     require(starts >= 1, "starts", starts, "at least 1")
     player, env = resolve_agent(agent, env, observability)
-    if (what := resolve(player, target)) == "value":
+    disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
+    steps = np.unique(np.array(delays, np.int64))
+    probe = Probe(player, _compared(player, target), disturbance, steps, starts, feedback, seed)
+    episodes = 4 * math.ceil(starts / disturbance.points_an_episode) + 16
+    probe.run(greedy_windows(player, env, episodes=episodes, seed=seed, cap=cap), progress)
+    return probe.result()
+
+
+def _compared(model: Any, target: Target) -> str:
+    """The output that is compared; a ``ValueError`` if it says nothing of actions."""
+    name = resolve(model, target)
+    if name == "value":
         raise ValueError(
             "contamination compares actions: target must be q, logits or probs, not value"
         )
-    strengths = np.array([np.nan] if shuffle else sigmas, np.float64)
-    steps = np.unique(np.array(delays, np.int64))
-    per_window, shortest = (1, LAST + 1) if shuffle else (POINTS_AN_EPISODE, 2)
-    policy = policy_of(player)
-    parts = list[tuple[Array, ...]]()
-    points = list[tuple[int, int]]()
-    skipped = 0
-    error = 0.0
-    rng = np.random.default_rng([seed, 1])
-    windows = greedy_windows(
-        player, env, episodes=4 * -(-starts // per_window) + 16, seed=seed, cap=cap
-    )
-    with policy.evaluating():
-        for number, w in enumerate(windows):
-            if w.n + 1 < shortest:
-                skipped += 1
-                continue
-            clean = policy.features(w.frames)
-            if shuffle:
-                order = shuffle_order(w.n + 1, FIRST, LAST, rng)
-                versions = clean[torch.as_tensor(order)][None]
-                places = np.array([LAST])
-                changed = FIRST
-            else:
-                places = np.sort(
-                    rng.choice(w.n, min(per_window, starts - len(points), w.n), replace=False)
-                )
-                noisy = policy.features(
-                    disturbed_frames(w.frames, places, strengths, clip, int(rng.integers(2**62)))
-                )
-                versions = clean.repeat(len(noisy), 1, 1)
-                changed = int(places.min())
-                versions[torch.arange(len(noisy)), places.repeat(len(strengths))] = noisy
-            # What the machinery itself does: a frame in the middle is replaced by itself, encoded
-            # alone.
-            again = clean.clone()
-            middle = w.n // 2
-            again[middle] = policy.features(w.frames[middle : middle + 1])[0]
-            raw = replayed(policy, w, torch.cat([clean[None], versions]), changed, feedback)
-            error = max(
-                error,
-                float((replayed(policy, w, again[None], changed, feedback) - raw[:1]).abs().max()),
+    return name
+
+
+class Versions(NamedTuple):
+    """Disturbed versions of a trajectory, as features."""
+
+    features: Tensor  # [V, T, E]
+    places: Ints  # int64 [points], the frames that delays are counted from
+    changed: int  # index of a frame before which all versions are the trajectory as it was
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Adds Gaussian noise of several strengths to single frames, a version each."""
+
+    sigmas: Array
+    clip: bool
+    points_an_episode: int = POINTS_AN_EPISODE
+    shortest: int = 2  # frames that a trajectory needs
+
+    def versions(
+        self, policy: Policy, window: Window, clean: Tensor, most: int, rng: np.random.Generator
+    ) -> Versions:
+        """Disturb up to ``most`` frames of a window, whose features are ``clean``."""
+        count = min(self.points_an_episode, most, window.n)
+        places = np.sort(rng.choice(window.n, count, replace=False))
+        seed = int(rng.integers(2**62))
+        frames = disturbed_frames(window.frames, places, self.sigmas, self.clip, seed)
+        noisy = policy.features(frames)
+        features = clean.repeat(len(noisy), 1, 1)
+        features[torch.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
+        return Versions(features, places, int(places.min()))
+
+
+@dataclass(frozen=True)
+class Shuffle:
+    """Permutes the frames behind `FIRST`, up to `LAST`."""
+
+    sigmas: Array = field(default_factory=lambda: np.array([np.nan]))
+    points_an_episode: int = 1
+    shortest: int = LAST + 1
+
+    def versions(
+        self, policy: Policy, window: Window, clean: Tensor, most: int, rng: np.random.Generator
+    ) -> Versions:
+        """Permute early frames of a window, whose features are ``clean``."""
+        order = shuffle_order(window.n + 1, FIRST, LAST, rng)
+        return Versions(clean[torch.as_tensor(order)][None], np.array([LAST]), FIRST)
+
+
+class Changes(NamedTuple):
+    """How decisions changed; the fields are those of `Contamination`."""
+
+    flip: Array
+    change: Array
+    kl: Array
+
+
+class Probe:
+    """Disturbs one trajectory after another, and gathers how the decisions change."""
+
+    def __init__(
+        self,
+        model: Any,
+        target: str,
+        disturbance: Noise | Shuffle,
+        delays: Ints,
+        starts: int,
+        feedback: bool,
+        seed: int,
+    ) -> None:
+        self.model = model
+        self.policy = policy_of(model)
+        self.target = target
+        self.disturbance = disturbance
+        self.delays = delays
+        self.starts = starts
+        self.feedback = feedback
+        self.rng = np.random.default_rng([seed, 1])
+        self.changes = list[Changes]()
+        self.points = list[tuple[int, int]]()
+        self.clean_error = 0.0
+        self.skipped = 0
+
+    def run(self, windows: Iterable[Window], progress: Progress | None) -> None:
+        """Disturb trajectories until there are enough start points."""
+        with self.policy.evaluating():
+            for number, window in enumerate(windows):
+                if window.n + 1 < self.disturbance.shortest:
+                    self.skipped += 1
+                    continue
+                self._disturb(number, window)
+                if progress is not None:
+                    progress(len(self.points), self.starts)
+                if len(self.points) >= self.starts:
+                    break
+
+    def _disturb(self, number: int, window: Window) -> None:
+        """Disturb a trajectory, replay its versions, and compare their decisions."""
+        clean = self.policy.features(window.frames)
+        most = self.starts - len(self.points)
+        versions = self.disturbance.versions(self.policy, window, clean, most, self.rng)
+        features = torch.cat([clean[None], versions.features])
+        raw = replayed(self.policy, window, features, versions.changed, self.feedback)
+        error = self._error(window, clean, raw[:1], versions.changed)
+        self.clean_error = max(self.clean_error, error)
+        decisions = versions.places[:, None, None] + self.delays
+        self.changes.append(_compare(self.model, self.target, raw, decisions))
+        self.points += [(number, int(place)) for place in versions.places]
+
+    def _error(self, window: Window, clean: Tensor, raw: Tensor, changed: int) -> float:
+        """What the machinery itself does to the outputs ``raw``: a frame in the middle is replaced
+        by itself, encoded alone.
+        """
+        features = clean.clone()
+        middle = window.n // 2
+        features[middle] = self.policy.features(window.frames[middle : middle + 1])[0]
+        again = replayed(self.policy, window, features[None], changed, self.feedback)
+        return float((again - raw).abs().max())
+
+    def result(self) -> Contamination:
+        """All changes; a ``ValueError`` if there is none."""
+        if not any(np.isfinite(changes.flip).any() for changes in self.changes):
+            wanted = (
+                f"{self.disturbance.shortest} frames are needed, and {self.delays[0]} steps after "
+                "the disturbed one"
             )
-            parts.append(_compare(player, what, raw, places[:, None, None] + steps))
-            points += [(number, int(place)) for place in places]
-            if progress is not None:
-                progress(len(points), starts)
-            if len(points) >= starts:
-                break
-    if not any(np.isfinite(flip).any() for flip, *_ in parts):
-        wanted = f"{shortest} frames are needed, and {steps[0]} steps after the disturbed one"
-        raise ValueError(f"none of {skipped + len(parts)} episodes was long enough: {wanted}")
-    flip, change, kl = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Contamination(
-        strengths, steps, flip, change, kl, np.array(points, dtype=np.int64), error, skipped, what
-    )
+            episodes = self.skipped + len(self.changes)
+            raise ValueError(f"none of {episodes} episodes was long enough: {wanted}")
+        return Contamination(
+            sigmas=self.disturbance.sigmas,
+            delays=self.delays,
+            flip=np.concatenate([changes.flip for changes in self.changes]),
+            change=np.concatenate([changes.change for changes in self.changes]),
+            kl=np.concatenate([changes.kl for changes in self.changes]),
+            points=np.array(self.points, dtype=np.int64),
+            clean_error=self.clean_error,
+            skipped=self.skipped,
+            target=self.target,
+        )
 
 
-def _compare(model: Any, what: str, raw: Tensor, decisions: Ints) -> tuple[Array, ...]:
-    """Flip, relative change and KL of rows 1... against row 0 at steps [points, 1, K], each
-    [points, S, K].
-    """
+def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
+    """Compare rows 1... with row 0 at steps [points, 1, K]; the changes are [points, S, K]."""
     rows = torch.arange(1, len(raw)).reshape(len(decisions), -1, 1)
-    known = torch.as_tensor(decisions < raw.shape[1])
+    reached = torch.as_tensor(decisions < raw.shape[1])
     steps = torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
-    pairs = (raw[0, steps], raw[rows, steps])
-    scalars = outputs(model, what)
-    a, b = (
-        values - values.mean(-1, keepdim=True)
-        for values in (scalars(out).double().cpu() for out in pairs)
-    )
+    clean = raw[0, steps]
+    disturbed = raw[rows, steps]
+    scalars = outputs(model, target)
+    a = _centred(scalars(clean))
+    b = _centred(scalars(disturbed))
     spread = a.amax(-1) - a.amin(-1)
     change = torch.where(spread > 0, (b - a).abs().amax(-1) / spread, torch.nan)
     flip = (a.argmax(-1) != b.argmax(-1)).double()
     kl = torch.full_like(flip, torch.nan)
-    if what in ("logits", "probs"):
-        p, q = (outputs(model, "logits")(out).double().cpu().log_softmax(-1) for out in pairs)
+    if target in ("logits", "probs"):
+        logits = outputs(model, "logits")
+        p = logits(clean).double().cpu().log_softmax(-1)
+        q = logits(disturbed).double().cpu().log_softmax(-1)
         kl = (p.exp() * (p - q)).sum(-1)
-    return tuple(torch.where(known, each, torch.nan).numpy() for each in (flip, change, kl))
+
+    def where_reached(values: Tensor) -> Array:
+        return np.asarray(torch.where(reached, values, torch.nan).numpy())
+
+    return Changes(where_reached(flip), where_reached(change), where_reached(kl))
+
+
+def _centred(values: Tensor) -> Tensor:
+    """Outputs of actions minus their mean, in double precision on the CPU."""
+    values = values.double().cpu()
+    return values - values.mean(-1, keepdim=True)
 
 
 @dataclass(frozen=True)

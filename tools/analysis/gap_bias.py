@@ -11,8 +11,9 @@ seeds.
 
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -99,17 +100,20 @@ class GapBias:
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
-        found = {row.agent: row for row in self.rows}
-        require(agent in found, "an agent", agent, f"one of {', '.join(found)}")
-        return found[agent]
+        rows = {row.agent: row for row in self.rows}
+        require(agent in rows, "an agent", agent, f"one of {', '.join(rows)}")
+        return rows[agent]
 
     @property
     def coverage(self) -> dict[int, float]:
         """Fewest seeds -> measured coverage of the intervals of Gap, the smallest of the agents
         with so few.
         """
-        known = [(row.seeds, -row.coverage) for row in self.rows if row.coverage == row.coverage]
-        return {seeds: -share for seeds, share in sorted(known)}
+        smallest = dict[int, float]()
+        for row in self.rows:
+            if not np.isnan(row.coverage):
+                smallest[row.seeds] = min(row.coverage, smallest.get(row.seeds, 1.0))
+        return dict(sorted(smallest.items()))
 
     def difference(self, name: str, first: str, second: str) -> Interval:
         """A number of the table, such as ``gap``, of one agent minus another's, its interval from
@@ -121,20 +125,22 @@ class GapBias:
 
     def table(self) -> list[dict[str, Any]]:
         """Plain rows, for a CSV file; games left out stand in column ``without``."""
-        found = []
-        for without, rows in {"": self.rows, **self.without}.items():
-            for row in rows:
-                values: dict[str, Any] = {
-                    "agent": row.agent,
-                    "without": without,
-                    "seeds": row.seeds,
-                }
-                for name in NUMBERS:
-                    values |= zip(
-                        (name, f"{name}_low", f"{name}_high"), getattr(row, name), strict=True
-                    )
-                found.append(values | {"coverage": row.coverage})
-        return found
+        rows = [_plain_row(row) for row in self.rows]
+        for game, rows_without in self.without.items():
+            rows += [_plain_row(row, game) for row in rows_without]
+        return rows
+
+
+def _plain_row(row: AgentRow, without: str = "") -> dict[str, Any]:
+    """A row for a CSV file: an interval takes three columns."""
+    values: dict[str, Any] = {"agent": row.agent, "without": without, "seeds": row.seeds}
+    for name in NUMBERS:
+        interval = getattr(row, name)
+        values[name] = interval.value
+        values[f"{name}_low"] = interval.low
+        values[f"{name}_high"] = interval.high
+    values["coverage"] = row.coverage
+    return values
 
 
 def gap_and_bias(
@@ -170,44 +176,26 @@ def gap_and_bias(
     """
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
     require(draws >= 1, "draws", draws, "at least 1")
-    cells = _cells(
-        [score for score in read_scores(runs, metric) if score.observability not in BOTH_TWINS]
-    )
-    agents = list(dict.fromkeys(agent for agent, _, _ in cells))
-    if not (found := find_baselines(agents, baseline)):
-        raise ValueError(
-            f"no scores for the memory-free agent {baseline!r}, only for "
-            f"{', '.join(agents) or 'nobody'}"
-        )
-    baselines = {agent: found.get(agent) for agent in [*found.values(), *agents]}
-    every = list(dict.fromkeys(game for _, game, _ in cells))
-    tasks = [
-        game
-        for game in every
-        if all((agent, game, twin) in cells for agent in agents for twin in TWINS)
-    ]
+    cells = _cells(read_scores(runs, metric))
+    baselines = _baselines(cells, baseline)
+    games = list(dict.fromkeys(game for _, game, _ in cells))
+    tasks = [game for game in games if _is_complete(game, cells, baselines)]
     if not tasks:
         raise ValueError(
             "no task has finished runs of every agent on both twins: nothing to compare yet"
         )
     rows, values = _rows(cells, baselines, tasks, draws, confidence, seed, iqm=True)
-    games = list(dict.fromkeys(game_of(task) for task in tasks))
-    without = {}
-    for game in games if len(games) > 1 else []:
-        rest = [task for task in tasks if game_of(task) != game]
-        without[game], _ = _rows(cells, baselines, rest, draws, confidence, seed, iqm=False)
-    dropped = tuple(game for game in every if game not in tasks)
     return GapBias(
-        rows,
-        tuple(tasks),
-        dropped,
-        metric,
-        rows[0].agent,
-        baselines,
-        confidence,
-        draws,
-        without,
-        values,
+        rows=rows,
+        tasks=tuple(tasks),
+        dropped=tuple(game for game in games if game not in tasks),
+        metric=metric,
+        baseline=rows[0].agent,
+        baselines=baselines,
+        confidence=confidence,
+        draws=draws,
+        without=_rows_without(cells, baselines, tasks, draws, confidence, seed),
+        _values=values,
     )
 
 
@@ -216,8 +204,11 @@ Baselines = Mapping[str, str | None]
 
 
 def _cells(scores: Sequence[Score]) -> Cells:
-    found: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
+    """The scores by (agent, game, twin), ordered by seed; those of no single twin are left out."""
+    by_cell: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for score in scores:
+        if score.observability in BOTH_TWINS:
+            continue
         require(
             score.observability in TWINS, "observability", score.observability, "full or partial"
         )
@@ -225,10 +216,47 @@ def _cells(scores: Sequence[Score]) -> Cells:
             raise ValueError(
                 f"the score of {score.agent} on {score.game}, seed {score.seed}, is {score.value}"
             )
-        found.setdefault((score.agent, score.game, score.observability), []).append(
-            (score.seed, score.value)
+        cell = (score.agent, score.game, score.observability)
+        by_cell.setdefault(cell, []).append((score.seed, score.value))
+    cells = Cells()
+    for cell, pairs in by_cell.items():
+        cells[cell] = np.array([value for _, value in sorted(pairs)])
+    return cells
+
+
+def _baselines(cells: Cells, baseline: str) -> dict[str, str | None]:
+    """The memory-free agent of every agent, or None; memory-free agents come first."""
+    agents = list(dict.fromkeys(agent for agent, _, _ in cells))
+    memory_free = find_baselines(agents, baseline)
+    if not memory_free:
+        raise ValueError(
+            f"no scores for the memory-free agent {baseline!r}, only for "
+            f"{', '.join(agents) or 'nobody'}"
         )
-    return {key: np.array([value for _, value in sorted(pairs)]) for key, pairs in found.items()}
+    return {agent: memory_free.get(agent) for agent in [*memory_free.values(), *agents]}
+
+
+def _is_complete(game: str, cells: Cells, agents: Iterable[str]) -> bool:
+    """Whether all agents have scores on both twins of a game."""
+    return all((agent, game, twin) in cells for agent, twin in product(agents, TWINS))
+
+
+def _rows_without(
+    cells: Cells,
+    baselines: Baselines,
+    tasks: Sequence[str],
+    draws: int,
+    confidence: float,
+    seed: int,
+) -> dict[str, tuple[AgentRow, ...]]:
+    """The rows that leave out one game, all its difficulties; none if there is only one game."""
+    games = list(dict.fromkeys(game_of(task) for task in tasks))
+    without = {}
+    if len(games) > 1:
+        for game in games:
+            rest = [task for task in tasks if game_of(task) != game]
+            without[game], _ = _rows(cells, baselines, rest, draws, confidence, seed, iqm=False)
+    return without
 
 
 def _place(task: str) -> tuple[str, int, str]:
@@ -264,34 +292,62 @@ def _rows(
     values = dict[str, dict[str, Array]]()
     # the same sums, to the bit, in whatever order the runs were met
     tasks = sorted(tasks, key=_place)
-    for agent, free in baselines.items():
-        mine = values.setdefault(agent, {})
-        counts = list[tuple[int, ...]]()
-        for twin, name in zip(TWINS, ("mdp", "pomdp"), strict=True):
-            seeds = [cells[agent, task, twin] for task in tasks]
-            drawn = [
-                bootstrap.resampled(
-                    [cells[agent, task, twin]], draws, _generator(seed, agent, task, twin)
-                )[0]
-                for task in tasks
-            ]
-            raw = [np.vstack([first, again]) for first, again in zip(seeds, drawn, strict=True)]
-            scaled = [normalise(task, each) for task, each in zip(tasks, raw, strict=True)]
-            mine[f"{name}_raw"] = bootstrap.mean_over_tasks(raw)
-            mine[name] = bootstrap.mean_over_tasks(scaled)
-            mine[f"{name}_iqm"] = bootstrap.iqm(scaled if iqm else [each[:1] for each in scaled])
-            counts.append(tuple(map(len, seeds)))
-        mine["gap"], mine["bias"] = (
-            mine["mdp"] - mine["pomdp"],
-            mine["mdp"] - (values[free]["mdp"] if free else np.nan),
-        )
-        fewest = min(map(min, counts))
-        free_seeds = min(len(cells[free or agent, task, "full"]) for task in tasks)
-        known = dict.fromkeys(mine, fewest > 1) | {"bias": min(fewest, free_seeds) > 1}
-        ends = {
-            name: percentile_interval(x[0], x[1:], confidence, known[name])
-            for name, x in mine.items()
-        }
-        coverage = bootstrap.measured_coverage(*counts, confidence) if fewest > 1 else float("nan")
+    for agent, memory_free in baselines.items():
+        mdp, mdp_seeds = _returns(cells, agent, tasks, "full", draws, seed, iqm)
+        pomdp, pomdp_seeds = _returns(cells, agent, tasks, "partial", draws, seed, iqm)
+        numbers = values.setdefault(agent, {})
+        for name in mdp:
+            numbers[f"mdp{name}"] = mdp[name]
+            numbers[f"pomdp{name}"] = pomdp[name]
+        numbers["gap"] = numbers["mdp"] - numbers["pomdp"]
+        if memory_free is None:
+            numbers["bias"] = np.full_like(numbers["mdp"], np.nan)
+        else:
+            numbers["bias"] = numbers["mdp"] - values[memory_free]["mdp"]
+        fewest = min(*mdp_seeds, *pomdp_seeds)
+        fewest_of_bias = min(fewest, *_seeds(cells, memory_free or agent, tasks, "full"))
+        ends = dict[str, Interval]()
+        for name, draws_of_number in numbers.items():
+            known = (fewest_of_bias if name == "bias" else fewest) > 1
+            ends[name] = percentile_interval(
+                draws_of_number[0], draws_of_number[1:], confidence, known
+            )
+        coverage = float("nan")
+        if fewest > 1:
+            coverage = bootstrap.measured_coverage(mdp_seeds, pomdp_seeds, confidence)
         rows.append(AgentRow(agent, fewest, coverage=coverage, **ends))
     return tuple(rows), values
+
+
+def _returns(
+    cells: Cells,
+    agent: str,
+    tasks: Sequence[str],
+    twin: str,
+    draws: int,
+    seed: int,
+    iqm: bool,
+) -> tuple[dict[str, Array], tuple[int, ...]]:
+    """Returns of an agent on one twin, each [1 + draws]: ``_raw``, normalised (an empty name), and
+    ``_iqm``, without draws unless ``iqm``; and its number of seeds of every task.
+    """
+    raw = list[Array]()
+    scaled = list[Array]()
+    for task in tasks:
+        seeds = cells[agent, task, twin]
+        (drawn,) = bootstrap.resampled([seeds], draws, _generator(seed, agent, task, twin))
+        returns = np.vstack([seeds, drawn])
+        raw.append(returns)
+        scaled.append(normalise(task, returns))
+    of_iqm = scaled if iqm else [returns[:1] for returns in scaled]
+    means = {
+        "_raw": bootstrap.mean_over_tasks(raw),
+        "": bootstrap.mean_over_tasks(scaled),
+        "_iqm": bootstrap.iqm(of_iqm),
+    }
+    return means, _seeds(cells, agent, tasks, twin)
+
+
+def _seeds(cells: Cells, agent: str, tasks: Sequence[str], twin: str) -> tuple[int, ...]:
+    """The number of seeds of an agent on one twin of every task."""
+    return tuple(len(cells[agent, task, twin]) for task in tasks)

@@ -2,17 +2,16 @@
 deviations allow.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from arcade_torch.tools.analysis.bootstrap import Interval
 from arcade_torch.tools.analysis.gap_bias import (
     SIGNED_GAMES,
-    TWINS,
     AgentRow,
     GapBias,
     game_of,
@@ -45,12 +44,23 @@ class PaperTable:
 
     def printed(self) -> Table:
         """The table, three decimals; errors four."""
-        rows = []
+        rows = list[tuple[str, ...]]()
         for row, rest in zip(self.table.rows, self.table.without["Tetris"], strict=True):
-            shown = row.mdp, row.pomdp, row.gap, row.bias, rest.pomdp, rest.gap, rest.bias
-            errors = zip(self.mdp[row.agent], self.pomdp[row.agent], strict=True)
-            numbers = (f"{x.value:{sign}.3f}" for x, sign in zip(shown, "--++-++", strict=True))
-            rows.append((row.agent, *numbers, *(f"{mdp:.4f}/{pomdp:.4f}" for mdp, pomdp in errors)))
+            mdp = self.mdp[row.agent]
+            pomdp = self.pomdp[row.agent]
+            cells = (
+                row.agent,
+                f"{row.mdp.value:.3f}",
+                f"{row.pomdp.value:.3f}",
+                f"{row.gap.value:+.3f}",
+                f"{row.bias.value:+.3f}",
+                f"{rest.pomdp.value:.3f}",
+                f"{rest.gap.value:+.3f}",
+                f"{rest.bias.value:+.3f}",
+                f"{mdp.sem:.4f}/{pomdp.sem:.4f}",
+                f"{mdp.half_width:.4f}/{pomdp.half_width:.4f}",
+            )
+            rows.append(cells)
         head = (
             "agent",
             "MDP",
@@ -79,34 +89,53 @@ def paper_table() -> PaperTable:
     table = gap_and_bias(PAPER_RETURNS, draws=1)
     published = read_csv(PAPER_RETURNS)
 
-    def spread(agent: str, twin: str, without: str = "") -> Spread:
-        column = {"full": "mdp_std", "partial": "pomdp_std"}[twin]
-        here = [
-            (game_of(row["env"]), float(row[column])) for row in published if row["model"] == agent
-        ]
-        stds = np.array(
-            [std * (0.5 if game in SIGNED_GAMES else 1.0) for game, std in here if game != without]
-        )
-        half = 1.96 * np.sqrt((stds**2 / SEEDS).sum()) / stds.size
-        return Spread(float(stds.mean() / np.sqrt(SEEDS * stds.size)), float(half))
-
-    def widened(row: AgentRow, without: str = "") -> AgentRow:
-        mdp, pomdp = (spread(row.agent, twin, without).half_width for twin in TWINS)
-        bias = (
-            0.0
-            if row.agent == table.baseline
-            else np.hypot(mdp, spread(table.baseline, "full", without).half_width)
-        )
-        halves = {"mdp": mdp, "pomdp": pomdp, "gap": np.hypot(mdp, pomdp), "bias": bias}
-        values = {name: (getattr(row, name).value, float(half)) for name, half in halves.items()}
-        intervals: Any = {
-            name: Interval(x, x - half, x + half) for name, (x, half) in values.items()
-        }
-        return replace(row, seeds=SEEDS, **intervals)
-
-    rows = tuple(map(widened, table.rows))
-    without = {
-        game: tuple(widened(row, game) for row in part) for game, part in table.without.items()
-    }
-    mdp, pomdp = ({row.agent: spread(row.agent, twin) for row in rows} for twin in TWINS)
+    spreads = Spreads(published, table.baseline)
+    rows = tuple(spreads.widened(row) for row in table.rows)
+    without = {}
+    for game, rows_without in table.without.items():
+        without[game] = tuple(spreads.widened(row, game) for row in rows_without)
+    mdp = {row.agent: spreads.of(row.agent, "full") for row in rows}
+    pomdp = {row.agent: spreads.of(row.agent, "partial") for row in rows}
     return PaperTable(replace(table, rows=rows, without=without), mdp, pomdp)
+
+
+@dataclass(frozen=True)
+class Spreads:
+    """Errors that the published standard deviations give."""
+
+    published: Sequence[Mapping[str, str]]  # rows of `PAPER_RETURNS`
+    baseline: str
+
+    def of(self, agent: str, twin: str, without: str = "") -> Spread:
+        """Errors of an agent's mean over tasks, one game left out."""
+        column = {"full": "mdp_std", "partial": "pomdp_std"}[twin]
+        normalised = list[float]()
+        for row in self.published:
+            game = game_of(row["env"])
+            if row["model"] == agent and game != without:
+                scale = 0.5 if game in SIGNED_GAMES else 1.0
+                normalised.append(float(row[column]) * scale)
+        stds = np.array(normalised)
+        half_width = 1.96 * np.sqrt((stds**2 / SEEDS).sum()) / stds.size
+        return Spread(float(stds.mean() / np.sqrt(SEEDS * stds.size)), float(half_width))
+
+    def widened(self, row: AgentRow, without: str = "") -> AgentRow:
+        """A row of the table with its intervals."""
+        mdp = self.of(row.agent, "full", without).half_width
+        pomdp = self.of(row.agent, "partial", without).half_width
+        bias = 0.0
+        if row.agent != self.baseline:
+            bias = float(np.hypot(mdp, self.of(self.baseline, "full", without).half_width))
+        return replace(
+            row,
+            seeds=SEEDS,
+            mdp=_around(row.mdp.value, mdp),
+            pomdp=_around(row.pomdp.value, pomdp),
+            gap=_around(row.gap.value, float(np.hypot(mdp, pomdp))),
+            bias=_around(row.bias.value, bias),
+        )
+
+
+def _around(value: float, half_width: float) -> Interval:
+    """An interval with a value in its middle."""
+    return Interval(value, value - half_width, value + half_width)

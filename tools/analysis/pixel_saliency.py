@@ -29,7 +29,7 @@ Norm = Literal["l2sq", "l2", "l1"]
 
 @dataclass(frozen=True)
 class Saliency:
-    """What `saliency` found."""
+    """The gradients that `saliency` gives."""
 
     # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame
     maps: NDArray[np.float32]
@@ -79,49 +79,61 @@ def saliency(
         chunk: frames pushed through the encoder at once; bounds memory.
         dtype: of frames and gradients, float32 or float64 (the model's parameters must match).
 
-    Returns:
-        Maps and sums as numpy arrays.
-
     Raises:
         ValueError: a shape does not fit, n is out of range, or an option has an unknown value.
         TypeError: ``model`` has none of the forms above.
     """
-    if (reduce, resolve(model, target)) == ("sum", "probs"):
-        raise ValueError(
-            "the sum of all probabilities is always 1: take reduce per_action, or target logits"
-        )
-    for name, value, kind in (("reduce", reduce, Reduce), ("norm", norm, Norm)):
-        require(value in get_args(kind), name, value, f"one of {', '.join(get_args(kind))}")
-    require(chunk >= 1, "chunk", chunk, "at least 1")
-    require(frames.ndim == 4, "the shape of frames", list(frames.shape), "[T, H, W, C]")
-    total = frames.shape[0]
-    require(-total <= n < total, "n", n, f"inside a window of {total} frames")
-    zeros = torch.zeros(total, dtype=torch.int64, device=frames.device)
-    actions, starts = (
-        zeros if given is None else given.reshape(-1) for given in (last_action, is_init)
-    )
-    for name, given in (("last_action", actions), ("is_init", starts)):
-        require(
-            len(given) == total, f"the length of {name}", len(given), f"that of frames, {total}"
-        )
-    steps = n % total + 1
+    _check_options(reduce, norm, chunk, resolve(model, target))
+    steps = _index(n, frames) + 1
+    actions = _one_a_frame("last_action", last_action, frames)
+    starts = _one_a_frame("is_init", is_init, frames).bool()
     policy = policy_of(model)
     scalars = outputs(model, target)
     with policy.evaluating(), torch.enable_grad():
-        leaf = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
+        features = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
         before = policy.initial_state(1) if state is None else state
         out, _ = policy.remember(
-            leaf[None], actions[None, :steps], starts[None, :steps].bool(), before
+            features[None], actions[None, :steps], starts[None, :steps], before
         )
         values = scalars(out[:, -1])[0]
-        jacobian = _jacobian(values, leaf, reduce)
+        jacobian = _jacobian(values, features, reduce)
         maps, sums = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
-    arrays = (
-        maps.float().cpu().numpy(),
-        sums.double().cpu().numpy(),
-        values.detach().float().cpu().numpy(),
+    return Saliency(
+        maps=maps.float().cpu().numpy(),
+        per_frame=sums.double().cpu().numpy(),
+        output=values.detach().float().cpu().numpy(),
+        n=steps - 1,
+        target=resolve(model, target),
     )
-    return Saliency(*arrays, steps - 1, resolve(model, target))
+
+
+def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
+    """Refuse options of `saliency` that are unknown, out of range, or do not go together."""
+    if (reduce, target) == ("sum", "probs"):
+        raise ValueError(
+            "the sum of all probabilities is always 1: take reduce per_action, or target logits"
+        )
+    require(reduce in get_args(Reduce), "reduce", reduce, f"one of {', '.join(get_args(Reduce))}")
+    require(norm in get_args(Norm), "norm", norm, f"one of {', '.join(get_args(Norm))}")
+    require(chunk >= 1, "chunk", chunk, "at least 1")
+
+
+def _index(n: int, frames: Tensor) -> int:
+    """The index of a frame, counted from the first; negative ``n`` count from the end."""
+    require(frames.ndim == 4, "the shape of frames", list(frames.shape), "[T, H, W, C]")
+    total = frames.shape[0]
+    require(-total <= n < total, "n", n, f"inside a window of {total} frames")
+    return n % total
+
+
+def _one_a_frame(name: str, values: Tensor | None, frames: Tensor) -> Tensor:
+    """One value a frame, [T]; zeros by default."""
+    total = frames.shape[0]
+    if values is None:
+        return torch.zeros(total, dtype=torch.int64, device=frames.device)
+    values = values.reshape(-1)
+    require(len(values) == total, f"the length of {name}", len(values), f"that of frames, {total}")
+    return values
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
@@ -129,11 +141,13 @@ def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
     rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
     if not values.requires_grad:
         return leaf.new_zeros(len(rows), *leaf.shape)
-    each = [
-        torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True)
-        for row in rows
-    ]
-    return torch.stack([gradient for (gradient,) in each])
+    gradients = []
+    for row in rows:
+        (gradient,) = torch.autograd.grad(
+            values, leaf, row, retain_graph=True, materialize_grads=True
+        )
+        gradients.append(gradient)
+    return torch.stack(gradients)
 
 
 def _frame_norms(
@@ -142,9 +156,8 @@ def _frame_norms(
     """Norms of the gradients by the frames, summed over the outputs: of pixels [T, H, W], and of
     whole frames [T].
     """
-    per_pixel, per_frame = (
-        jacobian.new_zeros(shape, dtype=dtype) for shape in (frames.shape[:3], len(frames))
-    )
+    per_pixel = jacobian.new_zeros(frames.shape[:3], dtype=dtype)
+    per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
     reached = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
     for index in reached.split(chunk):
         part = frames[index].to(dtype).requires_grad_()
@@ -189,17 +202,26 @@ def episode_saliency(
     ``progress`` is called once, with (1, 1).
     """
     windows: list[Window] = []
-    for at in range(seed, seed + tries):
-        windows.append(
-            greedy_window(agent, seed=at, observability=observability, max_steps=max_steps)
+    for episode_seed in range(seed, seed + tries):
+        window = greedy_window(
+            agent, seed=episode_seed, observability=observability, max_steps=max_steps
         )
-        if windows[-1].n + 1 >= show:
+        windows.append(window)
+        if window.n + 1 >= show:
             break
-    w = max(windows, key=lambda window: window.n)
-    seen = w.frames, w.last_action, w.is_init, w.state
-    found = saliency(agent, *seen, reduce=reduce, norm=norm, target=target)
+    longest = max(windows, key=lambda window: window.n)
+    result = saliency(
+        agent,
+        longest.frames,
+        longest.last_action,
+        longest.is_init,
+        longest.state,
+        reduce=reduce,
+        norm=norm,
+        target=target,
+    )
     if progress is not None:
         progress(1, 1)
     return EpisodeSaliency(
-        **vars(found), frames=w.frames.cpu().numpy(), action=w.action.cpu().numpy()
+        **vars(result), frames=longest.frames.cpu().numpy(), action=longest.action.cpu().numpy()
     )

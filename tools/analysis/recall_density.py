@@ -47,9 +47,9 @@ class RecallDensity:
     @property
     def shares(self) -> tuple[Array, ...]:
         """One float64 [n_i + 1] a trajectory."""
-        return (
-            tuple(np.split(self.deltas, np.cumsum(self.lengths)[:-1])) if self.lengths.size else ()
-        )
+        if not self.lengths.size:
+            return ()
+        return tuple(np.split(self.deltas, np.cumsum(self.lengths)[:-1]))
 
     def mass(self, bins: int) -> Array:
         """Mean mass in equal parts of the trajectories, float64 [bins]; sums to 1."""
@@ -113,9 +113,9 @@ def recall_density(
     """
     player, env = resolve_agent(agent, env, observability)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
-    done = (lambda count: progress(count, episodes)) if progress is not None else None
+    tell = None if progress is None else lambda count: progress(count, episodes)
     return density_of_windows(
-        player, windows, norm=norm, reduce=reduce, target=target, progress=done
+        player, windows, norm=norm, reduce=reduce, target=target, progress=tell
     )
 
 
@@ -134,26 +134,37 @@ def density_of_windows(
     called with the number of windows done. Everything else is as for `recall_density`.
     """
     shares = [np.zeros(0)]
-    ended = []
+    ended = list[bool]()
     dropped = 0
     silent = 0
-    for count, w in enumerate(windows, start=1):
-        if w.n + 1 < MIN_STEPS:
+    for count, window in enumerate(windows, start=1):
+        if window.n + 1 < MIN_STEPS:
             dropped += 1
         else:
-            seen = w.frames, w.last_action, w.is_init, w.state
-            found = saliency(model, *seen, reduce=reduce, norm=norm, target=target)
-            if found.per_frame.sum() > 0:
-                shares.append(found.shares())
-                ended.append(w.ended)
+            gradients = saliency(
+                model,
+                window.frames,
+                window.last_action,
+                window.is_init,
+                window.state,
+                reduce=reduce,
+                norm=norm,
+                target=target,
+            )
+            if gradients.per_frame.sum() > 0:
+                shares.append(gradients.shares())
+                ended.append(window.ended)
             else:
                 silent += 1
         if progress is not None:
             progress(count)
-    lengths = np.array([share.size for share in shares[1:]], dtype=np.int64)
-    what = resolve(model, target)
     return RecallDensity(
-        np.concatenate(shares), lengths, np.array(ended, dtype=np.bool_), dropped, silent, what
+        deltas=np.concatenate(shares),
+        lengths=np.array([share.size for share in shares[1:]], dtype=np.int64),
+        ended=np.array(ended, dtype=np.bool_),
+        dropped=dropped,
+        silent=silent,
+        target=resolve(model, target),
     )
 
 
@@ -174,9 +185,8 @@ def binned(shares: Array, bins: int) -> Array:
     if bins < 1 or shares.size < 1:
         raise ValueError(f"need at least one bin and one step, got {bins} and {shares.size}")
     steps = np.arange(shares.size + 1) / shares.size
-    return np.diff(
-        np.interp(np.arange(bins + 1) / bins, steps, np.concatenate([[0.0], np.cumsum(shares)]))
-    )
+    mass_before = np.concatenate([[0.0], np.cumsum(shares)])
+    return np.diff(np.interp(np.arange(bins + 1) / bins, steps, mass_before))
 
 
 def point_sampled(shares: Array, taus: Array) -> Array:
@@ -193,6 +203,9 @@ def no_memory(lengths: Sequence[int], bins: int) -> Array:
     A trajectory with fewer steps than bins spreads its last frame over several of them, as it does
     its other frames.
     """
-    return np.asarray(
-        np.mean([binned(np.eye(1, length, length - 1)[0], bins) for length in lengths], axis=0)
-    )
+    masses = []
+    for length in lengths:
+        last_frame_only = np.zeros(length)
+        last_frame_only[-1] = 1.0
+        masses.append(binned(last_frame_only, bins))
+    return np.asarray(np.mean(masses, axis=0))

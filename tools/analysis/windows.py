@@ -54,11 +54,15 @@ class Window:
         """The same window ending with step ``n``."""
         if n == self.n:
             return self
-        cut = {
-            name: getattr(self, name)[: n + 1]
-            for name in ("frames", "last_action", "is_init", "action", "reward")
-        }
-        return replace(self, **cut, ended=False)
+        return replace(
+            self,
+            frames=self.frames[: n + 1],
+            last_action=self.last_action[: n + 1],
+            is_init=self.is_init[: n + 1],
+            action=self.action[: n + 1],
+            reward=self.reward[: n + 1],
+            ended=False,
+        )
 
 
 def greedy_window(
@@ -130,7 +134,8 @@ def greedy_windows(
         windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
         ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
         # these windows begin later than what was kept: play the very same again
-        if (late := ends >= cap).any():
+        late = ends >= cap
+        if late.any():
             del windows
             first = np.where(late, ends - cap + 1, 0).tolist()
             windows, _ = play(agent, env, seed=batch_seed, keep=cap, first=first)
@@ -194,15 +199,24 @@ def play(
     windows = []
     for row, (begin, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
         steps = max(0, min(keep, length - begin))
-        seen = {
-            name: value if name == "pixels" else value.reshape(-1)
-            for name, value in kept[row, :steps].items()
-        }
         whole = bool(ended[row]) and begin + steps == length
-        windows.append(
-            Window(seen.pop("pixels"), **seen, state=states[row], ended=whole, seed=seed, row=row)
-        )
+        windows.append(_window(kept[row, :steps], states[row], whole, seed, row))
     return windows, lengths.numpy()
+
+
+def _window(steps: TensorDictBase, state: Any, ended: bool, seed: int, row: int) -> Window:
+    """A window from what was kept of the steps of one episode, [T]."""
+    return Window(
+        frames=steps["pixels"],
+        last_action=steps["last_action"].reshape(-1),
+        is_init=steps["is_init"].reshape(-1),
+        action=steps["action"].reshape(-1),
+        reward=steps["reward"].reshape(-1),
+        state=state,
+        ended=ended,
+        seed=seed,
+        row=row,
+    )
 
 
 def resolve_agent(

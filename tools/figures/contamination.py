@@ -43,103 +43,129 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
     at_least(options, horizon=2, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.contamination, vars(options), progress)
-    made = Made([], notes, [_table(label, item) for label, item in measured])
-    first = measured[0][1]  # strengths and delays are those of all
-    for (game, twin), agents in style.agents_by_task(
-        pool(by_task(measured), options.confidence)
-    ).items():
-        figure = _figure(agents, first, options)
-        figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
-        seeds = {agent: np.isfinite(value["flip"].seeds).sum(0) for agent, value in agents.items()}
-        counts = [count for each in seeds.values() for count in each.ravel().tolist() if count]
-        label, item = next(pair for pair in measured if pair[0].task[1:] == (game, twin))
-        ceiling = "last shuffled frame" if options.shuffle else "decision's own frame"
-        note = (
-            f"{style.seeds_note(counts, options.confidence)}; {len(item.points)} start points "
-            "each, "
-            f"{'replay chooses its actions' if options.feedback else 'recorded actions'};\n"
-            f"0 steps: the {ceiling}; dashed: without memory nothing changes after it"
-        )
-        rows = []
-        for agent, value in agents.items():
-            what = {"agent": agent, "game": game, "observability": twin, "seeds": seeds[agent]}
-            what |= {
-                "sigma": None if options.shuffle else first.sigmas[:, None],
-                "delay": first.delays,
-            }
-            for name in MEASURES:
-                what |= zip((name, f"{name}_low", f"{name}_high"), value[name][1:], strict=True)
-            rows += style.rows_of(**what)
-        kind = "shuffle" if options.shuffle else "noise"
-        made.pictures.append(Picture(f"contamination-{kind}-{game}-{twin}", figure, note, rows))
+    made = Made([], notes, [_table(label, changes) for label, changes in measured])
+    tasks = style.agents_by_task(pool(by_task(measured), options.confidence))
+    for (game, twin), agents in tasks.items():
+        seeds = [pair for pair in measured if pair[0].task[1:] == (game, twin)]
+        made.pictures.append(_picture(game, twin, agents, seeds[0][1], options))
+        label = seeds[0][0]
         try:
-            how = vars(options) | {"sigma": max(options.sigmas)}
-            _, example = measure_run(label.path, measure.contamination_example, how)
+            settings = vars(options) | {"sigma": max(options.sigmas)}
+            _, example = measure_run(label.path, measure.contamination_example, settings)
         except ValueError as error:  # episodes too short
             made.notes.append(f"no example of {label}: {error}")
         else:
-            made.pictures.append(
-                Picture(f"contamination-{kind}-example-{game}-{twin}", *_example(label, example))
-            )
+            name = f"contamination-{_kind(options)}-example-{game}-{twin}"
+            made.pictures.append(Picture(name, *_example(label, example)))
     return made
 
 
-def _example(label: Label, found: measure.Example) -> tuple[Any, str, list[dict[str, Any]]]:
+def _kind(options: ContaminationOptions) -> str:
+    return "shuffle" if options.shuffle else "noise"
+
+
+def _picture(
+    game: str,
+    twin: str,
+    agents: Mapping[str, Measures],
+    seed: measure.Contamination,
+    options: ContaminationOptions,
+) -> Picture:
+    """The figure of one task; strengths, delays and start points are those of one ``seed``."""
+    figure = _figure(agents, seed, options)
+    figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
+    rows = list[dict[str, Any]]()
+    counts = list[int]()
+    for agent, measures in agents.items():
+        seeds = np.isfinite(measures["flip"].seeds).sum(0)
+        counts += seeds[seeds > 0].tolist()
+        columns = {"agent": agent, "game": game, "observability": twin, "seeds": seeds}
+        columns["sigma"] = None if options.shuffle else seed.sigmas[:, None]
+        columns["delay"] = seed.delays
+        for name in MEASURES:
+            columns[name] = measures[name].mean
+            columns[f"{name}_low"] = measures[name].low
+            columns[f"{name}_high"] = measures[name].high
+        rows += style.rows_of(**columns)
+    ceiling = "last shuffled frame" if options.shuffle else "decision's own frame"
+    actions = "replay chooses its actions" if options.feedback else "recorded actions"
+    note = (
+        f"{style.seeds_note(counts, options.confidence)}; {len(seed.points)} start points each, "
+        f"{actions};\n"
+        f"0 steps: the {ceiling}; dashed: without memory nothing changes after it"
+    )
+    return Picture(f"contamination-{_kind(options)}-{game}-{twin}", figure, note, rows)
+
+
+def _example(label: Label, example: measure.Example) -> tuple[Any, str, list[dict[str, Any]]]:
     """Rows: an episode as it was, and disturbed; columns: some of its frames, and bars of the
     outputs on its last.
     """
-    n = found.frames.shape[1] - 1
-    best = found.values.argmax(1)
-    shuffle = found.hits[1] < 0
-    names = [
-        "clean",
-        *("shuffled" if shuffle else f"noise on frame {hit}" for hit in found.hits[1:]),
-    ]
+    n = example.frames.shape[1] - 1
+    shuffle = example.hits[1] < 0
+    names = ["clean"]
+    for hit in example.hits[1:]:
+        names.append("shuffled" if shuffle else f"noise on frame {hit}")
     columns = 6 if shuffle else 3
     size = (1.6 * (columns + 1.7), 1.7 * len(names) + 0.8)
-    look = {"width_ratios": [1.0] * columns + [1.7]}
-    figure, axes = style.panels(len(names), columns + 1, size, sharey="col", **look)
-    task = dict(zip(("agent", "game", "observability"), label.task, strict=True))
+    widths = [1.0] * columns + [1.7]
+    figure, axes = style.panels(len(names), columns + 1, size, sharey="col", width_ratios=widths)
+    agent, game, twin = label.task
     numbers = list[dict[str, Any]]()
     for row, (*pictures, bars) in enumerate(axes):
-        early = (
-            range(measure.FIRST + 1, measure.FIRST + 4)
-            if shuffle
-            else (0, max(found.hits[row], found.hits[1]))
-        )
-        for axis, t in zip(pictures, (*early, *range(n - 2 * shuffle, n + 1)), strict=True):
-            axis.imshow(found.frames[row, t], interpolation="nearest")
+        hit = example.hits[row]
+        if shuffle:
+            early = range(measure.FIRST + 1, measure.FIRST + 4)
+            late = range(n - 2, n + 1)
+            steps = [*early, *late]
+        else:
+            steps = [0, max(hit, example.hits[1]), n]
+        for axis, t in zip(pictures, steps, strict=True):
+            axis.imshow(example.frames[row, t], interpolation="nearest")
             axis.set(xticks=[], yticks=[], frame_on=False)
-            axis.set_title(f"$o_{{{found.order[row, t]}}}$", parse_math=True)
+            axis.set_title(f"$o_{{{example.order[row, t]}}}$", parse_math=True)
         pictures[0].set_ylabel(names[row], fontsize="small")
-        bars.bar(ACTION_NAMES, found.values[row], color=REST)
-        bars.patches[best[row]].set_facecolor(OTHER_BEST)
-        bars.patches[best[0]].set_facecolor(CLEAN_BEST)
-        bars.axhline(0.0, color=style.NEUTRAL, lw=0.8)
-        bars.tick_params(labelsize="small")
-        hit = None if found.hits[row] < 0 else found.hits[row]
+        _plot_outputs(example, row, bars)
         numbers += style.rows_of(
-            **task, row=names[row], hit=hit, action=ACTION_NAMES, value=found.values[row]
+            agent=agent,
+            game=game,
+            observability=twin,
+            row=names[row],
+            hit=None if hit < 0 else hit,
+            action=ACTION_NAMES,
+            value=example.values[row],
         )
-    outputs = "probabilities" if found.target == "probs" else f"centred {found.target}"
+    outputs = "probabilities" if example.target == "probs" else f"centred {example.target}"
     axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
-    figure.suptitle(
-        f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}", x=0.01, ha="left"
-    )
-    noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {found.sigma:g}"
+    title = f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}"
+    figure.suptitle(title, x=0.01, ha="left")
+    noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {example.sigma:g}"
     note = f"n = 1 episode, {noise}; blue: best action when clean, red: best if another"
     return figure, note, numbers
 
 
-def _table(label: Label, found: measure.Contamination) -> Table:
-    names = ["shuffled" if np.isnan(sigma) else f"{sigma:g}" for sigma in found.sigmas]
-    rows = [
-        [name, *(f"{100 * x:.1f}" for x in line)]
-        for name, line in zip(names, found.mean("flip"), strict=True)
-    ]
-    counts = f"{len(found.points)} start points ({', '.join(map(str, found.counts()[0]))} by delay)"
-    caption = f"{counts}; a frame replaced by itself moves outputs by {found.clean_error:.1e}"
-    head = ("sigma", *(f"+{delay}" for delay in found.delays))
+def _plot_outputs(example: measure.Example, row: int, axis: Any) -> None:
+    """Draw the outputs of a row as bars, that of the best action in colour."""
+    best = example.values.argmax(1)
+    axis.bar(ACTION_NAMES, example.values[row], color=REST)
+    axis.patches[best[row]].set_facecolor(OTHER_BEST)
+    axis.patches[best[0]].set_facecolor(CLEAN_BEST)
+    axis.axhline(0.0, color=style.NEUTRAL, lw=0.8)
+    axis.tick_params(labelsize="small")
+
+
+def _table(label: Label, changes: measure.Contamination) -> Table:
+    """The changed decisions of one checkpoint: a row a strength, a column a delay."""
+    rows = list[list[str]]()
+    for sigma, shares in zip(changes.sigmas, changes.mean("flip"), strict=True):
+        name = "shuffled" if np.isnan(sigma) else f"{sigma:g}"
+        rows.append([name, *(f"{100 * share:.1f}" for share in shares)])
+    by_delay = ", ".join(map(str, changes.counts()[0]))
+    caption = (
+        f"{len(changes.points)} start points ({by_delay} by delay); a frame replaced by itself "
+        f"moves outputs by {changes.clean_error:.1e}"
+    )
+    head = ("sigma", *(f"+{delay}" for delay in changes.delays))
     return Table(f"{label}: changed decisions in %", head, rows, caption)
 
 
@@ -163,33 +189,36 @@ def _figure(
     """One row a measure, one column a strength of the noise; the dashed line is an agent without
     memory.
     """
-    shown = [
-        name
-        for name in MEASURES
-        if any(np.isfinite(value[name].mean).any() for value in agents.values())
-    ]
-    size = max(6.5, 3.6 * len(first.sigmas)), 1.3 + 2.5 * len(shown)
-    figure, axes = style.panels(len(shown), len(first.sigmas), size, sharex=True, sharey="row")
+    names = [name for name in MEASURES if _is_measured(name, agents.values())]
+    size = max(6.5, 3.6 * len(first.sigmas)), 1.3 + 2.5 * len(names)
+    figure, axes = style.panels(len(names), len(first.sigmas), size, sharex=True, sharey="row")
     delays = first.delays[: reached(agents.values())].tolist()
-    for row, name in zip(axes, shown, strict=True):
+    for row, name in zip(axes, names, strict=True):
         for column, axis in enumerate(row):
             plot(agents, axis, name, column, delays)
         row[0].set_ylabel(MEASURES[name])
         from_zero(row[0])
+    start = "shuffled frames" if options.shuffle else "noisy frame to the decision"
     for sigma, top, bottom in zip(first.sigmas, axes[0], axes[-1], strict=True):
         top.set_title("" if options.shuffle else f"noise sigma = {sigma:g}")
-        bottom.set_xlabel(
-            "steps from the "
-            f"{'shuffled frames' if options.shuffle else 'noisy frame to the decision'}"
-        )
+        bottom.set_xlabel(f"steps from the {start}")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
     return figure
 
 
 def reached(agents: Iterable[Measures]) -> int:
     """How many of the delays were reached: episodes may be shorter than the longest one."""
-    known = [np.isfinite(one.mean).any(0) for value in agents for one in value.values()]
-    return int(np.flatnonzero(np.any(known, axis=0))[-1]) + 1
+    delays = set[int]()
+    for measures in agents:
+        for values in measures.values():
+            _, finite = np.nonzero(np.isfinite(values.mean))
+            delays.update(finite.tolist())
+    return max(delays) + 1
+
+
+def _is_measured(name: str, agents: Iterable[Measures]) -> bool:
+    """Whether some agent has a value of one of `MEASURES`."""
+    return any(np.isfinite(measures[name].mean).any() for measures in agents)
 
 
 def from_zero(axis: Any) -> None:
@@ -209,11 +238,13 @@ def plot(
     """Draw one measure by delay, a line an agent; the dashed line is an agent without memory."""
     colours = colours or style.agent_colours(list(agents))
     for place, (agent, value) in enumerate(agents.items()):
-        mean, low, high = (part[column, : len(delays)] for part in value[name][1:])
+        mean = value[name].mean[column, : len(delays)]
+        low = value[name].low[column, : len(delays)]
+        high = value[name].high[column, : len(delays)]
         x = np.arange(len(delays)) + 0.1 * (place - (len(agents) - 1) / 2)
-        bars = {"fmt": "none", "ecolor": colours[agent], "capsize": 2, "lw": 1}
+        bars = style.whiskers(mean, low, high)
         marker = style.MARKERS[place % len(style.MARKERS)]
         axis.plot(x, mean, color=colours[agent], marker=marker, label=style.legend_name(agent))
-        axis.errorbar(x, mean, style.whiskers(mean, low, high), **bars)
+        axis.errorbar(x, mean, bars, fmt="none", ecolor=colours[agent], capsize=2, lw=1)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(range(len(delays)), [str(delay) for delay in delays])

@@ -2,8 +2,10 @@
 returns of people.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,17 @@ PANELS = {
     "bias": ("Memory Bias", "MDP - memory-free MDP"),
 }
 DRAWN = ("pomdp", "gap", "bias")
+COLUMNS = {
+    "mdp": "MDP",
+    "pomdp": "POMDP",
+    "gap": "gap",
+    "bias": "bias",
+    "mdp_iqm": "MDP IQM",
+    "pomdp_iqm": "POMDP IQM",
+    "mdp_raw": "MDP raw",
+    "pomdp_raw": "POMDP raw",
+}
+"""Numbers of the printed table, and their heads."""
 
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
@@ -72,67 +85,98 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     """The figure ``size-sweep``: a panel a game; agents are named LAYERSxWIDTH, the memory-free one
     without.
     """
-    found = find_runs(options.runs)
-    sized = agent_names(found.names, sized=True)
-    names = {
-        key: name if memory_free(name, options.baseline) else sized[key]
-        for key, name in found.names.items()
-    }
-    every = list(zip(found.runs, found.scores(options.metric), strict=True))
-    notes = list(found.notes)
+    runs = find_runs(options.runs)
+    notes = list(runs.notes)
     tables = dict[str, GapBias]()
-    for game in dict.fromkeys(run.game for run in found.runs):
+    for game, scores in _scores_by_game(runs, options).items():
         try:
-            here = [
-                replace(score, agent=names[run.key]) for run, score in every if run.game == game
-            ]
-            tables[game] = _computed(here, options)
+            tables[game] = _computed(scores, options)
         except ValueError as error:
             notes.append(f"left out, {game}: {error}")
     if not tables:
         raise ValueError(f"no size sweep in these runs: {notes[-1]}")
-    rows = [row | {"game": game} for game, table in tables.items() for row in table.table()]
-    if len({row["agent"] for row in rows}) < 3:
+    figure, axes = panels(1, len(tables), (7.2 * len(tables), 5.4))
+    rows = list[dict[str, Any]]()
+    agents = set[str]()
+    for axis, (game, table) in zip(axes[0], tables.items(), strict=True):
+        plot(table.rows, axis)
+        axis.set_title(game)
+        for row in table.table():
+            rows.append(row | {"game": game})
+            agents.add(row["agent"])
+    if len(agents) < 3:
         notes.append(
             "a single size beside the memory-free agent: vary --network-option layers or "
             "hidden_size"
         )
-    figure, axes = panels(1, len(tables), (7.2 * len(tables), 5.4))
-    for axis, (game, table) in zip(axes[0], tables.items(), strict=True):
-        plot(table.rows, axis)
-        axis.set_title(game)
     note = f"labels: layers x width; {options.metric}, {_seeds(list(tables.values()), options)}"
     return Made([Picture("size-sweep", figure, note, rows)], notes)
 
 
+def _scores_by_game(runs: Runs, options: SweepOptions) -> dict[str, list[Score]]:
+    """The scores of runs by game; agents with memory are named by its size."""
+    names = dict(runs.names)
+    sized = agent_names(names, sized=True)
+    for key, name in runs.names.items():
+        if not memory_free(name, options.baseline):
+            names[key] = sized[key]
+    by_game: dict[str, list[Score]] = {}
+    for run, score in zip(runs.runs, runs.scores(options.metric), strict=True):
+        by_game.setdefault(run.game, []).append(replace(score, agent=names[run.key]))
+    return by_game
+
+
 def human(options: PaperOptions, progress: Progress | None) -> Made:
     """The figure ``human``; runs are not looked at."""
-    table = read_csv(PAPER_RETURNS)
-    people = [row for row in table if row["model"] == "human"]
-    machine = {(row["env"], row["difficulty"]): row for row in table if row["model"] == "MLP"}
+    people: dict[str, list[dict[str, str]]] = {}
+    rows_without_memory: dict[str, list[dict[str, str]]] = {}
+    rows = []
+    for row in read_csv(PAPER_RETURNS):
+        if row["model"] == "human":
+            people.setdefault(row["env"], []).append(row)
+            rows.append(row)
+        elif row["model"] == "MLP":
+            rows_without_memory.setdefault(row["env"], []).append(row)
     figure, axes = panels(2, 5, (12.5, 5.6), sharey=True)
-    x = np.arange(len(DIFFICULTIES))
-    for axis, game in zip(axes.flat, dict.fromkeys(row["env"] for row in people), strict=True):
-        here = [row for row in people if row["env"] == game]
-        for side, (colour, twin) in enumerate(
-            zip(TWIN_COLOURS.values(), ("mdp", "pomdp"), strict=True)
-        ):
-            places = x + (side - 0.5) * 0.36
-            mean, std = ([float(row[f"{twin}_{what}"]) for row in here] for what in ("mean", "std"))
-            style = {"fmt": "os"[side], "color": colour, "capsize": 2, "lw": 1.2}
-            axis.errorbar(places, mean, std, label=f"people, {twin.upper()}", **style)
-            plain = [float(machine[game, row["difficulty"]][f"{twin}_mean"]) for row in here]
-            label = "memory-free agent" if side else None
-            axis.plot(places, plain, "_", mew=2, color=agent_colours(["mlp"])["mlp"], label=label)
-        axis.axhline(0.0, color="#bbbbbb", lw=0.8)
-        axis.set_xticks(x, DIFFICULTIES)
+    for axis, game in zip(axes.flat, people, strict=True):
+        _plot_people(people[game], rows_without_memory[game], axis)
         axis.set_title(game)
     for axis in axes[:, 0]:
         axis.set_ylabel("return, not normalised")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     note = f"published; n = {SEEDS} people, bars: one standard deviation over people"
     notes = ["people cannot be measured again: --runs is not looked at"] if options.runs else []
-    return Made([Picture("human", figure, note, people)], notes)
+    return Made([Picture("human", figure, note, rows)], notes)
+
+
+def _plot_people(
+    people: Sequence[Mapping[str, str]], without_memory: Sequence[Mapping[str, str]], axis: Any
+) -> None:
+    """Draw the returns of people in one game by difficulty, those of the memory-free agent beside
+    them.
+    """
+    x = np.arange(len(DIFFICULTIES))
+    grey = agent_colours(["mlp"])["mlp"]
+    baseline = {row["difficulty"]: row for row in without_memory}
+    sides = (("mdp", "full", "o", -0.18), ("pomdp", "partial", "s", 0.18))
+    for name, twin, marker, offset in sides:
+        means = [float(row[f"{name}_mean"]) for row in people]
+        stds = [float(row[f"{name}_std"]) for row in people]
+        axis.errorbar(
+            x + offset,
+            means,
+            stds,
+            label=f"people, {name.upper()}",
+            fmt=marker,
+            color=TWIN_COLOURS[twin],
+            capsize=2,
+            lw=1.2,
+        )
+        levels = [float(baseline[row["difficulty"]][f"{name}_mean"]) for row in people]
+        label = "memory-free agent" if name == "pomdp" else None
+        axis.plot(x + offset, levels, "_", mew=2, color=grey, label=label)
+    axis.axhline(0.0, color="#bbbbbb", lw=0.8)
+    axis.set_xticks(x, DIFFICULTIES)
 
 
 def plot(rows: Sequence[AgentRow], axis: Any) -> None:
@@ -142,9 +186,7 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
         point = (row.bias.value, row.gap.value)
         colour = colours[row.agent]
         look = {"fmt": MARKERS[place % len(MARKERS)], "color": colour, "capsize": 2, "lw": 1}
-        axis.errorbar(
-            *point, *(whiskers(*np.array([each]).T) for each in (row.gap, row.bias)), **look
-        )
+        axis.errorbar(*point, yerr=_whiskers([row.gap]), xerr=_whiskers([row.bias]), **look)
         axis.annotate(
             row.agent, point, (6, 5), textcoords="offset points", color=colour, fontsize="small"
         )
@@ -158,57 +200,71 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
 
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
-    chosen = [row for row in rows if name != "bias" or _has_bias(row)]
-    ends = np.reshape([getattr(row, name) for row in chosen], (-1, 3)).T
-    places = range(len(chosen))
+    rows_with_number = list(filter(_has_bias, rows)) if name == "bias" else rows
+    agents = [row.agent for row in rows_with_number]
+    intervals = [getattr(row, name) for row in rows_with_number]
     colours = agent_colours([row.agent for row in rows])
-    errors = {"error_kw": {"lw": 1}, "capsize": 3}
+    places = range(len(agents))
     axis.bar(
         places,
-        ends[0],
+        [interval.value for interval in intervals],
         0.72,
-        color=[colours[row.agent] for row in chosen],
-        yerr=whiskers(*ends),
-        **errors,
+        color=[colours[agent] for agent in agents],
+        yerr=_whiskers(intervals),
+        error_kw={"lw": 1},
+        capsize=3,
     )
-    axis.set_xticks(
-        places, [row.agent for row in chosen], rotation=35, ha="right", rotation_mode="anchor"
-    )
+    axis.set_xticks(places, agents, rotation=35, ha="right", rotation_mode="anchor")
     axis.set(title=PANELS[name][0], ylabel=PANELS[name][1])
     if name in ("gap", "bias"):
         axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
 
 
+def _whiskers(intervals: Sequence[Interval]) -> Any:
+    """Lengths of the error bars of intervals, [2, n]."""
+    return whiskers(*np.reshape(intervals, (-1, 3)).T)
+
+
 def _without_each(table: GapBias) -> Any:
     """The same three numbers with one game left out at a time; the first column has all games."""
-    columns = {"all games": table.rows} | {
-        f"no {game}": rows for game, rows in table.without.items()
-    }
+    columns = {"all games": table.rows}
+    for game, rows in table.without.items():
+        columns[f"no {game}"] = rows
     figure, axes = panels(3, 1, (12.5, 10), sharex=True)
-    agents = [row.agent for row in table.rows]
-    offsets = np.linspace(-0.34, 0.34, len(agents))
-    places = np.arange(len(columns))
     for axis, name in zip(axes[:, 0], DRAWN, strict=True):
-        for place, (agent, row) in enumerate(zip(agents, table.rows, strict=True)):
-            if name == "bias" and (not _has_bias(row) or agent == table.baselines[agent]):
-                continue
-            ends = np.array([getattr(rows[place], name) for rows in columns.values()]).T
-            look = {
-                "fmt": MARKERS[place % len(MARKERS)],
-                "lw": 1,
-                "color": agent_colours(agents)[agent],
-            }
-            axis.errorbar(
-                places + offsets[place], ends[0], whiskers(*ends), label=legend_name(agent), **look
-            )
-        axis.set_title(PANELS[name][0], loc="left")
-        axis.set_ylabel(PANELS[name][1])
-        axis.axvline(0.5, color=NEUTRAL, lw=0.8)
-        if name != "pomdp":
-            axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
-    axes[0, 0].legend(ncols=len(agents), loc="lower center", bbox_to_anchor=(0.5, 1.08))
-    axes[-1, 0].set_xticks(places, list(columns), rotation=25, ha="right")
+        _plot_columns(list(columns.values()), table, axis, name)
+    axes[0, 0].legend(ncols=len(table.rows), loc="lower center", bbox_to_anchor=(0.5, 1.08))
+    axes[-1, 0].set_xticks(range(len(columns)), list(columns), rotation=25, ha="right")
     return figure
+
+
+def _plot_columns(
+    columns: Sequence[Sequence[AgentRow]], table: GapBias, axis: Any, name: str
+) -> None:
+    """Draw one number of every agent, one of `PANELS`, in several columns side by side."""
+    agents = [row.agent for row in table.rows]
+    colours = agent_colours(agents)
+    places = np.arange(len(columns))
+    offsets = np.linspace(-0.34, 0.34, len(agents))
+    for index, row in enumerate(table.rows):
+        is_baseline = row.agent == table.baselines[row.agent]
+        if name == "bias" and (is_baseline or not _has_bias(row)):
+            continue
+        intervals = [getattr(rows[index], name) for rows in columns]
+        axis.errorbar(
+            places + offsets[index],
+            [interval.value for interval in intervals],
+            _whiskers(intervals),
+            label=legend_name(row.agent),
+            fmt=MARKERS[index % len(MARKERS)],
+            color=colours[row.agent],
+            lw=1,
+        )
+    axis.set_title(PANELS[name][0], loc="left")
+    axis.set_ylabel(PANELS[name][1])
+    axis.axvline(0.5, color=NEUTRAL, lw=0.8)
+    if name != "pomdp":
+        axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
 
 
 def _has_bias(row: AgentRow) -> bool:
@@ -237,17 +293,14 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
     scores = read_scores(options.runs, options.metric)
     table = _computed(scores, options)
     notes = found.notes + found.single_seeds()
-    rows = [
-        row
-        for path in options.runs
-        if path not in folders
-        for row in read_csv(table_of(path) or path)
-    ]
-    if lost := sum(row.get("status", "finished") != "finished" for row in rows):
-        notes.append(f"left out, not finished: {lost} run{'s' * (lost > 1)}")
-    if apart := sum(score.observability in BOTH_TWINS for score in scores):
+    unfinished = sum(_count_unfinished(path) for path in options.runs if path not in folders)
+    if unfinished:
+        notes.append(f"left out, not finished: {unfinished} run{'s' * (unfinished > 1)}")
+    twins = Counter(score.observability for score in scores)
+    mixed = sum(twins[twin] for twin in BOTH_TWINS)
+    if mixed:
         notes.append(
-            f"left out, of no single twin: {apart} score{'s' * (apart > 1)} "
+            f"left out, of no single twin: {mixed} score{'s' * (mixed > 1)} "
             f"({' or '.join(BOTH_TWINS)})"
         )
     if table.dropped:
@@ -257,42 +310,55 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
     return Made(notes=notes, tables=[_printed(table, tasks)]), table, note
 
 
+def _count_unfinished(path: Path) -> int:
+    """The number of rows of a table of runs, or of a study's, that have not finished."""
+    statuses = Counter(row.get("status", "finished") for row in read_csv(table_of(path) or path))
+    return statuses.total() - statuses["finished"]
+
+
 def _computed(scores: list[Score], options: SweepOptions) -> GapBias:
-    how: Any = {
-        name: getattr(options, name) for name in ("metric", "baseline", "draws", "confidence")
-    }
-    return gap_and_bias(scores, **how)
+    """The table of Gap and Bias with the options of a figure."""
+    return gap_and_bias(
+        scores,
+        metric=options.metric,
+        baseline=options.baseline,
+        draws=options.draws,
+        confidence=options.confidence,
+    )
 
 
 def _seeds(tables: Sequence[GapBias], options: SweepOptions) -> str:
     """How many seeds, and the smallest coverage of an interval of Gap."""
-    share = min((share for table in tables for share in table.coverage.values()), default=None)
-    return seeds_note(
-        [row.seeds for table in tables for row in table.rows], options.confidence, share=share
-    )
+    seeds = list[int]()
+    shares = list[float]()
+    for table in tables:
+        seeds += [row.seeds for row in table.rows]
+        shares += table.coverage.values()
+    return seeds_note(seeds, options.confidence, share=min(shares, default=None))
 
 
 def _printed(table: GapBias, what: str) -> Table:
     """The table as it is printed; an interval stands under its value."""
 
-    def cell(interval: Interval) -> str:
-        ends = "" if np.isnan(interval.low) else f"\n{interval.low:+.3f} {interval.high:+.3f}"
-        return "none" if np.isnan(interval.value) else f"{interval.value:+.3f}{ends}"
+    rows = list[tuple[Any, ...]]()
+    for row in table.rows:
+        cells = [_cell(getattr(row, name)) for name in COLUMNS]
+        rows.append((row.agent, row.seeds, *cells))
+    shares = [f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in table.coverage.items()]
+    if shares:
+        caption = (
+            f"below: {100 * table.confidence:g} % bootstrap interval over seeds; measured coverage "
+            f"of the gap's: {', '.join(shares)}"
+        )
+    else:
+        caption = "no intervals: a single seed"
+    return Table(f"gap and bias over {what}", ("agent", "seeds", *COLUMNS.values()), rows, caption)
 
-    head = {
-        **{"mdp": "MDP", "pomdp": "POMDP", "gap": "gap", "bias": "bias", "mdp_iqm": "MDP IQM"},
-        **{"pomdp_iqm": "POMDP IQM", "mdp_raw": "MDP raw", "pomdp_raw": "POMDP raw"},
-    }
-    rows = [
-        (row.agent, row.seeds, *(cell(getattr(row, name)) for name in head)) for row in table.rows
-    ]
-    measured = ", ".join(
-        f"{100 * share:.0f} % with {seeds} seeds" for seeds, share in table.coverage.items()
-    )
-    caption = (
-        f"below: {100 * table.confidence:g} % bootstrap interval over seeds; measured coverage of "
-        f"the gap's: {measured}"
-        if measured
-        else "no intervals: a single seed"
-    )
-    return Table(f"gap and bias over {what}", ("agent", "seeds", *head.values()), rows, caption)
+
+def _cell(interval: Interval) -> str:
+    """A number, and under it its interval if it has one."""
+    if np.isnan(interval.value):
+        return "none"
+    if np.isnan(interval.low):
+        return f"{interval.value:+.3f}"
+    return f"{interval.value:+.3f}\n{interval.low:+.3f} {interval.high:+.3f}"

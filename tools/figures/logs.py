@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
+from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
@@ -55,36 +57,57 @@ class Curve(NamedTuple):
 
 def curves(options: CurveOptions, progress: Progress | None) -> Made:
     """The figure ``curves``: a panel a task, a line an agent, mean over seeds with a band."""
-    found = find_runs(options.runs)
+    runs = find_runs(options.runs)
     kind = "eval" if options.metric == "eval_final" else "train"
-    every = curves_of_runs(found.groups(), kind, options.confidence)
-    if not every:
+    all_curves = curves_of_runs(runs.groups(), kind, options.confidence)
+    if not all_curves:
         raise ValueError(
             f"no run below {options.runs[0]} has logged a {AXIS[kind]}: nothing to draw"
         )
-    tasks = style.agents_by_task(every)
-    agents = list(dict.fromkeys(agent for agent, _, _ in every))
+    figure = _curve_figure(all_curves, AXIS[kind])
+    rows = list[dict[str, Any]]()
+    counts = list[int]()
+    for (agent, game, twin), curve in all_curves.items():
+        returns = curve.returns
+        counts.append(len(returns.seeds))
+        rows += style.rows_of(
+            agent=agent,
+            game=game,
+            observability=twin,
+            seeds=len(returns.seeds),
+            frames=curve.frames.astype(np.int64),
+            mean=returns.mean,
+            low=returns.low,
+            high=returns.high,
+        )
+    note = style.seeds_note(counts, options.confidence, "bands")
+    return Made([Picture("curves", figure, note, rows)], runs.notes + runs.single_seeds())
+
+
+def _curve_figure(curves: Mapping[tuple[str, str, str], Curve], ylabel: str) -> Any:
+    """Draw a panel a task; the twins of a game share their y axis, and all panels one legend."""
+    tasks = style.agents_by_task(curves)
+    agents = list(dict.fromkeys(agent for agent, _, _ in curves))
     columns = min(4, len(tasks))
     lines = math.ceil(len(tasks) / columns)
     figure, axes = style.panels(lines, columns, (max(5.5, 3.9 * columns), 0.8 + 3.0 * lines))
     for axis in axes.flat[len(tasks) :]:
         axis.set_axis_off()
-    of_game: dict[str, Any] = {}
-    for axis, ((game, twin), here) in zip(axes.flat, tasks.items(), strict=False):
-        axis.sharey(of_game.setdefault(game, axis))  # twins are there to be compared
-        plot(here, axis, agents)
-        axis.set(title=f"{game}, {style.TWIN_NAMES.get(twin, twin)}", ylabel=AXIS[kind])
-    handles = {handle.get_label(): handle for axis in axes.flat for handle in axis.get_lines()}
-    shown = [handles[label] for label in map(style.legend_name, agents) if label in handles]
-    figure.legend(handles=shown, loc="outside upper center", ncols=min(8, len(shown)))
-    rows = []
-    for (agent, game, twin), (frames, (seeds, mean, low, high)) in every.items():
-        what = {"agent": agent, "game": game, "observability": twin, "seeds": len(seeds)}
-        rows += style.rows_of(**what, frames=frames.astype(np.int64), mean=mean, low=low, high=high)
-    note = style.seeds_note(
-        [len(curve.returns.seeds) for curve in every.values()], options.confidence, "bands"
-    )
-    return Made([Picture("curves", figure, note, rows)], found.notes + found.single_seeds())
+    axis_of_game: dict[str, Any] = {}
+    handles: dict[str, Any] = {}
+    for axis, ((game, twin), by_agent) in zip(axes.flat, tasks.items(), strict=False):
+        axis.sharey(axis_of_game.setdefault(game, axis))  # twins are there to be compared
+        plot(by_agent, axis, agents)
+        axis.set(title=f"{game}, {style.TWIN_NAMES.get(twin, twin)}", ylabel=ylabel)
+        for handle in axis.get_lines():
+            handles[handle.get_label()] = handle
+    in_legend = []
+    for agent in agents:
+        label = style.legend_name(agent)
+        if label in handles:
+            in_legend.append(handles[label])
+    figure.legend(handles=in_legend, loc="outside upper center", ncols=min(8, len(in_legend)))
+    return figure
 
 
 def plot(
@@ -132,33 +155,64 @@ def curves_of_runs(
     It goes over the frames that all runs of the group have reached. ``kind`` is ``eval`` (greedy
     evaluations) or ``train`` (running mean of training returns, exploration included).
     """
-    found = {}
+    curves = {}
     for task, runs in groups.items():
-        histories = [history for run in runs if (history := _history(run, kind))[0].size]
+        histories = _histories(runs, kind)
         if not histories:
             continue
-        end = min(frames[-1] for frames, _ in histories)
-        start = max(frames[0] for frames, _ in histories)
-        longest = max((frames for frames, _ in histories), key=len)
-        grid = (
-            longest[(longest >= start) & (longest <= end)]
-            if kind == "eval"
-            else np.linspace(start, end, POINTS)
-        )
+        grid = _shared_frames(histories, kind)
         if grid.size:
-            seeds = [np.interp(grid, frames, values) for frames, values in histories]
-            found[task] = Curve(grid, pooled(seeds, confidence))
-    return found
+            seeds = [np.interp(grid, history.frames, history.values) for history in histories]
+            curves[task] = Curve(grid, pooled(seeds, confidence))
+    return curves
 
 
-def _history(run: Run, kind: str) -> tuple[Array, Array]:
+class History(NamedTuple):
+    """What one run has logged: values at some frames."""
+
+    frames: Array
+    values: Array
+
+
+def _histories(runs: Sequence[Run], kind: str) -> list[History]:
+    """The histories of the runs that have logged something."""
+    histories = []
+    for run in runs:
+        history = _history(run, kind)
+        if history.frames.size:
+            histories.append(history)
+    return histories
+
+
+def _shared_frames(histories: Sequence[History], kind: str) -> Array:
+    """Where a mean over runs has values: within the frames that all of them have reached."""
+    frames = [history.frames for history in histories]
+    start = max(steps[0] for steps in frames)
+    end = min(steps[-1] for steps in frames)
+    if kind == "train":
+        return np.linspace(start, end, POINTS)
+    longest = max(frames, key=len)
+    return np.compress((longest >= start) & (longest <= end), longest)
+
+
+def _history(run: Run, kind: str) -> History:
+    """Read the table of a run that has its returns; a ``ValueError`` if it is damaged."""
     name, column = ("eval.csv", "mean") if kind == "eval" else ("metrics.csv", "train_return_ewm")
-    rows = [row for row in run.table(name) if row.get(column)]
+    frames = list[float]()
+    values = list[float]()
+    rows = run.table(name)
     try:
-        frames = np.array([float(row["frames"]) for row in rows])
-        return frames, np.array([float(row[column]) for row in rows])
+        for row in rows:
+            if row.get(column):
+                frames.append(float(row["frames"]))
+                values.append(float(row[column]))
     except ValueError as error:
         raise ValueError(f"{run.path / name} is damaged: {error}") from None
+    return History(np.array(frames), np.array(values))
+
+
+Line = dict[int, float]
+"""Number of envs -> frames per second."""
 
 
 class Rate(NamedTuple):
@@ -180,69 +234,104 @@ def throughput(options: Options, progress: Progress | None) -> Made:
     wanted = "one file of `arcade-torch bench envs --out FILE.csv`"
     given = list(map(str, options.runs))
     require(len(given) == 1, "--runs", given, wanted)
-    rows = read_rows(options.runs[0], Rate)
-    if not all(0 < number < 10**12 for row in rows for number in row[2:]):
-        raise ValueError(f"{options.runs[0]}: obs_size, num_envs and rates must be numbers above 0")
-    if not any(row.measure == "step+draw" for row in rows):
-        raise ValueError(
-            f"{options.runs[0]} has no row with the measure step+draw: nothing to draw"
-        )
-    rows = [row._replace(game=printable(row.game)) for row in rows]
-    sizes = sorted({row.obs_size for row in rows})
-    here = [row for row in rows if row.obs_size == sizes[0]]
-    notes = [
-        f"left out: frames of {', '.join(map(str, sizes[1:]))} px; drawn are {sizes[0]} px"
-    ] * (len(sizes) > 1)
-    games = list(dict.fromkeys(row.game for row in here))
-    counts = sorted({row.num_envs for row in here})
-    drawn, bare = (
-        {game: series(here, game, kind) for game in games} for kind in ("step+draw", "step")
+    file = options.runs[0]
+    rates = _read_rates(file)
+    sizes = sorted({rate.obs_size for rate in rates})
+    smallest = sizes[0]
+    notes = []
+    if len(sizes) > 1:
+        others = ", ".join(map(str, sizes[1:]))
+        notes.append(f"left out: frames of {others} px; drawn are {smallest} px")
+    rates = [rate for rate in rates if rate.obs_size == smallest]
+    counts = sorted({rate.num_envs for rate in rates})
+    lines = _throughput_lines(rates)
+    figure = _throughput_figure(lines, counts)
+    numbers = list[dict[str, Any]]()
+    for kind, by_name in lines._asdict().items():
+        for name, line in by_name.items():
+            numbers += style.rows_of(
+                series=name,
+                kind=KINDS_OF_LINES[kind],
+                num_envs=list(line),
+                frames_per_s=list(line.values()),
+            )
+    machine = read_csv(file)[0]  # the same in every row
+    note = (
+        f"{smallest} px, every frame consumed by a checksum inside the clock; median of repeats, "
+        "no interval; "
+        f"{machine.get('jax_device', 'unknown device')}, {machine.get('cores', '?')} cores, "
+        f"arcade-torch {machine.get('arcade_torch', '?')} ({machine.get('commit') or 'no commit'})"
     )
-    rest = {name: mean_series(here, games, kind) for name, kind in (OURS | {LIMIT: "fill"}).items()}
-    figure, ((left, right),) = style.panels(1, 2, (11.5, 5.4), sharey=True)
-    for place, game in enumerate(games):
-        spare = len(style.SPARE_COLOURS)
+    return Made([Picture("throughput", figure, note, numbers)], notes)
+
+
+def _read_rates(file: Path) -> list[Rate]:
+    """Read the rates of a file of ``bench envs``; a ``ValueError`` if they cannot be drawn."""
+    rates = []
+    for rate in read_rows(file, Rate):
+        for number in (rate.obs_size, rate.num_envs, rate.frames_per_s_with_check):
+            if not 0 < number < 10**12:
+                raise ValueError(f"{file}: obs_size, num_envs and rates must be numbers above 0")
+        rates.append(rate._replace(game=printable(rate.game)))
+    if not any(rate.measure == "step+draw" for rate in rates):
+        raise ValueError(f"{file} has no row with the measure step+draw: nothing to draw")
+    return rates
+
+
+class ThroughputLines(NamedTuple):
+    """The lines of the figure ``throughput``."""
+
+    drawn: dict[str, Line]  # game -> rate with drawing
+    bare: dict[str, Line]  # game -> rate without
+    means: dict[str, Line]  # layer, or `LIMIT` -> mean over games
+
+
+KINDS_OF_LINES = {"drawn": "drawing", "bare": "no drawing", "means": "mean"}
+"""How the CSV file names the lines."""
+
+
+def _throughput_lines(rates: Sequence[Rate]) -> ThroughputLines:
+    """The lines of rates that were all measured with frames of one size."""
+    games = list(dict.fromkeys(rate.game for rate in rates))
+    lines = ThroughputLines({}, {}, {})
+    for game in games:
+        lines.drawn[game] = series(rates, game, "step+draw")
+        lines.bare[game] = series(rates, game, "step")
+    for name, measure in (OURS | {LIMIT: "fill"}).items():
+        lines.means[name] = mean_series(rates, games, measure)
+    return lines
+
+
+def _throughput_figure(lines: ThroughputLines, counts: Sequence[int]) -> Any:
+    """Draw two panels on one scale, with ticks at the numbers of envs: single games, and means."""
+    figure, axes = style.panels(1, 2, (11.5, 5.4), sharey=True)
+    left, right = axes[0]
+    spare = len(style.SPARE_COLOURS)
+    for place, (game, drawn) in enumerate(lines.drawn.items()):
         marker = style.MARKERS[(place + place // spare) % len(style.MARKERS)]
         look = {"color": style.SPARE_COLOURS[place % spare], "marker": marker}
-        _line(left, drawn[game], label=style.legend_name(game), **look)
-        _line(left, bare[game], ls=":", **look)
+        _line(left, drawn, label=style.legend_name(game), **look)
+        _line(left, lines.bare[game], ls=":", **look)
     left.plot([], [], color=style.NEUTRAL, ls=":", label="the same without drawing")
     for name, marker, size in zip(OURS, "*vo", (11, None, None), strict=True):
-        _line(
-            right,
-            rest[name],
-            label=f"{name}, mean of {len(games)}",
-            color="#0072b2",
-            marker=marker,
-            ms=size,
-        )
-    _line(right, rest[LIMIT], label=LIMIT, color=style.NEUTRAL, ls="--")
-    for axis, title in ((left, "this package's games"), (right, "their mean, by layer")):
+        label = f"{name}, mean of {len(lines.drawn)}"
+        _line(right, lines.means[name], label=label, color="#0072b2", marker=marker, ms=size)
+    _line(right, lines.means[LIMIT], label=LIMIT, color=style.NEUTRAL, ls="--")
+    left.set_title("this package's games")
+    right.set_title("their mean, by layer")
+    left.set_ylabel("frames/s")
+    for axis in (left, right):
         axis.set_xscale("log", base=2)
         axis.set_yscale("log", base=10)
-        axis.set_xticks(counts, [str(count) for count in counts])
+        axis.set_xticks(counts, list(map(str, counts)))
         axis.yaxis.set_major_formatter(lambda rate, place: power_of_ten(rate))
         axis.minorticks_off()
-        axis.set(xlabel="environments", title=title)
+        axis.set_xlabel("environments")
         columns = 2 if len(axis.lines) < 9 else 3
         axis.legend(
             fontsize="small", ncols=columns, loc="upper center", bbox_to_anchor=(0.5, -0.16)
         )
-    left.set_ylabel("frames/s")
-    made = read_csv(options.runs[0])[0]
-    numbers = list[dict[str, Any]]()
-    note = (
-        f"{sizes[0]} px, every frame consumed by a checksum inside the clock; median of repeats, "
-        "no interval; "
-        f"{made.get('jax_device', 'unknown device')}, {made.get('cores', '?')} cores, "
-        f"arcade-torch {made.get('arcade_torch', '?')} ({made.get('commit') or 'no commit'})"
-    )
-    for kind, lines in {"drawing": drawn, "no drawing": bare, "mean": rest}.items():
-        for name, line in lines.items():
-            numbers += style.rows_of(
-                series=name, kind=kind, num_envs=list(line), frames_per_s=list(line.values())
-            )
-    return Made([Picture("throughput", figure, note, numbers)], notes)
+    return figure
 
 
 def power_of_ten(value: float) -> str:
@@ -255,17 +344,23 @@ def power_of_ten(value: float) -> str:
     return "10" + str(round(math.log10(value))).translate(SUPERSCRIPT) if value > 0 else ""
 
 
-def series(rows: Sequence[Rate], game: str, measure: str) -> dict[int, float]:
-    """Number of envs -> frames consumed per second, of one game."""
-    here = [row for row in rows if (row.game, row.measure) == (game, measure)]
-    return dict(sorted((row.num_envs, row.frames_per_s_with_check) for row in here))
+def series(rows: Sequence[Rate], game: str, measure: str) -> Line:
+    """The frames consumed per second by number of envs, of one game."""
+    rates = Line()
+    for row in rows:
+        if (row.game, row.measure) == (game, measure):
+            rates[row.num_envs] = row.frames_per_s_with_check
+    return dict(sorted(rates.items()))
 
 
-def mean_series(rows: Sequence[Rate], games: Sequence[str], measure: str) -> dict[int, float]:
+def mean_series(rows: Sequence[Rate], games: Sequence[str], measure: str) -> Line:
     """Mean rate over games, at the numbers of envs that all of them were measured with."""
-    every = [series(rows, game, measure) for game in games]
-    shared = sorted(set.intersection(*map(set, every))) if every else []
-    return {count: float(np.mean([one[count] for one in every])) for count in shared}
+    lines = [series(rows, game, measure) for game in games]
+    means = Line()
+    if lines:
+        for count in sorted(set.intersection(*map(set, lines))):
+            means[count] = float(np.mean([line[count] for line in lines]))
+    return means
 
 
 def _line(axis: Any, rates: Mapping[int, float], **look: Any) -> None:
@@ -278,66 +373,85 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
 
     Generated from the configs themselves, so that it cannot go stale.
     """
-    configs: dict[str, list[Mapping[str, Any]]] = {}
+    columns = dict[str, dict[str, str]]()
     if options.paper:
         notes = [
             f"total_frames is that of {TrainConfig().env}; the paper's budget depends on the game"
         ]
-        configs = {name: [preset("paper", algorithm=name).to_dict()] for name in ALGORITHMS}
+        for algorithm in ALGORITHMS:
+            config = preset("paper", algorithm=algorithm).to_dict()
+            columns[algorithm] = _settings([config], algorithm)
     else:
-        found = find_runs(options.runs)
-        notes = list(found.notes)
-        for run in found.runs:
-            configs.setdefault(str(run.config.get("algorithm", "pqn")), []).append(run.config)
-    columns = {name: _settings(here, name) for name, here in configs.items()}
-    names = dict.fromkeys(name for column in columns.values() for name in column)
-    rows = [
-        {"setting": name} | {key: column.get(name, "") for key, column in columns.items()}
-        for name in names
-    ]
-    if not rows:
+        runs = find_runs(options.runs)
+        notes = list(runs.notes)
+        for algorithm, configs in _configs_by_algorithm(runs.runs).items():
+            columns[algorithm] = _settings(configs, algorithm)
+    names = list(dict.fromkeys(chain.from_iterable(columns.values())))
+    if not names:
         raise ValueError(
             f"the runs below {options.runs[0]} say nothing of their settings: nothing to draw"
         )
     head = ["setting", *columns]
-    table = [list(row.values()) for row in rows]
-    figure, axes = style.panels(1, 1, (2.8 + 2.6 * len(columns), 0.26 * (len(rows) + 2)))
-    axes[0, 0].set_axis_off()
-    drawn = axes[0, 0].table(
-        table, colLabels=head, bbox=(0, 0, 1, 1), cellLoc="left", edges="horizontal"
-    )
+    table = list[list[str]]()
+    for name in names:
+        values = [column.get(name, "") for column in columns.values()]
+        table.append([name, *values])
+    base, endings = options.path("hyperparameters")
+    files = []
+    if len(endings) > 1:
+        files.append(write_atomic(base.with_suffix(".md"), markdown_table(head, table) + "\n"))
+    rows = [dict(zip(head, line, strict=True)) for line in table]
+    picture = Picture("hyperparameters", _table_figure(head, table), rows=rows)
+    return Made([picture], notes, files=files)
+
+
+def _configs_by_algorithm(runs: Sequence[Run]) -> dict[str, list[Mapping[str, Any]]]:
+    """Sort the configs of runs by their algorithm."""
+    configs: dict[str, list[Mapping[str, Any]]] = {}
+    for run in runs:
+        algorithm = str(run.config.get("algorithm", "pqn"))
+        configs.setdefault(algorithm, []).append(run.config)
+    return configs
+
+
+def _table_figure(head: Sequence[str], table: Sequence[Sequence[str]]) -> Any:
+    """Draw a table as a picture."""
+    size = (2.8 + 2.6 * (len(head) - 1), 0.26 * (len(table) + 2))
+    figure, axes = style.panels(1, 1, size)
+    axis = axes[0, 0]
+    axis.set_axis_off()
+    drawn = axis.table(table, colLabels=head, bbox=(0, 0, 1, 1), cellLoc="left", edges="horizontal")
     drawn.auto_set_font_size(False)
     for (line, _), cell in drawn.get_celld().items():
         cell.set_edgecolor("#d0d0d0")
         cell.set_text_props(weight="normal" if line else "bold")
-    base, endings = options.path("hyperparameters")
-    page = base.with_suffix(".md")
-    several = len(endings) > 1
-    files = [write_atomic(page, markdown_table(head, table) + "\n")] if several else []
-    return Made([Picture("hyperparameters", figure, rows=rows)], notes, files=files)
+    return figure
 
 
 def _settings(configs: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:
-    """Each setting's value, or all its values where runs differ; without the settings of other
-    algorithms.
+    """The value of every setting, or all its values where runs differ; without the settings of
+    other algorithms.
     """
-    others = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}
-
-    def stated_by(config: Mapping[str, Any]) -> dict[str, str]:
-        flat = flatten({key: value for key, value in config.items() if key not in others})
-        return {
-            name.removeprefix(f"{algorithm}."): _text(value)
-            for name, value in flat.items()
-            if value != {}
-        }
-
-    default = stated_by(TrainConfig().to_dict())  # of a setting that a run does not state
-    stated = [stated_by(config) for config in configs]
+    default = _flat_settings(TrainConfig().to_dict(), algorithm)
+    settings_of_runs = [_flat_settings(config, algorithm) for config in configs]
     values = dict[str, str]()
-    for name in dict.fromkeys(name for settings in stated for name in settings):
-        several = {settings.get(name, default.get(name, "-")) for settings in stated}
-        values[name] = " / ".join(sorted(several))
+    for name in dict.fromkeys(chain.from_iterable(settings_of_runs)):
+        # a run that does not name a setting was trained with its default
+        unnamed = default.get(name, "-")
+        different = {settings.get(name, unnamed) for settings in settings_of_runs}
+        values[name] = " / ".join(sorted(different))
     return values
+
+
+def _flat_settings(config: Mapping[str, Any], algorithm: str) -> dict[str, str]:
+    """The settings of a config as text, nested names joined by dots."""
+    left_out = {*NOT_SETTINGS, *ALGORITHMS} - {algorithm}
+    kept = {name: value for name, value in config.items() if name not in left_out}
+    settings = dict[str, str]()
+    for name, value in flatten(kept).items():
+        if value != {}:
+            settings[name.removeprefix(f"{algorithm}.")] = _text(value)
+    return settings
 
 
 def _text(value: Any) -> str:

@@ -28,37 +28,31 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
     at_least(options, show=1, max_steps=1)
     paths, notes = checkpoints_of(options.runs)
     if len(paths) > 1 and all((path / "eval.json").is_file() for path in paths):
-        first = [runs[0].path for runs in find_runs(paths).groups().values()]
+        first = [seeds[0].path for seeds in find_runs(paths).groups().values()]
         paths = [path for path in paths if path in first or path in options.runs]
     measured = measure_runs(paths, episode_saliency, vars(options), progress)
     drawn = list[Row]()
     cells = list[tuple[str, int, str]]()
     arrays = dict[str, Any]()
     numbers = list[dict[str, Any]]()
-    for index, (label, found) in enumerate(measured):
-        title = (
-            f"{label.agent}, {label.game} ({TWIN_NAMES[label.observability]}), seed {label.seed}"
-        )
-        shares = found.shares()
-        drawn.append((title, found.frames, found.maps))
+    for index, (label, episode) in enumerate(measured):
+        twin = TWIN_NAMES[label.observability]
+        title = f"{label.agent}, {label.game} ({twin}), seed {label.seed}"
+        shares = episode.shares()
+        drawn.append((title, episode.frames, episode.maps))
         cells.append((title, len(shares), f"{100 * shares[-1]:.1f} %"))
         numbers += rows_of(row=index, run=title, step=np.arange(len(shares)), share=shares)
         arrays[f"title_{index}"] = np.array(title)
-        arrays |= {
-            f"{name}_{index}": getattr(found, name)
-            for name in ("frames", "maps", "per_frame", "action")
-        }
+        arrays[f"frames_{index}"] = episode.frames
+        arrays[f"maps_{index}"] = episode.maps
+        arrays[f"per_frame_{index}"] = episode.per_frame
+        arrays[f"action_{index}"] = episode.action
     note = (
         f"n = 1 episode a row, decision at n; {options.reduce}, {options.norm} of the gradient, "
         f"{measured[0][1].target}, brightness is its square root; no interval"
     )
-    picture = Picture(
-        "saliency",
-        saliency_figure(drawn, show=options.show, figure=new_figure()),
-        note,
-        numbers,
-        arrays,
-    )
+    figure = saliency_figure(drawn, show=options.show, figure=new_figure())
+    picture = Picture("saliency", figure, note, numbers, arrays)
     table = Table("gradient of the last decision", ("run", "frames", "on the last frame"), cells)
     return Made([picture], notes, [table])
 
@@ -76,7 +70,8 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -
     Returns:
         A matplotlib figure.
     """
-    columns = min(show, max(frames.shape[0] for _, frames, _ in rows))
+    longest = max(len(frames) for _, frames, _ in rows)
+    columns = min(show, longest)
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(1.7 * columns, 2.2 * len(rows))
     figure.set_layout_engine("constrained")
@@ -104,11 +99,9 @@ def plot(
     """
     sigma = SIGMA_PX * frames.shape[1] / 128 if sigma_px is None else sigma_px
     blur = need("scipy.ndimage").gaussian_filter
-    soft = (
-        blur(np.asarray(maps, np.float64), (0, sigma, sigma), truncate=3.0)
-        if sigma
-        else np.asarray(maps)
-    )
+    soft = np.asarray(maps)
+    if sigma:
+        soft = blur(np.asarray(maps, np.float64), (0, sigma, sigma), truncate=3.0)
     peak = float(soft.max(initial=0.0))
     heat = np.sqrt(soft / peak) if peak > 0 else soft
     n = len(frames) - 1

@@ -79,8 +79,9 @@ def import_matplotlib() -> Any:
     except Exception:
         before = {name: os.environ.get(name) for name in _PLAIN}
         os.environ.update(_PLAIN)
-        for half in [name for name in sys.modules if name.startswith("matplotlib.")]:
-            del sys.modules[half]  # left over from the import that failed
+        for name in list(sys.modules):
+            if name.startswith("matplotlib."):
+                del sys.modules[name]  # left over from the import that failed
         try:
             return need("matplotlib")
         finally:
@@ -99,11 +100,10 @@ def drawing(style: str) -> Iterator[Any]:
     open. Gives a namespace with `subplots`.
     """
     matplotlib = import_matplotlib()
-    look = {
-        name: value
-        for name, value in matplotlib.rcParamsDefault.items()
-        if not name.startswith("backend")
-    }
+    look = dict[str, Any]()
+    for name, value in matplotlib.rcParamsDefault.items():
+        if not name.startswith("backend"):
+            look[name] = value
     for sheet in dict.fromkeys(("light", style)):
         look |= matplotlib.rc_params_from_file(
             STYLES / f"{sheet}.mplstyle", use_default_template=False
@@ -121,7 +121,10 @@ def subplots(
     rows: int = 1, columns: int = 1, *, squeeze: bool = True, **options: Any
 ) -> tuple[Any, Any]:
     """A figure and its axes; options are those of ``matplotlib.pyplot.subplots``."""
-    of_axes = {name: options.pop(name) for name in _OF_AXES if name in options}
+    of_axes = dict[str, Any]()
+    for name in _OF_AXES:
+        if name in options:
+            of_axes[name] = options.pop(name)
     figure = new_figure(**options)
     return figure, figure.subplots(rows, columns, squeeze=squeeze, **of_axes)
 
@@ -142,13 +145,14 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour for every agent: that of its memory, or a spare one where there is none or another
     agent has it.
     """
-    found: dict[str, str] = {}
+    colours: dict[str, str] = {}
     for place, name in enumerate(names):
         memory = name.lower().partition(" ")[0].rpartition("-")[2]
         colour = AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
-        free = [spare for spare in SPARE_COLOURS if spare not in found.values()]
-        found[name] = free[0] if colour in found.values() and free else colour
-    return found
+        taken = set(colours.values())
+        free = [spare for spare in SPARE_COLOURS if spare not in taken]
+        colours[name] = free[0] if colour in taken and free else colour
+    return colours
 
 
 def whiskers(value: Array, low: Array, high: Array) -> Any:
@@ -181,11 +185,11 @@ def seeds_note(
 
 
 def agents_by_task(
-    found: Mapping[tuple[str, str, str], Any],
+    values: Mapping[tuple[str, str, str], Any],
 ) -> dict[tuple[str, str], dict[str, Any]]:
     """(agent, game, twin) -> value, sorted by task: (game, twin) -> agent -> value."""
     tasks: dict[tuple[str, str], dict[str, Any]] = {}
-    for (agent, game, twin), value in found.items():
+    for (agent, game, twin), value in values.items():
         tasks.setdefault((game, twin), {})[agent] = value
     return tasks
 
@@ -198,8 +202,11 @@ def rows_of(**columns: Any) -> list[dict[str, Any]]:
         >>> rows_of(agent="lru", delay=[0, 1])
         [{'agent': 'lru', 'delay': 0}, {'agent': 'lru', 'delay': 1}]
     """
-    cells = (column.ravel().tolist() for column in np.broadcast_arrays(*columns.values()))
-    return [dict(zip(columns, row, strict=True)) for row in zip(*cells, strict=True)]
+    cells = [column.ravel().tolist() for column in np.broadcast_arrays(*columns.values())]
+    rows = []
+    for row in zip(*cells, strict=True):
+        rows.append(dict(zip(columns, row, strict=True)))
+    return rows
 
 
 def save(options: Options, picture: Picture) -> list[Path]:
@@ -212,15 +219,15 @@ def save(options: Options, picture: Picture) -> list[Path]:
     if picture.note:  # wrapped to the width of the figure
         label = figure.supxlabel(" ", fontsize="small", color=NEUTRAL)
         letters = int(figure.get_figwidth() * 72 / (0.56 * label.get_fontsize()))
-        label.set_text(
-            "\n".join(
-                line for part in picture.note.split("\n") for line in textwrap.wrap(part, letters)
-            )
-        )
-    for ending in [ending for ending in endings if ending in PICTURES]:
-        buffer = BytesIO()
-        figure.savefig(buffer, format=ending[1:])
-        written.append(write_atomic(base.with_name(base.name + ending), buffer.getvalue()))
+        lines = list[str]()
+        for line in picture.note.split("\n"):
+            lines += textwrap.wrap(line, letters)
+        label.set_text("\n".join(lines))
+    for ending in endings:
+        if ending in PICTURES:
+            buffer = BytesIO()
+            figure.savefig(buffer, format=ending[1:])
+            written.append(write_atomic(base.with_name(base.name + ending), buffer.getvalue()))
     if picture.rows:
         written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows))
     if picture.arrays and endings != NUMBERS:
@@ -239,9 +246,10 @@ def svg(figure: Any, name: str) -> str:
     text = re.sub(
         r' (?:width|height)="[\d.]+pt"| xmlns(?::xlink)?="[^"]*"| version="[\d.]+"', "", text
     )
-    text = re.sub(r"-?\d+\.\d{2,}", lambda found: f"{float(found[0]):.4g}", text)
+    text = re.sub(r"-?\d+\.\d{2,}", lambda number: f"{float(number[0]):.4g}", text)
     prefix = re.sub(r"\W+", "-", name)
-    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", re.sub(r">\s+<", "><", text))
+    text = re.sub(r">\s+<", "><", text)
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", text)
     return text.replace("<svg", f'<svg role="img" aria-label="{escape(printable(name))}"', 1)
 
 

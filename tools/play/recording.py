@@ -8,7 +8,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, pairwise
+from itertools import chain, pairwise, repeat
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,9 @@ Chooser = Callable[[Session], int]
 
 def scripted(name: str, game: Any, seed: int) -> Chooser:
     """The random player or an oracle of the games, one of `SCRIPTED`."""
-    player = (
-        RandomPlayer(seed)
-        if name == "random"
-        else make_oracle(game, "state" if name[0] == "s" else "frames")
-    )
+    player: Any = RandomPlayer(seed)
+    if name != "random":
+        player = make_oracle(game, "state" if name == "state-oracle" else "frames")
 
     def choose(session: Session) -> int:
         seen = session.view(partial=True) if name == "frames-oracle" else session.state
@@ -86,9 +84,10 @@ def recorded_frames(
 ) -> Iterator[Frame]:
     """Play a session to its end and give out its frames, the last of an episode ``hold`` times."""
     while not session.closed:
-        yield enlarge(session.frame, scale)
+        frame = enlarge(session.frame, scale)
+        yield frame
         if session.end is not None:
-            yield from (enlarge(session.frame, scale) for _ in range(hold - 1))
+            yield from repeat(frame, hold - 1)
             session.press(NEXT)
         elif session.steps >= max_steps:
             session.press(QUIT)
@@ -109,11 +108,10 @@ def write_gif(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     """Write an endless GIF. Frames of up to 256 colours, as the games' are, keep every pixel."""
     image = need("PIL.Image")
     buffer = io.BytesIO()
-    pictures = (image.fromarray(frame).quantize(256) for frame in frames)
+    pictures = (image.fromarray(frame).quantize(256) for frame in frames)  # one at a time
+    first = next(pictures)
     duration_ms = 10 * max(1, round(100 / fps))
-    next(pictures).save(
-        buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0
-    )
+    first.save(buffer, "GIF", save_all=True, append_images=pictures, duration=duration_ms, loop=0)
     return write_atomic(path, buffer.getvalue())
 
 
@@ -129,16 +127,8 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
     program = need("imageio_ffmpeg").get_ffmpeg_exe()
     rest = iter(frames)
     first = next(rest)
-    source = [
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{first.shape[1]}x{first.shape[0]}",
-        "-r",
-        str(fps),
-    ]
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {fps}".split()
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
         log = Path(folder) / "log"
@@ -160,11 +150,10 @@ def _moments(id: str, obs_size: int, seed: int, steps: int) -> Iterator[list[Fra
     state.
     """
     session = Session(compiled_game(id, obs_size, "default", {}), seed=seed)
-    choose = scripted(
-        "state-oracle" if "state" in session.game.oracles else "random", session.game, seed
-    )
+    player = "state-oracle" if "state" in session.game.oracles else "random"
+    choose = scripted(player, session.game, seed)
     while session.end is None and session.steps <= steps:
-        yield [session.view(partial)[0] for partial in (False, True)]
+        yield [session.view(partial=False)[0], session.view(partial=True)[0]]
         session.press(ACTION_NAMES[choose(session)])
 
 
@@ -172,7 +161,8 @@ def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]
     """Both twins of one moment in the middle of a game, played by the scripted player that sees the
     state.
     """
-    *_, last = _moments(id, obs_size, seed, min(steps, make(id, obs_size=obs_size).max_steps // 4))
+    middle = make(id, obs_size=obs_size).max_steps // 4
+    *_, last = _moments(id, obs_size, seed, min(steps, middle))
     return last
 
 
@@ -186,18 +176,24 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
             f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay "
             "below"
         )
-    columns = [np.vstack([_padded(frame, obs_size) for frame in moments[step]]) for step in steps]
+    columns = []
+    for step in steps:
+        full, partial = moments[step]
+        columns.append(np.vstack([_padded(full, obs_size), _padded(partial, obs_size)]))
     return np.hstack(columns)[:-GAP, :-GAP]
 
 
 def sheet(ids: Sequence[str], columns: int = 2) -> Frame:
     """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
-    games = [
-        np.hstack([_padded(frame, 256) for size in (256, 128) for frame in scene(id, size)])
-        for id in ids
-    ]
+    games = []
+    for id in ids:
+        frames = [*scene(id, 256), *scene(id, 128)]
+        games.append(np.hstack([_padded(frame, 256) for frame in frames]))
     games += [np.full_like(games[0], PAPER)] * (-len(games) % columns)
-    return np.vstack([np.hstack(games[at : at + columns]) for at in range(0, len(games), columns)])
+    lines = []
+    for first in range(0, len(games), columns):
+        lines.append(np.hstack(games[first : first + columns]))
+    return np.vstack(lines)
 
 
 def _padded(frame: Frame, height: int) -> Frame:
@@ -238,8 +234,10 @@ class EvaluationVideos:
                 episodes=1,
             )
             player = trained(agent, partial)
-            how = {"max_steps": self.max_steps, "hold": FILM_FPS, "scale": 2}
-            self._write(path, recorded_frames(session, player, **how), FILM_FPS)
+            frames = recorded_frames(
+                session, player, max_steps=self.max_steps, hold=FILM_FPS, scale=2
+            )
+            self._write(path, frames, FILM_FPS)
         except Exception as error:  # a training is worth more than its film
             self._failed = True
             warnings.warn(

@@ -22,8 +22,21 @@ from arcade_torch.tools.play.session import QUIT, Attempt, Session
 from arcade_torch.tools.text import csv_cell
 
 COLUMNS = (
-    *("model", "env", "difficulty", "observability", "return", "steps", "end", "attempt"),
-    *("seed", "actions", "game", "obs_size", "rules", "options", "player"),
+    "model",
+    "env",
+    "difficulty",
+    "observability",
+    "return",
+    "steps",
+    "end",
+    "attempt",
+    "seed",
+    "actions",
+    "game",
+    "obs_size",
+    "rules",
+    "options",
+    "player",
 )
 _WHOLE = re.compile(r"[0-9]{1,10}")
 
@@ -34,16 +47,19 @@ def score_row(
     """One line of the table."""
     env = game_of(game.id)
     return {
-        **{
-            name: getattr(attempt, name)
-            for name in ("observability", "steps", "end", "attempt", "seed", "actions")
-        },
-        **{name: getattr(game, name) for name in ("obs_size", "rules")},
         "model": "human",
         "env": env,
         "difficulty": game.id.removeprefix(env).partition("-")[0].lower(),
+        "observability": attempt.observability,
         "return": None if attempt.end == "abandoned" else attempt.total,
+        "steps": attempt.steps,
+        "end": attempt.end,
+        "attempt": attempt.attempt,
+        "seed": attempt.seed,
+        "actions": attempt.actions,
         "game": game.id,
+        "obs_size": game.obs_size,
+        "rules": game.rules,
         "options": json.dumps(dict(options), sort_keys=True),
         "player": player,
     }
@@ -76,8 +92,11 @@ def append_score(path: Path, row: Mapping[str, Any]) -> None:
 def next_seed(rows: list[dict[str, str]], game_id: str, player: str) -> int:
     """The first seed above all that a player has met in a game; 0 for the first."""
     written = csv_cell(player)
-    met = [int(row["seed"]) for row in rows if (row["game"], row["player"]) == (game_id, written)]
-    return max(met, default=-1) + 1
+    seeds = [-1]
+    for row in rows:
+        if (row["game"], row["player"]) == (game_id, written):
+            seeds.append(int(row["seed"]))
+    return max(seeds) + 1
 
 
 def replay(row: Mapping[str, Any]) -> Attempt:
@@ -86,7 +105,7 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     Raises:
         ValueError: the actions go on after the end, or the line is damaged.
     """
-    found = list[Attempt]()
+    attempts = list[Attempt]()
     actions = row["actions"]
     require(
         re.fullmatch(r"[0-4]+", actions) is not None,
@@ -103,11 +122,11 @@ def replay(row: Mapping[str, Any]) -> Attempt:
         game,
         seed=int(row["seed"]),
         partial=row["observability"] == "partial",
-        on_attempt=found.append,
+        on_attempt=attempts.append,
     )
     for number, action in enumerate(actions):
         if session.end is not None:
             raise ValueError(f"{len(actions)} actions, but the episode ends after {number}")
         session.press(ACTION_NAMES[int(action)])
     session.press(QUIT)
-    return found[0]
+    return attempts[0]

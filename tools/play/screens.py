@@ -26,21 +26,32 @@ WINDOW_KEYS = {
     "K_LEFT": "left",
     "K_RIGHT": "right",
     "K_SPACE": "fire",
+    "K_r": RESTART,
+    "K_p": TOGGLE,
+    "K_RETURN": NEXT,
+    "K_ESCAPE": QUIT,
 }
-WINDOW_KEYS |= {"K_r": RESTART, "K_p": TOGGLE, "K_RETURN": NEXT, "K_ESCAPE": QUIT}
 
-_ARROWS = dict(zip("ABCD", ("up", "down", "right", "left"), strict=True))
 TERMINAL_KEYS = {
-    **{
-        f"\x1b{prefix}{letter}".encode(): name
-        for prefix in "[O"
-        for letter, name in _ARROWS.items()
-    },
+    b"\x1b[A": "up",
+    b"\x1bOA": "up",
+    b"\x1b[B": "down",
+    b"\x1bOB": "down",
+    b"\x1b[C": "right",
+    b"\x1bOC": "right",
+    b"\x1b[D": "left",
+    b"\x1bOD": "left",
     b" ": "fire",
-    **dict.fromkeys((b"r", b"R"), RESTART),
-    **dict.fromkeys((b"p", b"P"), TOGGLE),
-    **dict.fromkeys((b"\r", b"\n"), NEXT),
-    **dict.fromkeys((b"\x1b", b"q", b"\x03", b"\x04"), QUIT),
+    b"r": RESTART,
+    b"R": RESTART,
+    b"p": TOGGLE,
+    b"P": TOGGLE,
+    b"\r": NEXT,
+    b"\n": NEXT,
+    b"\x1b": QUIT,
+    b"q": QUIT,
+    b"\x03": QUIT,  # Ctrl-C
+    b"\x04": QUIT,  # Ctrl-D
 }
 # up to the final byte of a sequence, or one byte
 _SEQUENCE = re.compile(rb"\x1b[\[O][^@-~]*[@-~]?|.", re.DOTALL)
@@ -75,7 +86,10 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
     keys = {getattr(pygame, constant): name for constant, name in WINDOW_KEYS.items()}
     try:
         window.show(session.frame, session.caption)
-        pygame.key.set_repeat(*((_DELAY_MS, key_repeat_ms) if key_repeat_ms else ()))
+        if key_repeat_ms:
+            pygame.key.set_repeat(_DELAY_MS, key_repeat_ms)
+        else:
+            pygame.key.set_repeat()
         while not session.closed:
             for event in pygame.event.get((pygame.QUIT, pygame.KEYDOWN)):
                 key = QUIT if event.type == pygame.QUIT else keys.get(event.key)
@@ -93,7 +107,8 @@ def play_in_terminal(session: Session) -> None:
     Raises:
         ValueError: standard input or output is no terminal, or the terminal cannot move its cursor.
     """
-    if (reason := why_no_terminal()) is not None:
+    reason = why_no_terminal()
+    if reason is not None:
         raise ValueError(f"playing needs a window or a terminal, and this is neither: {reason}")
     # before the terminal is changed: an interruption of imports ends the process at once
     need("PIL.Image")
@@ -116,7 +131,8 @@ def why_no_terminal() -> str | None:
     streams = {"standard input": sys.stdin, "standard output": sys.stdout}
     redirected = [name for name, stream in streams.items() if stream is None or not stream.isatty()]
     if redirected:
-        return f"{' and '.join(redirected)} {'are' if len(redirected) > 1 else 'is'} redirected"
+        verb = "are" if len(redirected) > 1 else "is"
+        return f"{' and '.join(redirected)} {verb} redirected"
     if os.environ.get("TERM", "") in ("dumb", "unknown"):
         return f"TERM is {os.environ['TERM']}, a terminal that shows no pictures"
     return None
@@ -149,14 +165,15 @@ def decode_keys(data: bytes) -> list[str]:
         >>> decode_keys(b"\\x1b[A p\\x1b")
         ['up', 'fire', 'toggle', 'quit']
     """
-    return [TERMINAL_KEYS[found] for found in _SEQUENCE.findall(data) if found in TERMINAL_KEYS]
+    return [TERMINAL_KEYS[code] for code in _SEQUENCE.findall(data) if code in TERMINAL_KEYS]
 
 
 def screen(session: Session, columns: int, rows: int) -> str:
     """What to write to the terminal to show a session."""
     picture = half_blocks(session.frame, 2 * max(1, rows - _TEXT_ROWS), columns)
-    text = [words[:columns] for words in (printable(session.caption), LEGEND)]
-    return "\x1b[H" + "\r\n".join(f"{line}\x1b[K" for line in [*picture, *text]) + "\x1b[J"
+    caption = printable(session.caption)
+    lines = [*picture, caption[:columns], LEGEND[:columns]]
+    return "\x1b[H" + "\x1b[K\r\n".join(lines) + "\x1b[K\x1b[J"
 
 
 def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
@@ -172,10 +189,9 @@ def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
     pixels = np.pad(pixels, ((0, len(pixels) % 2), (0, 0), (0, 0))).tolist()
     lines = []
     for upper, lower in zip(pixels[::2], pixels[1::2], strict=True):
-        runs = [
-            (colours, len(list(cells)))
-            for colours, cells in groupby(zip(upper, lower, strict=True))
-        ]
-        parts = [_COLOURS.format(*top, *bottom) + "\u2580" * count for (top, bottom), count in runs]
-        lines.append("".join(parts) + "\x1b[0m")
+        line = ""
+        for (top, bottom), cells in groupby(zip(upper, lower, strict=True)):
+            count = len(list(cells))
+            line += _COLOURS.format(*top, *bottom) + "\u2580" * count
+        lines.append(line + "\x1b[0m")
     return lines

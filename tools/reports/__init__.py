@@ -11,8 +11,8 @@ from typing import Any, get_args
 
 from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import pooled
-from arcade_torch.tools.analysis.gap_bias import GapBias, gap_and_bias, normalise
+from arcade_torch.tools.analysis.bootstrap import Interval, pooled
+from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias, normalise
 from arcade_torch.tools.comparable import Runs, check_comparable
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Part, Progress
@@ -21,7 +21,7 @@ from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
-from arcade_torch.tools.reports.panels import Finals, select_cells
+from arcade_torch.tools.reports.panels import Finals
 from arcade_torch.tools.runs import open_run
 from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -30,34 +30,6 @@ from arcade_torch.tools.studies.grid import Study
 MANY_PANELS = 8  # from here on pictures of learning are small
 # below this measured coverage a difference is one of the seeds that were run
 TRUSTED_COVERAGE = 0.85
-
-# Number of the table -> the fact; then how it goes on: a single seed, an interval without zero, one
-# with zero.
-SENTENCES = {
-    "gap": (
-        "Partial observability costs the memory-free agent {base:.2f} of normalised return and "
-        "{agent} {own:.2f}: ",
-        "a difference of {value:+.2f} with a single seed, which says nothing about others.",
-        "{where} {verb} the observability gap by {size:.2f} [{near:.2f}, {far:.2f}].",
-        "with memory the gap is {size:.2f} {side}, but the interval {ends} contains zero, so "
-        "{seeds} seeds do not "
-        "settle it.",
-    ),
-    "pomdp": (
-        "On the POMDP {agent} reaches a normalised return of {own:.2f}, the memory-free agent "
-        "{base:.2f}",
-        ".",
-        ", a difference of {value:+.2f} {ends}.",
-        "; the interval of the difference {ends} contains zero.",
-    ),
-    "bias": (
-        "On the MDP, where memory is not needed, {agent} {effect} {size:.2f} against the "
-        "memory-free agent",
-        ".",
-        " (bias {ends}).",
-        ", which is within the noise (bias {ends} contains zero).",
-    ),
-}
 
 Players = Mapping[str, Mapping[str, Baseline]]  # game -> player -> what it earned
 
@@ -90,107 +62,154 @@ def report(
         MissingPackage: jinja2 is not installed.
     """
     require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
-    if unknown := sorted(set(skip) - set(get_args(Part))):
+    unknown = sorted(set(skip) - set(get_args(Part)))
+    if unknown:
         raise ValueError(
             f"a report has no part {unknown[0]!r} to skip; parts: {', '.join(get_args(Part))}"
         )
-    jinja2 = need("jinja2")
+    environment = _environment()
     folder = StudyFolder(Path(root))
     study = folder.load()
     rows = folder.write_results(study)
-    started = [
-        folder.run(run).path
-        for run, row in zip(study.runs(), rows, strict=True)
-        if row["status"] == "finished"
-    ]
-    runs = Runs(tuple(run for path in started if (run := open_run(path)) is not None))
+    runs = _finished_runs(folder, study, rows)
     if not runs.runs:
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
     check_comparable(runs)
-    agents = list(dict.fromkeys(runs.names[run.key] for run in runs.runs))
-    finals = agents_by_task(
-        {task: [run.value("eval_final") for run in group] for task, group in runs.groups().items()}
-    )
-    cells, note = select_cells(runs, finals, study.baseline)
+    context: dict[str, Any] = {
+        "study": study,
+        "written": time.strftime("%Y-%m-%d %H:%M"),
+        "rows": rows,
+        "panels": panels,
+    }
     with drawing("light"):
-        context = {
-            "study": study,
-            "made": time.strftime("%Y-%m-%d %H:%M"),
-            "rows": rows,
-            **_learning(
-                runs,
-                finals,
-                agents,
-                _players(folder, runs, progress) if "references" not in skip else {},
-            ),
-            **_scores(folder, study, runs, metric),
-            **_repeat(folder, study, rows),
-            "note": note,
-            "strips": panels.saliency_strips(cells, progress) if "saliency" not in skip else [],
-            "recall": panels.recall_section(cells, agents, progress)
-            if "recall" not in skip
-            else None,
-            "contamination": None
-            if "contamination" in skip
-            else panels.contamination_section(cells, agents, progress),
-            "panels": panels,
-            "colours": {agent: f"c{place}" for place, agent in enumerate(agents)},
-            "palette": list(agent_colours(agents).values()),
-        }
-    loader = jinja2.PackageLoader("arcade_torch.tools")
-    strict = {"autoescape": True, "undefined": jinja2.StrictUndefined}
-    environment = jinja2.Environment(loader=loader, trim_blocks=True, lstrip_blocks=True, **strict)
-    environment.filters["commas"] = "{:,}".format
+        players: Players = {}
+        if "references" not in skip:
+            players = _players(folder, runs, progress)
+        context |= _parts(study, runs, players, skip, progress)
+        context |= _scores(folder, study, runs, metric)
+    context |= _repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
 
 
+def _environment() -> Any:
+    """What jinja2 renders the page with; a name that the template lacks is an error."""
+    jinja2 = need("jinja2")
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("arcade_torch.tools"),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["commas"] = "{:,}".format
+    return environment
+
+
+def _finished_runs(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]) -> Runs:
+    """The runs of a study that have finished, as its rows of results say."""
+    runs = []
+    for spec, row in zip(study.runs(), rows, strict=True):
+        if row["status"] == "finished":
+            run = open_run(folder.run(spec).path)
+            if run is not None:
+                runs.append(run)
+    return Runs(tuple(runs))
+
+
+def _parts(
+    study: Study, runs: Runs, players: Players, skip: Sequence[Part], progress: Progress | None
+) -> dict[str, Any]:
+    """What the agents learned, and what a look into some of them shows."""
+    agents = list(dict.fromkeys(runs.names[run.key] for run in runs.runs))
+    finals = _finals(runs)
+    parts = _learning(runs, finals, agents, players)
+    cells, note = panels.select_cells(runs, finals, study.baseline)
+    parts["note"] = note
+    parts["colours"] = {agent: f"c{place}" for place, agent in enumerate(agents)}
+    parts["palette"] = list(agent_colours(agents).values())
+    parts["strips"] = []
+    parts["recall"] = None
+    parts["contamination"] = None
+    if "saliency" not in skip:
+        parts["strips"] = panels.saliency_strips(cells, progress)
+    if "recall" not in skip:
+        parts["recall"] = panels.recall_section(cells, agents, progress)
+    if "contamination" not in skip:
+        parts["contamination"] = panels.contamination_section(cells, agents, progress)
+    return parts
+
+
+def _finals(runs: Runs) -> Finals:
+    """The final greedy returns of the seeds of every agent, by task."""
+    returns = {}
+    for cell, seeds in runs.groups().items():
+        returns[cell] = [run.value("eval_final") for run in seeds]
+    return agents_by_task(returns)
+
+
 def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Players:
     """What the players earn under the rules and options that the study was trained with."""
-    found = {}
-    configs = {run.game: run.config for run in reversed(runs.runs)}
-    for done, game in enumerate(dict.fromkeys(run.game for run in runs.runs), start=1):
-        rules = str(configs[game].get("rules", "default"))
-        options = dict(configs[game].get("env_options") or {})
-        found[game] = references(game, folder.analysis, rules, options)
+    players = {}
+    first_runs = {run.game: run for run in reversed(runs.runs)}
+    games = dict.fromkeys(run.game for run in runs.runs)
+    for done, game in enumerate(games, start=1):
+        config = first_runs[game].config
+        rules = str(config.get("rules", "default"))
+        options = dict(config.get("env_options") or {})
+        players[game] = references(game, folder.analysis, rules, options)
         if progress is not None:
-            progress("random policy and oracles", done, len(configs))
-    return found
+            progress("random policy and oracles", done, len(games))
+    return players
 
 
 def _learning(
     runs: Runs, finals: Finals, agents: Sequence[str], players: Players
 ) -> dict[str, Any]:
     """Curves, and the final greedy returns as sentences, rows and overviews."""
-    levels = {
-        game: {name: row.mean for name, row in rows.items()} for game, rows in players.items()
-    }
+    levels = dict[str, dict[str, float]]()
+    for game, baselines in players.items():
+        levels[game] = {player: baseline.mean for player, baseline in baselines.items()}
     sentences = list[str]()
     rows = list[dict[str, Any]]()
-    tables = dict[str, list[dict[str, Any]]]()
+    overviews = dict[str, list[dict[str, Any]]]()
     for (game, twin), by_agent in finals.items():
-        task = {"game": game, "twin": TWIN_NAMES[twin], "task": f"{game}-{twin}"}
         level = levels.get(game, {})
-        sentences.append(learning_sentence(game, twin, by_agent, level))
+        sentence = learning_sentence(game, twin, by_agent, level)
+        if sentence:
+            sentences.append(sentence)
+        task = {"game": game, "twin": TWIN_NAMES[twin], "task": f"{game}-{twin}"}
         cells: dict[str, Any] = dict.fromkeys(agents)
-        for agent, values in by_agent.items():
-            mean, low, high = map(float, pooled(values)[1:])
-            row = {"agent": agent, "mean": mean, "low": low, "high": high, "way": way(mean, level)}
-            rows.append(task | row | {"seeds": "  ".join(f"{value:.3f}" for value in values)})
-            cells[agent] = {
-                "value": mean,
-                "heat": round(100 * min(1.0, max(0.0, normalise(game, mean)))),
-            }
-        tables.setdefault(TWIN_NAMES[twin], []).append(task | {"cells": cells})
+        for agent, returns in by_agent.items():
+            row = _final_row(agent, returns, level)
+            rows.append(task | row)
+            share = min(1.0, max(0.0, normalise(game, row["mean"])))
+            cells[agent] = {"value": row["mean"], "heat": round(100 * share)}
+        overviews.setdefault(TWIN_NAMES[twin], []).append(task | {"cells": cells})
     small = len(finals) > MANY_PANELS
+    train_curves = [] if small else panels.curve_panels(runs, "train", levels, agents, small)
     return {
-        "learning": list(filter(None, sentences)),
+        "learning": sentences,
         "small": small,
         "curves": panels.curve_panels(runs, "eval", levels, agents, small),
-        "train_curves": [] if small else panels.curve_panels(runs, "train", levels, agents, small),
+        "train_curves": train_curves,
         "finals": rows,
-        "overviews": tables,
+        "overviews": overviews,
         "players": players,
+    }
+
+
+def _final_row(agent: str, returns: Sequence[float], levels: Mapping[str, float]) -> dict[str, Any]:
+    """The final returns of one agent on one task, for the table."""
+    summary = pooled(returns)
+    mean = float(summary.mean)
+    return {
+        "agent": agent,
+        "mean": mean,
+        "low": float(summary.low),
+        "high": float(summary.high),
+        "way": way(mean, levels),
+        "seeds": "  ".join(f"{value:.3f}" for value in returns),
     }
 
 
@@ -198,65 +217,108 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
     """Gap and bias by both metrics, also written as CSV, and what they say; or why there are
     none.
     """
-    found: dict[str, Any] = {
-        "trouble": "",
-        "table": None,
-        "second": None,
-        "sentences": [],
-        "caution": "",
-    }
-    for place, name in zip(
-        ("table", "second"), sorted(METRICS, key=lambda name: name != metric), strict=True
-    ):
+    tables = dict[str, GapBias]()
+    trouble = ""
+    for name in sorted(METRICS, key=lambda name: name != metric):
         try:
-            table = found[place] = gap_and_bias(
-                runs.scores(name), metric=name, baseline=study.baseline
-            )
-            write_csv(folder.analysis / f"gap_bias_{name}.csv", table.table())
+            tables[name] = gap_and_bias(runs.scores(name), metric=name, baseline=study.baseline)
+            write_csv(folder.analysis / f"gap_bias_{name}.csv", tables[name].table())
         except ValueError as error:
-            found["trouble"] = found["trouble"] or str(error)
-    if (table := found["table"]) is not None:
-        rows = [row for row in table.rows if table.baselines[row.agent] not in (None, row.agent)]
-        agents = [row.agent for row in sorted(rows, key=lambda row: -row.pomdp.value)]
-        found["sentences"] = [
-            score_sentence(table, name, agent) for agent in agents for name in SENTENCES
-        ]
-        found |= {"score_panels": panels.score_panels(table), "caution": coverage_sentence(table)}
-    return found
+            trouble = trouble or str(error)
+    table = tables.get(metric)
+    second = [tables[name] for name in tables if name != metric]
+    return {
+        "trouble": trouble,
+        "table": table,
+        "second": second[0] if second else None,
+        "sentences": _score_sentences(table) if table is not None else [],
+        "score_panels": panels.score_panels(table) if table is not None else [],
+        "caution": coverage_sentence(table) if table is not None else "",
+    }
+
+
+def _score_sentences(table: GapBias) -> list[str]:
+    """All findings, those about the agent with the highest return on the POMDP first."""
+    rows = []
+    for row in table.rows:
+        if table.baselines[row.agent] not in (None, row.agent):
+            rows.append(row)
+    rows.sort(key=lambda row: -row.pomdp.value)
+    sentences = []
+    for row in rows:
+        for name in SENTENCES:
+            sentences.append(score_sentence(table, name, row.agent))
+    return sentences
 
 
 def score_sentence(table: GapBias, name: str, agent: str) -> str:
     """One of `SENTENCES` about an agent with memory, and how sure it is."""
-    base = table.row(table.baselines[agent] or table.baseline)
-    row = table.row(agent)
-    difference = table.difference(
-        name, *((base.agent, agent) if name == "gap" else (agent, base.agent))
+    memory_free = table.row(table.baselines[agent] or table.baseline)
+    return SENTENCES[name](table, memory_free, table.row(agent))
+
+
+def gap_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What partial observability costs an agent with memory, and one without."""
+    fact = (
+        f"Partial observability costs the memory-free agent {memory_free.gap.value:.2f} of "
+        f"normalised return and {agent.agent} {agent.gap.value:.2f}"
     )
-    value, low, high = found = row.bias if name == "bias" else difference
-    fact, single, clear, vague = SENTENCES[name]
-    ending = single if low != low else clear if found.excludes_zero else vague
-    seeds = min(base.seeds, row.seeds)
-    weak = min(base.coverage, row.coverage) < TRUSTED_COVERAGE
-    near, far = sorted((abs(low), abs(high)))
-    return f"{fact}{ending}".format(
-        **{
-            "agent": agent,
-            "base": getattr(base, name).value,
-            "own": getattr(row, name).value,
-            "seeds": seeds,
-        },
-        **{
-            "value": value,
-            "size": abs(value),
-            "near": near,
-            "far": far,
-            "ends": f"[{low:+.2f}, {high:+.2f}]",
-        },
-        where=f"over these {seeds} seeds memory" if weak else "memory",
-        verb="narrows" if value > 0 else "widens",
-        side="smaller" if value > 0 else "larger",
-        effect="costs" if value < 0 else "adds",
+    difference = table.difference("gap", memory_free.agent, agent.agent)
+    size = abs(difference.value)
+    seeds = min(memory_free.seeds, agent.seeds)
+    if not difference.exists:
+        return (
+            f"{fact}: a difference of {difference.value:+.2f} with a single seed, which says "
+            "nothing about others."
+        )
+    if not difference.excludes_zero:
+        side = "smaller" if difference.value > 0 else "larger"
+        return (
+            f"{fact}: with memory the gap is {size:.2f} {side}, but the interval "
+            f"{_ends(difference)} contains zero, so {seeds} seeds do not settle it."
+        )
+    coverage = min(memory_free.coverage, agent.coverage)
+    memory = "memory" if coverage >= TRUSTED_COVERAGE else f"over these {seeds} seeds memory"
+    effect = "narrows" if difference.value > 0 else "widens"
+    near, far = sorted((abs(difference.low), abs(difference.high)))
+    return f"{fact}: {memory} {effect} the observability gap by {size:.2f} [{near:.2f}, {far:.2f}]."
+
+
+def pomdp_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What an agent with memory reaches where observations are partial, and one without."""
+    fact = (
+        f"On the POMDP {agent.agent} reaches a normalised return of {agent.pomdp.value:.2f}, the "
+        f"memory-free agent {memory_free.pomdp.value:.2f}"
     )
+    difference = table.difference("pomdp", agent.agent, memory_free.agent)
+    if not difference.exists:
+        return f"{fact}."
+    if difference.excludes_zero:
+        return f"{fact}, a difference of {difference.value:+.2f} {_ends(difference)}."
+    return f"{fact}; the interval of the difference {_ends(difference)} contains zero."
+
+
+def bias_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What memory costs where it is not needed."""
+    effect = "costs" if agent.bias.value < 0 else "adds"
+    fact = (
+        f"On the MDP, where memory is not needed, {agent.agent} {effect} "
+        f"{abs(agent.bias.value):.2f} against the memory-free agent"
+    )
+    if not agent.bias.exists:
+        return f"{fact}."
+    if agent.bias.excludes_zero:
+        return f"{fact} (bias {_ends(agent.bias)})."
+    return f"{fact}, which is within the noise (bias {_ends(agent.bias)} contains zero)."
+
+
+SENTENCES = {"gap": gap_sentence, "pomdp": pomdp_sentence, "bias": bias_sentence}
+"""The findings of a report, in their order: number of the table -> who writes its sentence."""
+
+
+def _ends(interval: Interval) -> str:
+    """An interval as a report writes it."""
+    return f"[{interval.low:+.2f}, {interval.high:+.2f}]"
 
 
 def coverage_sentence(table: GapBias) -> str:
@@ -279,7 +341,9 @@ def way(value: float, levels: Mapping[str, float]) -> float | None:
     """The share of the way from the random policy to the oracle; None where that is not known."""
     low = levels.get("random")
     high = levels.get("state")
-    return None if low is None or high is None or high == low else (value - low) / (high - low)
+    if low is None or high is None or high == low:
+        return None
+    return (value - low) / (high - low)
 
 
 def learning_sentence(
@@ -288,19 +352,22 @@ def learning_sentence(
     """Where the agents of one task ended between the random policy and the oracle; empty where that
     is not known.
     """
-    ways = {agent: way(sum(values) / len(values), levels) for agent, values in finals.items()}
-    if not ways or None in ways.values():
+    shares = list[str]()
+    below = list[str]()
+    for agent, returns in finals.items():
+        share = way(sum(returns) / len(returns), levels)
+        if share is None:
+            return ""
+        shares.append(f"{agent} {100 * share:.0f} %")
+        if min(returns) <= levels["random"]:
+            below.append(agent)
+    if not shares:
         return ""
-    said = ", ".join(
-        f"{agent} {100 * share:.0f} %" for agent, share in ways.items() if share is not None
-    )
-    below = [agent for agent, values in finals.items() if min(values) <= levels["random"]]
-    tail = (
-        f"; a seed of {' and of '.join(below)} did not get above random"
-        if below
-        else ", every seed above random"
-    )
-    return f"{game} {TWIN_NAMES[twin]}, share of the way from random to oracle: {said}{tail}."
+    task = f"{game} {TWIN_NAMES[twin]}"
+    fact = f"{task}, share of the way from random to oracle: {', '.join(shares)}"
+    if below:
+        return f"{fact}; a seed of {' and of '.join(below)} did not get above random."
+    return f"{fact}, every seed above random."
 
 
 def _repeat(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -308,36 +375,51 @@ def _repeat(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]
     share.
     """
     record = folder.record()
-    here = {run.name: folder.run(run) for run in study.runs()}
-    stated = {
-        name: flatten(run.config)
-        for name, run in here.items()
-        if (run.path / "config.json").exists()
-    }
-    names = {key for run in stated.values() for key in run}
-    default = {
-        key: value for key, value in flatten(TrainConfig().to_dict()).items() if key in names
-    }
-    # one that is missing has its default
-    settings = {name: default | run for name, run in stated.items()}
-    first = next(iter(settings.values()), {})
-    every = settings.values()
-    shared = {
-        key: value
-        for key, value in first.items()
-        if all(key in run and run[key] == value for run in every)
-    }
     commands = record["runs"] if isinstance(record.get("runs"), dict) else {}
-    details = []
-    for name, row in zip(here, rows, strict=True):
-        own = {key: value for key, value in settings.get(name, {}).items() if key not in shared}
-        details.append({"row": row, "name": name, "command": commands.get(name, ""), "own": own})
+    settings = _settings_of_runs(folder, study)
+    shared = _shared(list(settings.values()))
+    runs = []
+    for spec, row in zip(study.runs(), rows, strict=True):
+        different = {}
+        for key, value in settings.get(spec.name, {}).items():
+            if key not in shared:
+                different[key] = value
+        command = commands.get(spec.name, "")
+        runs.append({"row": row, "name": spec.name, "command": command, "settings": different})
     return {
         "shared": shared,
-        "runs": details,
+        "runs": runs,
         "versions": record.get("versions") or {},
         "also": record.get("also") or [],
         "command": record.get("command", ""),
         "report_command": command_line(["report", str(folder.root)]),
         "seconds": sum(float(row.get("seconds") or 0) for row in rows),
     }
+
+
+def _settings_of_runs(folder: StudyFolder, study: Study) -> dict[str, dict[str, Any]]:
+    """The settings of the runs by name, flat; one that a run does not name has its default."""
+    settings = dict[str, dict[str, Any]]()
+    names = set[str]()
+    for spec in study.runs():
+        run = folder.run(spec)
+        if (run.path / "config.json").exists():
+            settings[spec.name] = flatten(run.config)
+            names.update(settings[spec.name])
+    defaults = {}
+    for name, value in flatten(TrainConfig().to_dict()).items():
+        if name in names:
+            defaults[name] = value
+    return {run: defaults | values for run, values in settings.items()}
+
+
+def _shared(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The settings that have one value in all runs."""
+    if not settings:
+        return {}
+    first, *others = settings
+    shared = {}
+    for name, value in first.items():
+        if all(name in other and other[name] == value for other in others):
+            shared[name] = value
+    return shared

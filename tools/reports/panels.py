@@ -3,9 +3,11 @@
 All agents of a small study are looked into, and of a large one a few that stand for the rest.
 """
 
+import math
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -61,37 +63,41 @@ Cells = Mapping[tuple[str, str, str], Sequence[Path]]
 
 def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[Cells, str]:
     """The cells that are looked into, and a note on those that are not."""
-    groups = runs.groups()
-    paths = {
-        task: [run.path for run in group if (run.path / "checkpoints").is_dir()]
-        for task, group in groups.items()
-    }
-    bare = len(runs.runs) - sum(map(len, paths.values()))
-    notes = (
-        [f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into."]
-        if bare
-        else []
-    )
-    cells = {task: found[:MOST_SEEDS] for task, found in paths.items() if found}
-    most = max(map(len, paths.values()), default=0)
-    seeds = f"the first {MOST_SEEDS} of {most} seeds" if most > MOST_SEEDS else ""
+    cells = dict[tuple[str, str, str], list[Path]]()
+    bare = 0
+    most_seeds = 0
+    for task, group in runs.groups().items():
+        paths = [run.path for run in group if (run.path / "checkpoints").is_dir()]
+        bare += len(group) - len(paths)
+        most_seeds = max(most_seeds, len(paths))
+        if paths:
+            cells[task] = paths[:MOST_SEEDS]
+    notes = list[str]()
+    if bare:
+        notes.append(f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into.")
+    seeds = f"the first {MOST_SEEDS} of {most_seeds} seeds" if most_seeds > MOST_SEEDS else ""
     if len(cells) <= MOST_CELLS:
-        return cells, " ".join(notes + ([f"Shown: {seeds} of each agent."] if seeds else []))
+        if seeds:
+            notes.append(f"Shown: {seeds} of each agent.")
+        return cells, " ".join(notes)
     agents, games = representatives(finals, baseline)
-    out_of = (
-        f"{len({agent for agent, _, _ in cells})} agents and {len({game for _, game, _ in cells})} "
-        "games"
-    )
+    all_agents = {agent for agent, _, _ in cells}
+    all_games = {game for _, game, _ in cells}
+    selection = f"{' and '.join(agents)} on {', '.join(games)}"
+    if seeds:
+        selection += f", {seeds}"
     notes.append(
-        f"Shown: {' and '.join(agents)} on {', '.join(games)}{', ' + seeds if seeds else ''}, out "
-        f"of {out_of}: the "
+        f"Shown: {selection}, out of {len(all_agents)} agents and {len(all_games)} games: the "
         "memory with the highest mean return where observations are partial, beside the "
         "memory-free agent, on the "
         "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
     )
-    return {
-        task: found for task, found in cells.items() if task[0] in agents and task[1] in games
-    }, " ".join(notes)
+    selected = {}
+    for task, paths in cells.items():
+        agent, game, _ = task
+        if agent in agents and game in games:
+            selected[task] = paths
+    return selected, " ".join(notes)
 
 
 def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
@@ -103,73 +109,82 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
         >>> representatives({**both, ("B", "partial"): {"mlp": [0.5]}}, "mlp")
         (['mlp', 'lru'], ['A'])
     """
-    twin = "partial" if any(seen == "partial" for _, seen in finals) else "full"
-    means = {
-        game: {
-            agent: fmean([normalise(game, float(value)) for value in values])
-            for agent, values in agents.items()
-        }
-        for (game, seen), agents in finals.items()
-        if seen == twin
-    }
-    everybody = dict.fromkeys(agent for found in means.values() for agent in found)
-    free = [agent for agent in everybody if memory_free(agent, baseline)]
-    strength = {
-        agent: fmean([found[agent] for found in means.values() if agent in found])
-        for agent in everybody
-    }
-    best = sorted(
-        (agent for agent in everybody if agent not in free), key=lambda agent: -strength[agent]
-    )
-    pair = [*free[:1], *(best[:1])]
-    there = [game for game, found in means.items() if all(agent in found for agent in pair)]
-    there.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
-    return pair, there[:MOST_GAMES]
+    twin = "partial" if any(name == "partial" for _, name in finals) else "full"
+    means: dict[str, dict[str, float]] = {}  # game -> agent -> normalised return
+    returns: dict[str, list[float]] = {}  # agent -> normalised returns, one a game
+    for (game, name), agents in finals.items():
+        if name != twin:
+            continue
+        means[game] = {}
+        for agent, values in agents.items():
+            mean = fmean([normalise(game, float(value)) for value in values])
+            means[game][agent] = mean
+            returns.setdefault(agent, []).append(mean)
+    free = [agent for agent in returns if memory_free(agent, baseline)]
+    remembering = [agent for agent in returns if agent not in free]
+    remembering.sort(key=lambda agent: -fmean(returns[agent]))
+    pair = [*free[:1], *remembering[:1]]
+    games = [game for game, agents in means.items() if set(pair) <= set(agents)]
+    games.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
+    return pair, games[:MOST_GAMES]
 
 
 def curve_panels(
     runs: Runs, kind: str, levels: Levels, agents: Sequence[str], small: bool
 ) -> list[dict[str, str]]:
     """One picture a task, with what stands below it; the twins of a game share their y axis."""
-    every = logs.curves_of_runs(runs.groups(), kind)
+    curves = logs.curves_of_runs(runs.groups(), kind)
+    returns_of_game: dict[str, list[float]] = {}
+    for (_, game, _), curve in curves.items():
+        returns_of_game.setdefault(game, []).extend(curve.returns.seeds.flat)
     panels = []
-    for (game, twin), here in style.agents_by_task(every).items():
-        seen = np.concatenate(
-            [curve.returns.seeds.ravel() for task, curve in every.items() if task[1] == game]
-        )
+    for (game, twin), by_agent in style.agents_by_task(curves).items():
         means = levels.get(game, {})
-        low = min([seen.min(), *means.values()])
-        high = max([seen.max(), *means.values()])
+        inside = [*returns_of_game[game], *means.values()]
+        low = min(inside)
+        high = max(inside)
         margin = 0.07 * (high - low) or 0.5
-        shown: dict[str, float] = {}
-        for player, mean in means.items():
-            if (player, twin) != ("frames", "full"):  # lines that lie on one another share a label
-                near = next(
-                    (name for name, at in shown.items() if abs(at - mean) < 2 * margin), None
-                )
-                name = LEVEL_NAMES[player]
-                shown |= {name: mean} if near is None else {f"{near}, {name}": shown.pop(near)}
-        figure, ((axis,),) = style.panels(1, 1, SMALL if small else FULL)
-        logs.plot(here, axis, agents, shown)
+        figure, axes = style.panels(1, 1, SMALL if small else FULL)
+        axis = axes[0, 0]
+        logs.plot(by_agent, axis, agents, _named_levels(means, twin, 2 * margin))
         axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")
-        counts = sorted({len(curve.returns.seeds) for curve in here.values()})
-        seeds = " or ".join(map(str, counts)) + (" seed" if counts == [1] else " seeds")
-        caption = f"mean of {seeds}" + ("; band: interval over seeds" if counts != [1] else "")
         picture = style.svg(figure, f"{kind} {game}, {TWIN_NAMES[twin]}")
-        panels.append(
-            {"picture": picture, "caption": "" if small else caption, "task": f"{game}-{twin}"}
-        )
+        caption = "" if small else _curve_caption(list(by_agent.values()))
+        panels.append({"picture": picture, "caption": caption, "task": f"{game}-{twin}"})
     return panels
+
+
+def _named_levels(means: Mapping[str, float], twin: str, apart: float) -> dict[str, float]:
+    """Name the lines of the players; lines less than ``apart`` from each other share one."""
+    levels = dict[str, float]()
+    for player, mean in means.items():
+        if (player, twin) == ("frames", "full"):
+            continue  # on the MDP it sees what the other oracle sees
+        name = LEVEL_NAMES[player]
+        close = [label for label, level in levels.items() if abs(level - mean) < apart]
+        if close:
+            levels[f"{close[0]}, {name}"] = levels.pop(close[0])
+        else:
+            levels[name] = mean
+    return levels
+
+
+def _curve_caption(curves: Sequence[logs.Curve]) -> str:
+    """How many seeds are behind the curves of a panel."""
+    counts = sorted({len(curve.returns.seeds) for curve in curves})
+    if counts == [1]:
+        return "mean of 1 seed"
+    return f"mean of {' or '.join(map(str, counts))} seeds; band: interval over seeds"
 
 
 def score_panels(table: GapBias) -> list[str]:
     """Pictures of normalised returns on both twins, Gap and Bias."""
-    found = []
+    pictures = []
     for name in gap_bias.PANELS:
-        figure, ((axis,),) = style.panels(1, 1, FULL)
-        gap_bias.plot_bars(table.rows, axis, name)
-        found.append(style.svg(figure, name))
-    return found
+        figure, axes = style.panels(1, 1, FULL)
+        gap_bias.plot_bars(table.rows, axes[0, 0], name)
+        pictures.append(style.svg(figure, name))
+    return pictures
 
 
 def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, Any]]:
@@ -178,21 +193,25 @@ def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, A
     """
     strips = []
     for done, ((agent, game, twin), paths) in enumerate(cells.items(), start=1):
-        _, found = measure_run(paths[0], episode_saliency, {"show": SHOW, "tries": TRIES})
-        shares = 100 * found.shares()
-        count = min(SHOW, len(found.frames))
-        figure, axes = style.panels(-(-count // 4), 4, (4.8, 1.4 * -(-count // 4)))
+        _, episode = measure_run(paths[0], episode_saliency, {"show": SHOW, "tries": TRIES})
+        shares = 100 * episode.shares()
+        count = min(SHOW, len(episode.frames))
+        lines = math.ceil(count / 4)
+        figure, axes = style.panels(lines, 4, (4.8, 1.4 * lines))
         for axis in axes.flat[count:]:
             axis.set_axis_off()
-        peak = saliency.plot(found.frames, found.maps, axes.flat[:count], below=shares)
-        what = {
-            "agent": agent,
-            "game": game,
-            "twin": twin,
-            "frames": len(shares),
-            "last_share": shares[-1],
-        }
-        strips.append(what | {"peak": peak, "source": b64encode(style.png(figure)).decode("ascii")})
+        peak = saliency.plot(episode.frames, episode.maps, axes.flat[:count], below=shares)
+        strips.append(
+            {
+                "agent": agent,
+                "game": game,
+                "twin": twin,
+                "frames": len(shares),
+                "last_share": shares[-1],
+                "peak": peak,
+                "source": b64encode(style.png(figure)).decode("ascii"),
+            }
+        )
         if progress is not None:
             progress("saliency", done, len(cells))
     return strips
@@ -202,64 +221,79 @@ def recall_section(
     cells: Cells, agents: Sequence[str], progress: Progress | None
 ) -> dict[str, Any]:
     """Recall density of every cell, a picture a task; numbers are kept in the run folders."""
+    colours = agent_colours(agents)
 
-    def summary(measured: Sequence[tuple[Any, recall.RecallDensity]]) -> tuple[Any, dict[str, Any]]:
-        found = [density for _, density in measured if density.shares]
-        shares = [share for density in found for share in density.shares]
-        if not found:
-            raise ValueError("no episode of three frames")
-        row = {
-            "seeds": len(found),
-            "episodes": len(shares),
-            "length": np.mean([s.size for s in shares]),
-        }
-        row |= {"last": np.mean([s[-1] for s in shares]), "first": np.mean([s[0] for s in shares])}
-        return found, row | {"older": np.mean([density.mass(2)[0] for density in found])}
-
-    def plot(here: Mapping[str, Any], axis: Any) -> None:
-        bins = min(
-            BINS, *(int(density.lengths.min()) for found in here.values() for density in found)
-        )
-        colours = agent_colours(agents)
-        masses = {
-            agent: pooled([density.mass(bins) for density in found])
-            for agent, found in here.items()
-        }
-        recall_density.plot(
-            {agent: (mass, colours[agent]) for agent, mass in masses.items()}, axis, bins
-        )
+    def plot(by_agent: Mapping[str, Sequence[recall.RecallDensity]], axis: Any) -> None:
+        shortest = min(_shortest(densities) for densities in by_agent.values())
+        bins = min(BINS, shortest)
+        series = {}
+        for agent, densities in by_agent.items():
+            mass = pooled([density.mass(bins) for density in densities])
+            series[agent] = (mass, colours[agent])
+        recall_density.plot(series, axis, bins)
         axis.set_xlabel("time in the episode (1: the decision)")
 
-    return _section(
-        "recall density", cells, (recall.recall_density, DENSITY), summary, plot, progress
-    )
+    measure = (recall.recall_density, DENSITY)
+    return _section("recall density", cells, measure, _recall_row, plot, progress)
+
+
+def _shortest(densities: Sequence[recall.RecallDensity]) -> int:
+    """The number of frames of the shortest trajectory."""
+    return min(int(density.lengths.min()) for density in densities)
+
+
+def _recall_row(
+    measured: Sequence[tuple[Any, recall.RecallDensity]],
+) -> tuple[list[recall.RecallDensity], dict[str, Any]]:
+    """The densities of seeds that have a trajectory, and their row of the table."""
+    densities = [density for _, density in measured if density.lengths.size]
+    if not densities:
+        raise ValueError("no episode of three frames")
+    shares = list(chain.from_iterable(density.shares for density in densities))
+    row = {
+        "seeds": len(densities),
+        "episodes": len(shares),
+        "length": np.mean([share.size for share in shares]),
+        "last": np.mean([share[-1] for share in shares]),
+        "first": np.mean([share[0] for share in shares]),
+        "older": np.mean([density.mass(2)[0] for density in densities]),
+    }
+    return densities, row
 
 
 def contamination_section(
     cells: Cells, agents: Sequence[str], progress: Progress | None
 ) -> dict[str, Any]:
     """Share of decisions that one noisy frame changes, by delay; a picture a task."""
+    colours = agent_colours(agents)
 
-    def summary(measured: Sequence[tuple[Any, noise.Contamination]]) -> tuple[Any, dict[str, Any]]:
-        found = [one for _, one in measured]
-        (every,) = contamination.pool(by_task(measured)).values()
-        later = np.ma.masked_invalid(
-            np.concatenate([item.flip[:, 0, 1:].ravel() for item in found])
-        ).mean()
-        row = {"seeds": len(found), "points": sum(len(item.points) for item in found)}
-        row |= {"at_once": every["flip"].mean[0, 0], "one": every["flip"].mean[0, 1]}
-        return every, row | {
-            "later": float(np.ma.filled(later, np.nan)),
-            "change": every["change"].mean[0, 1],
-        }
-
-    def plot(here: Mapping[str, Any], axis: Any) -> None:
-        delays = NOISE["delays"][: contamination.reached(here.values())]
-        contamination.plot(here, axis, "flip", 0, delays, agent_colours(agents))
+    def plot(by_agent: Mapping[str, contamination.Measures], axis: Any) -> None:
+        delays = NOISE["delays"][: contamination.reached(by_agent.values())]
+        contamination.plot(by_agent, axis, "flip", 0, delays, colours)
         contamination.from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    return _section("contamination", cells, (noise.contamination, NOISE), summary, plot, progress)
+    measure = (noise.contamination, NOISE)
+    return _section("contamination", cells, measure, _contamination_row, plot, progress)
+
+
+def _contamination_row(
+    measured: Sequence[tuple[Any, noise.Contamination]],
+) -> tuple[contamination.Measures, dict[str, Any]]:
+    """The measures of one cell pooled over its seeds, and its row of the table."""
+    measures = next(iter(contamination.pool(by_task(measured)).values()))
+    seeds = [seed for _, seed in measured]
+    later = np.concatenate([seed.flip[:, 0, 1:].ravel() for seed in seeds])
+    flip = measures["flip"].mean[0]
+    row = {
+        "seeds": len(seeds),
+        "points": sum(len(seed.points) for seed in seeds),
+        "at_once": flip[0],
+        "one": flip[1],
+        "later": float(np.ma.filled(np.ma.masked_invalid(later).mean(), np.nan)),
+        "change": measures["change"].mean[0, 1],
+    }
+    return measures, row
 
 
 def _section(
@@ -267,7 +301,7 @@ def _section(
     cells: Cells,
     measure: tuple[Callable[..., Any], Mapping[str, Any]],
     summary: Callable[[Any], tuple[Any, dict[str, Any]]],
-    plot: Callable[[Mapping[str, Any], Any], None],
+    plot: Callable[[Any, Any], None],
     progress: Progress | None,
 ) -> dict[str, Any]:
     """Measure every cell for a row of the table, and draw the agents of each task in one picture;
@@ -286,9 +320,11 @@ def _section(
             notes.append(f"{agent} on {game} {TWIN_NAMES[twin]}: {error}")
         else:
             rows.append({"agent": agent, "game": game, "twin": TWIN_NAMES[twin]} | row)
-    for (game, twin), here in style.agents_by_task(drawn).items():
-        figure, ((axis,),) = style.panels(1, 1, SMALL)
-        plot(here, axis)
-        axis.set_title(title := f"{game}, {TWIN_NAMES[twin]}")
+    for (game, twin), by_agent in style.agents_by_task(drawn).items():
+        figure, axes = style.panels(1, 1, SMALL)
+        axis = axes[0, 0]
+        plot(by_agent, axis)
+        title = f"{game}, {TWIN_NAMES[twin]}"
+        axis.set_title(title)
         pictures.append(style.svg(figure, f"{name} {title}"))
     return {"pictures": pictures, "rows": rows, "notes": notes}

@@ -80,10 +80,9 @@ class Job(NamedTuple):
         load_extensions()  # of the process that made the job
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
-        if (
-            train(TrainConfig.from_dict(read_json(self.config)), self.folder, resume=True).status
-            == "interrupted"
-        ):
+        config = TrainConfig.from_dict(read_json(self.config))
+        result = train(config, self.folder, resume=True)
+        if result.status == "interrupted":
             raise KeyboardInterrupt
 
     def attempt(self) -> tuple[str, str]:
@@ -154,17 +153,19 @@ class Processes:
         # Fewer workers go where there is room: another study, or shard, may be at work on the same
         # machine.
         shared = [set(cores)] * min(self.workers, len(waiting))
-        free = [{core} for core in cores] if self.workers in (0, len(cores)) else shared
+        alone = [{core} for core in cores]
+        free = alone if self.workers in (0, len(cores)) else shared
         try:
             while waiting or active:
                 while waiting and free:
                     job = waiting.pop(0)
                     where = free.pop(0)
                     active[self._start(job, where)] = job, where
-                for process in [each for each in active if each.poll() is not None]:
-                    job, where = active.pop(process)
-                    free.append(where)
-                    yield JobResult(job.name, _error(process.returncode, job.log))
+                for process in list(active):
+                    if process.poll() is not None:
+                        job, where = active.pop(process)
+                        free.append(where)
+                        yield JobResult(job.name, _error(process.returncode, job.log))
                 time.sleep(self.poll_s)
         finally:
             for process in active:
@@ -179,14 +180,17 @@ class Processes:
 
     def _start(self, job: Job, cores: set[int]) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
-        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        environment = dict(os.environ)
+        for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            environment[variable] = "1"
+        environment[PARENT_VARIABLE] = str(os.getpid())
         with open_append(job.log) as log:
             process = subprocess.Popen(
                 [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **threads, PARENT_VARIABLE: str(os.getpid())},
+                env=environment,
                 # the terminal's Ctrl-C goes to the study alone, which then stops its workers
                 start_new_session=True,
             )
@@ -269,16 +273,13 @@ class Ray(RayOptions):
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs as there is room; on Ctrl-C or close each run gets time to save."""
         with self._cluster() as ray:
-            have = ray.cluster_resources()
-            cpus = have.get("CPU", 0)
-            gpus = have.get("GPU", 0)
+            resources = ray.cluster_resources()
+            cpus = resources.get("CPU", 0)
+            gpus = resources.get("GPU", 0)
             if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
-                wanted = (
-                    f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this "
-                    "machine has"
-                )
                 raise ValueError(
-                    f"{wanted} {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run"
+                    f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this "
+                    f"machine has {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run"
                 )
             options = {
                 "num_cpus": self.cpus_per_run,
@@ -368,10 +369,10 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     if not shared:
         # another attempt finds it again
         key = hashlib.sha256(f"{job.config}".encode() + config).hexdigest()[:16]
-        here = (
-            Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}" / f"{job.name}-{key}"
-        )
-        job = job._replace(folder=here / "run", config=write_atomic(here / "config.json", config))
+        disk = Path(tempfile.gettempdir()) / f"arcade-torch-{getpass.getuser()}"
+        folder = disk / f"{job.name}-{key}"
+        file = write_atomic(folder / "config.json", config)
+        job = job._replace(folder=folder / "run", config=file)
     error, trace = job.attempt()
     if not shared:
         kept = _NOT_SENT | ({"checkpoints"} if error else set())

@@ -14,6 +14,7 @@
 """
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,58 +102,74 @@ class StudyFolder:
         and refuse other settings themselves. A folder with other files, or a study or a finished
         run with other settings, is refused by a ``FileExistsError``.
         """
-        old: dict[str, Any] = {}
+        file = self.root / "study.json"
         # Looked at before study.json, which another shard may be about to write.
         foreign = self.root.exists() and not all(
-            each.name.startswith(".study.json.") for each in self.root.iterdir()
+            path.name.startswith(".study.json.") for path in self.root.iterdir()
         )
-        if (self.root / "study.json").exists():
+        old: dict[str, Any] = {}
+        if file.exists():
             with contextlib.suppress(ValueError):
                 old = self.record()
-            before = self.load() if old else study
-            was = before.fixed()
-            now = study.fixed()
-            names = {run.name for run in study.runs()}
-            what = [
-                f"study {before.name!r} with {k} = {was[k]!r}, not {now[k]!r}"
-                for k in now
-                if was[k] != now[k]
-            ]
-            what += [
-                f"run {run.name}, which this study lacks"
-                for run in before.runs()
-                if run.name not in names
-            ]
-            if what:
-                raise FileExistsError(f"{self.root} holds {what[0]}: choose another --out")
+            if old:
+                self._check_same(self.load(), study)
         elif foreign:
             raise FileExistsError(
                 f"{self.root} is not empty and holds no study: choose another --out"
             )
+        self._check_finished(study)
+        new = self._new_record(study, command, old)
+        if new != old:
+            write_json(file, new)
+
+    def _check_same(self, before: Study, study: Study) -> None:
+        """Refuse a study that has other settings than the one that stands here, or fewer runs."""
+        was = before.fixed()
+        now = study.fixed()
+        for name in now:
+            if was[name] != now[name]:
+                raise FileExistsError(
+                    f"{self.root} holds study {before.name!r} with {name} = {was[name]!r}, not "
+                    f"{now[name]!r}: choose another --out"
+                )
+        names = {run.name for run in study.runs()}
+        for run in before.runs():
+            if run.name not in names:
+                raise FileExistsError(
+                    f"{self.root} holds run {run.name}, which this study lacks: choose another "
+                    "--out"
+                )
+
+    def _check_finished(self, study: Study) -> None:
+        """Refuse a finished run that has other settings than the study says."""
         finished = [spec for spec in study.runs() if self.run(spec).final is not None]
         for spec, config in study.configs(finished).items():
             run = self.run(spec)
-            if fields := _other_settings(run, config):
+            fields = _other_settings(run, config)
+            if fields:
                 raise FileExistsError(
                     f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
                 )
-        jobs = [self.job(run) for run in study.runs()]
-        commands = {job.name: command_line(["train", *job.words]) for job in jobs}
-        here = versions()
-        # what the first runs were made with stays on record
-        first = old.get("versions", here)
+
+    def _new_record(self, study: Study, command: str, old: dict[str, Any]) -> dict[str, Any]:
+        """What ``study.json`` is to hold; the versions of the first runs stay on record."""
+        commands = dict[str, str]()
+        for run in study.runs():
+            job = self.job(run)
+            commands[job.name] = command_line(["train", *job.words])
+        current = versions()
+        first = old.get("versions", current)
         also = old.get("also")
         also = list(also) if isinstance(also, list) else []
-        also += [] if here in (first, *also) else [here]
-        made = {
+        if current not in (first, *also):
+            also.append(current)
+        return {
             "study": study.to_dict(),
             "command": command,
             "versions": first,
             "also": also,
             "runs": commands,
         }
-        if made != old:
-            write_json(self.root / "study.json", made)
 
     def write_results(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
         """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both,
@@ -169,41 +186,49 @@ class StudyFolder:
                 finished[run] = row
             rows.append(row)
         write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
-        write_csv(
-            self.root / "timings.csv",
-            [row for row in rows if row["seconds"] is not None],
-            TIMING_COLUMNS,
-        )
+        timed = [row for row in rows if row["seconds"] is not None]
+        write_csv(self.root / "timings.csv", timed, TIMING_COLUMNS)
         return rows
 
     def _row(self, spec: RunSpec) -> Row:
         run = self.run(spec)
-        error = ""
         row: Row = dict.fromkeys((*RESULT_COLUMNS, *TIMING_COLUMNS))
-        row |= {"run": spec.name, "frames": run.progress()[0]} | {
-            name: getattr(spec, name) for name in _CELL
-        }
-        if final := run.final:
-            mean = float(final["mean"])
-            returns = [float(value) for value in final["returns"]]
-            squares = sum((value - mean) ** 2 for value in returns)
-            # of one episode there is none
-            spread = (squares / (len(returns) - 1)) ** 0.5 if len(returns) > 1 else None
-            row |= {
-                name: final[name]
-                for name in ("frames", "seconds", "train_max_ewm")
-                if name in final
-            }
-            row |= {"eval_mean": mean, "eval_std": spread, "eval_n": len(returns)}
+        row["run"] = spec.name
+        row["frames"] = run.progress()[0]
+        for name in _CELL:
+            row[name] = getattr(spec, name)
+        final = run.final
+        if final:
+            row |= _final_columns(final)
+            row["status"] = "finished"
+            row["error"] = ""
         else:
-            # there is none, or it is damaged
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                error = str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
-        begun = "unfinished" if run.path.exists() else "waiting"
-        return row | {
-            "error": error,
-            "status": "finished" if final else "failed" if error else begun,
-        }
+            row["error"] = self._failure(spec)
+            unfinished = "unfinished" if run.path.exists() else "waiting"
+            row["status"] = "failed" if row["error"] else unfinished
+        return row
+
+    def _failure(self, spec: RunSpec) -> str:
+        """Why a run failed; empty if it did not, or its file is damaged."""
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
+        return ""
+
+
+def _final_columns(final: Mapping[str, Any]) -> Row:
+    """The columns of a finished run."""
+    columns = Row()
+    for name in ("frames", "seconds", "train_max_ewm"):
+        if name in final:
+            columns[name] = final[name]
+    mean = float(final["mean"])
+    returns = [float(value) for value in final["returns"]]
+    columns["eval_mean"] = mean
+    columns["eval_n"] = len(returns)
+    if len(returns) > 1:  # one episode has no spread
+        squares = sum((value - mean) ** 2 for value in returns)
+        columns["eval_std"] = (squares / (len(returns) - 1)) ** 0.5
+    return columns
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
@@ -211,6 +236,5 @@ def _other_settings(run: Run, plan: TrainConfig) -> list[str]:
     refused.
     """
     described(run)
-    return differing_fields(
-        run.config | {"env": resolve_id(run.game)}, replace(plan, env=resolve_id(plan.env)), FREE
-    )
+    config = run.config | {"env": resolve_id(run.game)}
+    return differing_fields(config, replace(plan, env=resolve_id(plan.env)), FREE)

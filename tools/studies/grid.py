@@ -30,15 +30,20 @@ def _text(allowed: str, form: str) -> Any:
 
 
 _AXES: dict[str, Any] = {
-    **dict.fromkeys(("games", "memories", "algorithms"), _text(_FOLDERS, _FOLDER)),
+    "games": _text(_FOLDERS, _FOLDER),
+    "memories": _text(_FOLDERS, _FOLDER),
+    "algorithms": _text(_FOLDERS, _FOLDER),
     "observability": _text("full, partial or both", "full|partial"),
     "seeds": Annotated[int, Range("0 or more and below 2**32", lambda seed: 0 <= seed < 2**32)],
     "sizes": _text("layers x width, such as '2x512'", r"[1-9]\d{0,8}x[1-9]\d{0,8}"),
 }
 """Axis -> what its values may be."""
 _OTHERS = {
-    **{"name": _text("made of letters, digits, dots and dashes", _FOLDER), "settings": Options},
-    **dict.fromkeys(("preset", "baseline", "question"), str),
+    "name": _text("made of letters, digits, dots and dashes", _FOLDER),
+    "settings": Options,
+    "preset": str,
+    "baseline": str,
+    "question": str,
 }
 """The same of what is no axis."""
 _FRAMES = Annotated[int, Range("from 1 to 10**15", lambda frames: 1 <= frames <= 10**15)]
@@ -96,8 +101,9 @@ class Study:
             object.__setattr__(self, name, coerce(name, getattr(self, name), kind))
         for axis in _AXES:
             object.__setattr__(self, axis, _axis(axis, getattr(self, axis)))
-        if wrong := [name for name in self.settings if name in _GRID]:
-            raise ValueError(f"settings may not hold {wrong[0]!r}: the grid decides it")
+        for name in self.settings:
+            if name in _GRID:
+                raise ValueError(f"settings may not hold {name!r}: the grid decides it")
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)
         if self.total_frames is not None:
@@ -112,9 +118,11 @@ class Study:
         """
         require(isinstance(values, Mapping), "a study", values, "a table of names and values")
         known = [item.name for item in fields(cls)]
-        if unknown := [key for key in values if key not in known]:
-            raise ValueError(f"unknown key {unknown[0]!r} in a study; known are {', '.join(known)}")
-        if missing := [key for key in ("name", "games", "memories", "seeds") if key not in values]:
+        for key in values:
+            if key not in known:
+                raise ValueError(f"unknown key {key!r} in a study; known are {', '.join(known)}")
+        missing = [key for key in ("name", "games", "memories", "seeds") if key not in values]
+        if missing:
             raise ValueError(f"a study needs {', '.join(missing)}")
         return cls(**values)
 
@@ -139,19 +147,17 @@ class Study:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for a JSON file; `from_dict` reads them back."""
-        return {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in asdict(self).items()
-        }
+        values = asdict(self)
+        for name in _AXES:
+            values[name] = list(values[name])
+        return values
 
     def require_baseline(self) -> None:
         """Refuse a memory-free agent that the study does not train: there would be no Bias to
         report.
         """
-        keys = [
-            AgentKey(algorithm, memory) for algorithm in self.algorithms for memory in self.memories
-        ]
-        names = list(agent_names(keys).values())
+        agents = product(self.algorithms, self.memories)
+        names = list(agent_names(AgentKey(*agent) for agent in agents).values())
         if not find_baselines(names, self.baseline):
             raise ValueError(
                 f"baseline = {self.baseline!r} is none of the agents that this study trains, "
@@ -173,16 +179,16 @@ class Study:
         """All cells; seeds vary slowest, so that an unfinished study holds every agent once before
         any twice.
         """
-        sizes = {
-            memory: self.sizes if memory != self.baseline and self.sizes else ("",)
-            for memory in self.memories
-        }
-        agents = [(memory, size) for memory in self.memories for size in sizes[memory]]
+        agents = list[tuple[str, str]]()
+        for memory in self.memories:
+            sized = bool(self.sizes) and memory != self.baseline
+            for size in self.sizes if sized else ("",):
+                agents.append((memory, size))
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
-        return [
-            RunSpec(game, twin, agent[0], algo, seed, agent[1])
-            for seed, game, algo, agent, twin in cells
-        ]
+        runs = []
+        for seed, game, algorithm, (memory, size), twin in cells:
+            runs.append(RunSpec(game, twin, memory, algorithm, seed, size))
+        return runs
 
     def configs(self, runs: Iterable[RunSpec]) -> dict[RunSpec, TrainConfig]:
         """The configs of some runs; seeds of one cell share all that was checked, but for the
@@ -202,25 +208,28 @@ class Study:
         """The config of one run; with one torch thread unless told, so that results are equal
         everywhere.
         """
-        others = set(self.algorithms) - {run.algorithm}
-        changes = {"threads": 1} | {
-            name: value for name, value in self.settings.items() if name not in others
-        }
-        changes |= {} if self.total_frames is None else {"total_frames": self.total_frames}
         base = preset(self.preset, env=run.game, algorithm=run.algorithm)
+        changes: dict[str, Any] = {"threads": 1}
+        other_algorithms = set(self.algorithms) - {run.algorithm}
+        for name, value in self.settings.items():
+            if name not in other_algorithms:
+                changes[name] = value
+        if self.total_frames is not None:
+            changes["total_frames"] = self.total_frames
         for name in ("env_options", "network_options"):
-            changes[name] = {**getattr(base, name), **changes.get(name, {})}
+            changes[name] = dict(getattr(base, name)) | dict(changes.get(name, {}))
         if run.size:
-            changes["network_options"] |= zip(
-                ("layers", "hidden_size"), map(int, run.size.split("x")), strict=True
-            )
-        cell = {
-            "env": run.game,
-            "observability": run.observability,
-            "memory": run.memory,
-            "seed": run.seed,
-        }
-        return preset(self.preset, algorithm=run.algorithm, **cell, **changes)
+            layers, hidden_size = map(int, run.size.split("x"))
+            changes["network_options"] |= {"layers": layers, "hidden_size": hidden_size}
+        return preset(
+            self.preset,
+            algorithm=run.algorithm,
+            env=run.game,
+            observability=run.observability,
+            memory=run.memory,
+            seed=run.seed,
+            **changes,
+        )
 
 
 def study_preset(name: str) -> Study:
@@ -230,12 +239,10 @@ def study_preset(name: str) -> Study:
         >>> len(study_preset("paper").runs())
         2400
     """
-    require(
-        name in STUDY_PRESETS, "the preset of a study", name, f"one of {', '.join(STUDY_PRESETS)}"
-    )
-    return replace(
-        Study.load(Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"), name=name
-    )
+    allowed = f"one of {', '.join(STUDY_PRESETS)}"
+    require(name in STUDY_PRESETS, "the preset of a study", name, allowed)
+    file = Path(__file__).resolve().parents[1] / "data" / f"study-{name}.toml"
+    return replace(Study.load(file), name=name)
 
 
 def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
@@ -243,14 +250,15 @@ def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
     memory-free control.
     """
     demo = study_preset("demo")
-    what = Study.from_dict(
-        demo.to_dict() | {"games": games, "seeds": seeds, "total_frames": frames}
-    )
+    changes = {"games": games, "seeds": seeds, "total_frames": frames}
+    study = Study.from_dict(demo.to_dict() | changes)
+    if games == demo.games:
+        return study
     question = (
         f"What does a memory do for agents that play {' and '.join(games)} as MDPs (full) and "
         "POMDPs (partial)?"
     )
-    return what if games == demo.games else replace(what, question=question)
+    return replace(study, question=question)
 
 
 def _text_of(path: Path) -> str:
@@ -272,20 +280,13 @@ def _axis(axis: str, value: Any) -> tuple[Any, ...]:
                 f"seeds = {value}: give the number of seeds (1 to {MOST_SEEDS}) or a list"
             )
         value = range(value)
-    values = (
-        (value,)
-        if isinstance(value, str)
-        else tuple(value)
-        if isinstance(value, Sequence)
-        else None
-    )
-    if values is None or not (values or axis == "sizes"):
-        raise ValueError(
-            f"{axis} is empty: a study needs at least one"
-            if values == ()
-            else f"{axis} must be a list"
-        )
-    values = tuple(coerce(axis, value, _AXES[axis]) for value in values)
+    if isinstance(value, str):
+        value = (value,)
+    if not isinstance(value, Sequence):
+        raise ValueError(f"{axis} must be a list")
+    if not value and axis != "sizes":
+        raise ValueError(f"{axis} is empty: a study needs at least one")
+    values = tuple(coerce(axis, item, _AXES[axis]) for item in value)
     if len(set(values)) != len(values):
         raise ValueError(f"{axis} names something twice: {', '.join(map(str, values))}")
     return values

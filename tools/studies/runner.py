@@ -7,6 +7,7 @@ import errno
 import re
 import shutil
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +47,7 @@ class StudyResult:
     @property
     def finished(self) -> int:
         """Number of finished runs."""
-        return sum(row["status"] == "finished" for row in self.rows)
+        return Counter(row["status"] for row in self.rows)["finished"]
 
 
 def study(
@@ -113,10 +114,11 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     of_ray = vars(ray or RayOptions())
     if name == "ray":
         return Ray(**of_ray, workers=workers)
-    if wrong := [key for key, value in of_ray.items() if value != getattr(RayOptions, key)]:
-        raise ValueError(
-            f"--{wrong[0].replace('_', '-')} is for --engine ray, and the engine is {name}"
-        )
+    for option, value in of_ray.items():
+        if value != getattr(RayOptions, option):
+            raise ValueError(
+                f"--{option.replace('_', '-')} is for --engine ray, and the engine is {name}"
+            )
     if name == "processes" or (name == "auto" and len(available_cores()) > 1):
         return Processes(workers)
     if name in ("auto", "inline"):
@@ -129,10 +131,11 @@ def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     all checked.
     """
     _check_names(what)
-    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
-    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
+    part, parts = map(int, match.groups()) if match else (0, 0)
+    if not 1 <= part <= parts:
         raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
-    return what.configs(what.runs()[int(found[1]) - 1 :: int(found[2])])
+    return what.configs(what.runs()[part - 1 :: parts])
 
 
 def _check_names(what: Study) -> None:
@@ -148,12 +151,14 @@ def _check_names(what: Study) -> None:
     for game in what.games:
         make(game)
         bare = resolve_id(game).rpartition("-v")[0]
-        if (first := games.setdefault(bare, game)) != game:
+        first = games.setdefault(bare, game)
+        if first != game:
             raise ValueError(f"games = {first}, {game} are one game: give it once, in one version")
     for memory in what.memories:
         if memory not in (*memory_names(), "feedforward"):
             make_memory(memory, 1, 1)  # refuses it
-        if (first := memories.setdefault(ALIASES.get(memory, memory), memory)) != memory:
+        first = memories.setdefault(ALIASES.get(memory, memory), memory)
+        if first != memory:
             raise ValueError(f"memories = {first}, {memory} are one memory model: give it once")
     if what.baseline != Study.baseline:
         what.require_baseline()
@@ -272,16 +277,18 @@ def show_progress(
         seen[name] = kept.get(name) or run.progress()
         if has_ended:
             kept[name] = seen[name]
-    usual = next((wanted for _, wanted, _ in seen.values() if wanted), 0)
-    frames = total = 0
-    for name, (done, wanted, status) in seen.items():
-        wanted = wanted or usual
-        done = wanted if name in ended else min(done, wanted)
-        frames = frames + done
-        total = total + wanted
+    totals = [total for _, total, _ in seen.values() if total]
+    usual = totals[0] if totals else 0  # of a run that has not begun
+    all_done = 0
+    all_frames = 0
+    for name, (done, total, status) in seen.items():
+        total = total or usual
+        done = total if name in ended else min(done, total)
+        all_done += done
+        all_frames += total
         bar = f"  {name.replace('__', ' ')}"
         if bars.terminal and status == "running" and name not in ended:
-            bars.update(bar, done, wanted)
+            bars.update(bar, done, total)
         else:
             bars.remove(bar)
-    bars.update(title, frames, total, f"{len(ended)}/{len(runs)} runs")
+    bars.update(title, all_done, all_frames, f"{len(ended)}/{len(runs)} runs")
