@@ -146,10 +146,10 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
             isinstance(kept, torch.Tensor) != isinstance(fresh, torch.Tensor)
             or kept.shape != fresh.shape
         ):
-            found = f"{type(kept).__name__} {list(kept.shape)}"
+            arrived = f"{type(kept).__name__} {list(kept.shape)}"
             raise ValueError(
-                f"entry {key!r} is a {found}, expected shape {list(fresh.shape)} as the env gives "
-                "it"
+                f"entry {key!r} is a {arrived}, expected shape {list(fresh.shape)} as the env "
+                "gives it"
             )
 
 

@@ -200,13 +200,15 @@ def _traced(name: str, method: str, function: Callable[..., Any], *args: Any) ->
         ) from error
 
 
-def _check_array(name: str, what: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
+def _check_array(name: str, subject: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
     """Refuse anything but an array of this shape and type."""
     if not hasattr(value, "shape"):
-        raise ValueError(f"{name}: {what} a {type(value).__name__}, wanted {dtype} {list(shape)}")
+        raise ValueError(
+            f"{name}: {subject} a {type(value).__name__}, wanted {dtype} {list(shape)}"
+        )
     if tuple(value.shape) != shape or value.dtype != dtype:
         raise ValueError(
-            f"{name}: {what} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}"
+            f"{name}: {subject} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}"
         )
 
 

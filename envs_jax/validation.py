@@ -30,21 +30,21 @@ def plain(value: Any) -> Any:
     return value.item() if is_number else value
 
 
-def check_penalty(what: str, value: Any) -> None:
-    """Raise TypeError unless the option ``what`` is an int or a float, and ValueError unless it is
+def check_penalty(option: str, value: Any) -> None:
+    """Raise TypeError unless the ``option`` is an int or a float, and ValueError unless it is
     from -1 to 0.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{what} is {format_value(value)}, expected a number from -1 to 0")
+        raise TypeError(f"{option} is {format_value(value)}, expected a number from -1 to 0")
     if not -1 <= value <= 0:
-        raise ValueError(f"{what} is {value!r}, allowed: -1 to 0")
+        raise ValueError(f"{option} is {value!r}, allowed: -1 to 0")
 
 
-def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
+def check_choice(option: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """Refuse a value outside a closed set.
 
     Args:
-        what: Name of the option, for the message.
+        option: Its name, for the message.
         value: What arrived.
         allowed: All values that are allowed.
 
@@ -54,7 +54,7 @@ def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
     kinds = tuple({type(one) for one in allowed})
     if isinstance(value, bool) or not isinstance(value, kinds) or value not in allowed:
         raise ValueError(
-            f"{what} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}"
+            f"{option} is {format_value(value)}, allowed: {', '.join(map(repr, allowed))}"
         )
 
 

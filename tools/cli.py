@@ -243,10 +243,10 @@ def _tell(error: Exception) -> int:
         (at.f_code.co_filename, at.f_globals["__name__"])
         for at, _ in traceback.walk_tb(error.__traceback__)
     }
-    own = [name for name in imported() if any(name in names for names in passed)]
+    modules_of_user = [name for name in imported() if any(name in names for names in passed)]
     _say(
-        f"{own[0]} failed:"
-        if own
+        f"{modules_of_user[0]} failed:"
+        if modules_of_user
         else "this is a fault of arcade-torch; please report it with what follows"
     )
     for line in "".join(traceback.format_exception(error)).rstrip("\n").split("\n"):

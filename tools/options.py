@@ -173,7 +173,7 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
         >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
         (['my_games'], ['train', '--env', 'PairsEasy'])
     """
-    found = list[str]()
+    modules = list[str]()
     rest = list[str]()
     pending = iter(words)
     for word in pending:
@@ -187,8 +187,8 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
                 f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
                 "something"
             )
-        found.append(str(Path(name).resolve()) if _is_file(name) else name)
-    return found, rest
+        modules.append(str(Path(name).resolve()) if _is_file(name) else name)
+    return modules, rest
 
 
 def load_extensions(names: Sequence[str] = ()) -> None:

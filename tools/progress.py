@@ -120,7 +120,7 @@ _FORMATS = {
 }
 
 
-def standing(row: Mapping[str, Any]) -> str:
+def describe_row(row: Mapping[str, Any]) -> str:
     """How a run stands by a row of ``metrics.csv``, in a few words; what there is not yet is left
     out.
 

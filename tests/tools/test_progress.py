@@ -5,7 +5,7 @@ from io import StringIO
 
 import pytest
 
-from arcade_torch.tools.progress import Bars, standing
+from arcade_torch.tools.progress import Bars, describe_row
 
 ROW = {
     "frames": 4_000,
@@ -51,8 +51,8 @@ def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appear
 ):
     row = {**ROW, "epsilon": None, "entropy": 1.5, "eval_return": -0.125}
     assert (
-        standing(ROW)
+        describe_row(ROW)
         == "return 0.250, of last episodes 0.500, loss 0.0123, epsilon 0.40, lr 5.0e-05"
     )
-    assert "greedy -0.125, loss 0.0123, entropy 1.50, lr" in standing(row)
-    assert standing({"frames": 1, "total_frames": 2, "lr": 1e-3}) == "lr 1.0e-03"
+    assert "greedy -0.125, loss 0.0123, entropy 1.50, lr" in describe_row(row)
+    assert describe_row({"frames": 1, "total_frames": 2, "lr": 1e-3}) == "lr 1.0e-03"

@@ -26,8 +26,8 @@ from arcade_torch.tools.studies.runner import (
     DiskFullError,
     make_engine,
     planned,
+    progress_bars,
     show_progress,
-    shown,
     study,
 )
 from tests.tools.fabricated import small_study, write_run, write_study
@@ -546,7 +546,7 @@ def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -
 
 def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
-    with shown("toy", {}, set(), stream) as note:
+    with progress_bars("toy", {}, set(), stream) as note:
         note("hello")
     assert stream.getvalue() == "toy: hello\ntoy: 0 frames, 0/0 runs\n"
 
@@ -560,7 +560,7 @@ def test_the_display_draws_bars_on_a_terminal(tmp_path: Path) -> None:
     folder = write_study(tmp_path / "s", small_study(seeds=1)).run(run)
     write_run(folder.path, run, 0.5, frames=2048, status="running")
     stream = Terminal()
-    with shown("toy", {run.name: folder}, set(), stream):
+    with progress_bars("toy", {run.name: folder}, set(), stream):
         pass
     assert "toy" in stream.getvalue() and "50%" in stream.getvalue()
 

@@ -52,12 +52,12 @@ def iqm(cells: Sequence[Array]) -> Array:
 
 
 def percentile_interval(
-    value: Any, draws: Array, confidence: float, known: bool = True
+    value: Any, draws: Array, confidence: float, has_interval: bool = True
 ) -> Interval:
     """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, or
-    if not ``known``.
+    if not ``has_interval``.
     """
-    if not known or not len(draws):
+    if not has_interval or not len(draws):
         return Interval(float(value), float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(value), float(low), float(high))
@@ -85,11 +85,11 @@ def pooled(
 
     def cell(seeds: Array) -> Array:
         # the same interval in whatever order the seeds come
-        known = np.sort(seeds[np.isfinite(seeds)])
-        if known.size < 2:
-            return np.array([known[0] if known.size else np.nan, np.nan, np.nan])
-        drawn = mean_over_tasks(resampled([known], draws, np.random.default_rng(seed)))
-        return np.array(percentile_interval(known.mean(), drawn, confidence))
+        finite = np.sort(seeds[np.isfinite(seeds)])
+        if finite.size < 2:
+            return np.array([finite[0] if finite.size else np.nan, np.nan, np.nan])
+        drawn = mean_over_tasks(resampled([finite], draws, np.random.default_rng(seed)))
+        return np.array(percentile_interval(finite.mean(), drawn, confidence))
 
     all_seeds = np.array(values, dtype=np.float64)
     mean, low, high = np.apply_along_axis(cell, 0, all_seeds)

@@ -345,7 +345,7 @@ def contamination_example(
     require(horizon >= 2, "horizon", horizon, "at least 2")
     player, env = resolve_agent(agent, env, observability)
     policy = policy_of(player)
-    what = resolve(player, target)
+    output = resolve(player, target)
     n = horizon + LAST * shuffle
     windows, _ = play(player, env, seed=held_out_seed(seed), keep=n + 1, max_steps=n + 1)
     w = next((window for window in windows if window.n == n), None)
@@ -365,10 +365,10 @@ def contamination_example(
     with policy.evaluating():
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
-        values = outputs(player, what)(raw).double().cpu().numpy()
-    values = values if what == "probs" else values - values.mean(1, keepdims=True)
+        values = outputs(player, output)(raw).double().cpu().numpy()
+    values = values if output == "probs" else values - values.mean(1, keepdims=True)
     pictures = versions.clamp(0, WHITE).round().byte().cpu().numpy()
-    return Example(pictures, order, np.array([-1, *hits]), values, what, sigma)
+    return Example(pictures, order, np.array([-1, *hits]), values, output, sigma)
 
 
 def disturbed_frames(frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int) -> Tensor:

@@ -119,9 +119,9 @@ class GapBias:
         """A number of the table, such as ``gap``, of one agent minus another's, its interval from
         the same draws.
         """
-        known = min(self.row(first).seeds, self.row(second).seeds) > 1
+        has_interval = min(self.row(first).seeds, self.row(second).seeds) > 1
         values = self._values[first][name] - self._values[second][name]
-        return percentile_interval(values[0], values[1:], self.confidence, known)
+        return percentile_interval(values[0], values[1:], self.confidence, has_interval)
 
     def table(self) -> list[dict[str, Any]]:
         """Plain rows, for a CSV file; games left out stand in column ``without``."""
@@ -308,9 +308,9 @@ def _rows(
         fewest_of_bias = min(fewest, *_seeds(cells, memory_free or agent, tasks, "full"))
         ends = dict[str, Interval]()
         for name, draws_of_number in numbers.items():
-            known = (fewest_of_bias if name == "bias" else fewest) > 1
+            has_interval = (fewest_of_bias if name == "bias" else fewest) > 1
             ends[name] = percentile_interval(
-                draws_of_number[0], draws_of_number[1:], confidence, known
+                draws_of_number[0], draws_of_number[1:], confidence, has_interval
             )
         coverage = float("nan")
         if fewest > 1:

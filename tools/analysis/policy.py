@@ -27,11 +27,11 @@ Progress = Callable[[int, int], None]  # called with (done, of how many)
 TARGETS = ("q", "logits", "probs", "value")  # outputs that can be asked for by name
 
 
-def read_plain(out: Tensor, what: str) -> Tensor:
+def read_plain(out: Tensor, output: str) -> Tensor:
     """Read outputs that are one number per action, or a single value."""
-    if what == "probs":
+    if output == "probs":
         return out.softmax(-1)
-    return out.amax(-1, keepdim=True) if what == "value" else out
+    return out.amax(-1, keepdim=True) if output == "value" else out
 
 
 @dataclass(frozen=True)
@@ -111,31 +111,31 @@ def policy_of(model: Any) -> Policy:
     raise TypeError(f"model must be {forms}, got {type(model).__name__}")
 
 
-def resolve(model: Any, what: str) -> str:
+def resolve(model: Any, target: str) -> str:
     """The output that is meant: ``auto`` is Q-values or, for a policy without them, action
     probabilities.
 
     Raises:
-        ValueError: ``what`` is none of `TARGETS`, or this model does not offer it.
+        ValueError: ``target`` is none of `TARGETS`, or this model does not offer it.
     """
-    if what not in get_args(Target):
-        raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {what!r}")
+    if target not in get_args(Target):
+        raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {target!r}")
     names = policy_of(model).offers
-    if what == "auto":
+    if target == "auto":
         return next(name for name in ("q", "probs", *names) if name in names)
-    if what not in names:
+    if target not in names:
         raise ValueError(
-            f"this agent offers {', '.join(names)}, not {what!r}: choose one of these as target"
+            f"this agent offers {', '.join(names)}, not {target!r}: choose one of these as target"
         )
-    return what
+    return target
 
 
-def outputs(model: Any, what: str = "auto") -> Callable[[Tensor], Tensor]:
+def outputs(model: Any, target: str = "auto") -> Callable[[Tensor], Tensor]:
     """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns,
     [..., R].
 
-    ``what`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
+    ``target`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
     """
     policy = policy_of(model)
-    name = resolve(model, what)
+    name = resolve(model, target)
     return lambda out: policy.read(out, name)

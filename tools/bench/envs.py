@@ -58,11 +58,11 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
     for game, size, count in product(games, options.sizes, options.batches):
         log(f"{game}, {size} px, {count} envs")
         measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
-        found = interleaved(measures, options.seconds, options.repeats)
-        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in found.items()} | {
+        measured = interleaved(measures, options.seconds, options.repeats)
+        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in measured.items()} | {
             "step": 0.0
         }
-        for name, result in found.items():
+        for name, result in measured.items():
             row: dict[str, Any] = {
                 "game": game,
                 "obs_size": size,

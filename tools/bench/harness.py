@@ -56,10 +56,10 @@ def interleaved(
     for measure in measures.values():
         for _ in range(warm_ups):
             measure.check(measure.work())
-    found = {name: Measured() for name in measures}
+    measured = {name: Measured() for name in measures}
     for _ in range(repeats):
         for name, measure in measures.items():
-            into = found[name]
+            into = measured[name]
             units = 0
             working = 0.0
             checking = 0.0
@@ -75,7 +75,7 @@ def interleaved(
             into.units += units
             into.rates.append(units / working)
             into.rates_with_check.append(units / (working + checking))
-    return found
+    return measured
 
 
 KINDS = {

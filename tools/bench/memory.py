@@ -78,7 +78,7 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
             f"device must be cpu, or cuda where torch finds a card, got {options.device!r}"
         )
     device = torch.device(options.device)
-    how = (options.seconds, options.repeats)
+    timing = (options.seconds, options.repeats)
     with torch_threads(options.threads):
         for steps, layers in product(options.steps, options.layers):
             log(f"memory models, T = {steps}, layers: {layers}")
@@ -87,16 +87,16 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
                 torch.randn(batch, steps, size, device=device),
                 torch.rand(batch, steps, device=device) < RESETS,
             )
-            for (model, form), found in time_passes(compared, _learn, inputs, *how).items():
+            for (model, form), measured in time_passes(compared, _learn, inputs, *timing).items():
                 yield (
                     "models",
-                    {"model": model, "form": form, "layers": layers, "steps": steps} | found,
+                    {"model": model, "form": form, "layers": layers, "steps": steps} | measured,
                 )
         for steps in options.steps:
             log(f"scans, T = {steps}")
-            yield from (("scans", row) for row in bench_scans(batch, steps, size, device, *how))
+            yield from (("scans", row) for row in bench_scans(batch, steps, size, device, *timing))
         log("saliency")
-        yield from (("saliency", row) for row in bench_saliency(options.frames, device, *how))
+        yield from (("saliency", row) for row in bench_saliency(options.frames, device, *timing))
 
 
 def forms(
@@ -167,9 +167,9 @@ def time_passes(
             ("both", partial(both, run)),
         ):
             measures[f"{key} {part}"] = _repeated(around(key, work), inputs[0].device)
-    found = interleaved(measures, seconds, repeats, warm_ups=1)
+    measured = interleaved(measures, seconds, repeats, warm_ups=1)
     return {
-        key: {f"{part}_ms": found[f"{key} {part}"].best_ms for part in ("forward", "both")}
+        key: {f"{part}_ms": measured[f"{key} {part}"].best_ms for part in ("forward", "both")}
         for key in runs
     }
 
@@ -224,10 +224,10 @@ def bench_scans(
             "forward_ms": partial(target[:one].copy_, source[:one]),
             "both_ms": partial(target.copy_, source),
         }
-        found = interleaved(
+        measured = interleaved(
             {name: _repeated(copy, device) for name, copy in copies.items()}, seconds, repeats
         )
-        least = {name: measured.best_ms for name, measured in found.items()}
+        least = {name: times.best_ms for name, times in measured.items()}
         yield {"form": COPY, "steps": steps, "numbers": numbers} | least | {"error": 0.0}
 
 
@@ -258,8 +258,8 @@ def bench_saliency(
         "two stages": Measure(partial(saliency, network, seen, actions, starts)),
         "whole network": Measure(whole),
     }
-    found = interleaved(ways, seconds, repeats, warm_ups=1)
-    return [{"way": way, "frames": frames, "both_ms": found[way].best_ms} for way in ways]
+    measured = interleaved(ways, seconds, repeats, warm_ups=1)
+    return [{"way": way, "frames": frames, "both_ms": measured[way].best_ms} for way in ways]
 
 
 class MemoryCost(NamedTuple):
@@ -278,9 +278,9 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
     """Count what a memory model needs."""
     state = memory.initial_state(1)  # type: ignore[operator]
     leaves = list(state.values(True, True))
-    like = next(memory.parameters())
-    x = like.new_zeros(1, 1, input_size)
-    is_init = torch.zeros(1, 1, dtype=torch.bool, device=like.device)
+    parameter = next(memory.parameters())
+    x = parameter.new_zeros(1, 1, input_size)
+    is_init = torch.zeros(1, 1, dtype=torch.bool, device=parameter.device)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         memory(x, state, is_init)
     state_size = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
@@ -300,15 +300,15 @@ def time_memories(
         memory = make_memory(name, size, size)
         state = memory.initial_state(ACTING_ENVS)  # type: ignore[operator]
         cells[name] = lambda x, is_init, memory=memory, state=state: memory(x, state, is_init)[0]
-    found = []
+    measured = []
     with torch_threads(1):
         for steps in (1, MINIBATCH_STEPS):
             inputs = (
                 torch.randn(ACTING_ENVS, steps, size),
                 torch.rand(ACTING_ENVS, steps) < RESETS,
             )
-            found.append(time_passes(cells, _learn, inputs, seconds, repeats))
-    acting, learning = found
+            measured.append(time_passes(cells, _learn, inputs, seconds, repeats))
+    acting, learning = measured
     act = 1e3 / ACTING_ENVS
     learn = 1e3 / (ACTING_ENVS * MINIBATCH_STEPS)
     return {

@@ -157,7 +157,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
     """Every measured number of a file by table, what its row is about, and column."""
-    found: dict[tuple[str, str, str], float] = {}
+    numbers_of_rows: dict[tuple[str, str, str], float] = {}
     for name, table in results["tables"].items():
         if name not in TABLES:
             raise ValueError(f"unknown table {name!r}; known are {', '.join(TABLES)}")
@@ -179,10 +179,10 @@ def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
                     raise ValueError(
                         f"{name}, {about}: {column} is {value!r}, wanted a number from 0 up"
                     )
-                if (name, about, column) in found:
+                if (name, about, column) in numbers_of_rows:
                     raise ValueError(f"table {name} has two rows for {about}")
-                found[name, about, column] = float(value)
-    return found
+                numbers_of_rows[name, about, column] = float(value)
+    return numbers_of_rows
 
 
 def compare(
@@ -193,7 +193,7 @@ def compare(
     """
     before = _numbers(old)
     after = _numbers(new)
-    found: dict[str, list[str]] = {
+    verdicts: dict[str, list[str]] = {
         verdict: [] for verdict in ("same", "worse", "better", "missing", "new")
     }
     for key in before | after:
@@ -215,8 +215,8 @@ def compare(
                 else "same"
             )
         values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (was, now))
-        found[verdict].append(f"{table}: {row}: {column} {values} {unit} (x {ratio:.2f})")
-    return found
+        verdicts[verdict].append(f"{table}: {row}: {column} {values} {unit} (x {ratio:.2f})")
+    return verdicts
 
 
 def page(results: Mapping[str, Any]) -> str:

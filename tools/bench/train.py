@@ -115,9 +115,9 @@ def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
     every_step = config.grad_steps_per_update
     learned = round(frames * options.grad_steps / every_step)  # of an update's frames in a pass
     measures = {"collect": Measure(collect, units=frames), "learn": Measure(learn, units=learned)}
-    found = interleaved(measures, seconds=1e-9, repeats=options.repeats, warm_ups=1)
-    collect_fps = found["collect"].rate
-    learn_fps = found["learn"].rate
+    measured = interleaved(measures, seconds=1e-9, repeats=options.repeats, warm_ups=1)
+    collect_fps = measured["collect"].rate
+    learn_fps = measured["learn"].rate
     row: dict[str, Any] = {
         "network": trainer.config.network,
         "memory": trainer.config.memory,

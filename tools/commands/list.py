@@ -31,7 +31,7 @@ class List(Command):
     Example: arcade-torch list memories --measure
     """
 
-    what: tyro.conf.Positional[Literal["all", "envs", "memories", "baselines", "sheet"]] = "all"
+    topic: tyro.conf.Positional[Literal["all", "envs", "memories", "baselines", "sheet"]] = "all"
     """What to show; all: envs and memories."""
     games: tyro.conf.Positional[tuple[str, ...]] = ()
     """For baselines and sheet: ids; all, or the ten games of one level, by default."""
@@ -46,13 +46,13 @@ class List(Command):
 
     def run(self) -> int:
         """Print the tables, or draw."""
-        for what in ("envs", "memories") if self.what == "all" else (self.what,):
-            getattr(self, f"_{what}")()
+        for topic in ("envs", "memories") if self.topic == "all" else (self.topic,):
+            getattr(self, f"_{topic}")()
         return 0
 
     def resume_hint(self) -> str:
         """What to type after an interruption."""
-        if self.what != "baselines":
+        if self.topic != "baselines":
             return super().resume_hint()
         return (
             f"finished rows are in {self.out or BASELINES}; the same command goes on with the "

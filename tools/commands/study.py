@@ -27,7 +27,7 @@ class Resumable(Command):
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
 
     def carry_out(
-        self, what: Study, out: Path, engine: Engine, shard: str = "", report: bool = True
+        self, definition: Study, out: Path, engine: Engine, shard: str = "", report: bool = True
     ) -> int:
         """Run a study, say how each run ended, and write the report; exit code 1 if a run
         failed.
@@ -37,7 +37,9 @@ class Resumable(Command):
             word for word, before in pairs if not word.startswith("--shard") and before != "--shard"
         ]
         try:
-            result = study(what, out, engine, command=command_line([self.word, *argv]), shard=shard)
+            result = study(
+                definition, out, engine, command=command_line([self.word, *argv]), shard=shard
+            )
         except DiskFullError as error:
             say(f"stopped: {error}; {self.resume_hint()}")
             return 1
@@ -96,9 +98,12 @@ class StudyCommand(Resumable):
                 f"give a TOML file, or --preset with one of {', '.join(STUDY_PRESETS)}; one of the "
                 "two"
             )
-        what = study_preset(self.preset) if self.preset is not None else Study.load(str(self.file))
+        if self.preset is not None:
+            definition = study_preset(self.preset)
+        else:
+            definition = Study.load(str(self.file))
         if self.dry_run:
-            plan = planned(what, self.shard)
+            plan = planned(definition, self.shard)
             total = 0
             for run, config in plan.items():
                 frames = config.num_updates * config.learner.frames_per_update
@@ -108,7 +113,7 @@ class StudyCommand(Resumable):
             return 0
         engine = make_engine(self.engine, self.workers, self.ray)
         return self.carry_out(
-            what, self.out or Path("runs") / what.name, engine, self.shard, self.report
+            definition, self.out or Path("runs") / definition.name, engine, self.shard, self.report
         )
 
 
@@ -134,8 +139,8 @@ class Demo(Resumable):
 
     def run(self) -> int:
         """Run the study and write its report."""
-        what = demo_study(self.games, self.frames, self.seeds)
-        return self.carry_out(what, self.out, make_engine("auto", self.workers))
+        definition = demo_study(self.games, self.frames, self.seeds)
+        return self.carry_out(definition, self.out, make_engine("auto", self.workers))
 
 
 @dataclass
@@ -161,10 +166,10 @@ class Report(Command):
         return 0
 
 
-def write_page(study: Path, out: Path | None = None, **how: Any) -> None:
+def write_page(study: Path, out: Path | None = None, **options: Any) -> None:
     """Write the report of a study, and say where it is."""
     from arcade_torch.tools.progress import Bars
     from arcade_torch.tools.reports import report
 
     with Bars() as bars:
-        say(f"report: {report(study, out, progress=bars.update, **how).resolve()}")
+        say(f"report: {report(study, out, progress=bars.update, **options).resolve()}")

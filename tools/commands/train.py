@@ -66,11 +66,11 @@ class Train(Command):
                 cls, argv, prog, cls(preset(given.get("preset", "paper"), **decisive))
             )
             names = {name.partition(".")[0].removeprefix("no_") for name in given}
-            own = {
+            chosen = {
                 name: getattr(parsed.settings, name)
                 for name in names & {f.name for f in fields(TrainConfig)}
             }
-            settings = preset(parsed.preset, **own)
+            settings = preset(parsed.preset, **chosen)
         options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
         more = {
             key: {**getattr(settings, key), **dict(map(name_and_value, pairs))}
@@ -83,7 +83,7 @@ class Train(Command):
         from arcade_torch.agents import train
         from arcade_torch.agents.runs.folder import wait_until_free
         from arcade_torch.tools.machine import keep_freed_memory
-        from arcade_torch.tools.progress import Bars, standing
+        from arcade_torch.tools.progress import Bars, describe_row
         from arcade_torch.tools.studies.engines import watch_parent
         from arcade_torch.tools.studies.grid import RunSpec
 
@@ -103,7 +103,7 @@ class Train(Command):
 
             def show(row: Any) -> None:
                 bars.update(
-                    str(folder), int(row["frames"]), int(row["total_frames"]), standing(row)
+                    str(folder), int(row["frames"]), int(row["total_frames"]), describe_row(row)
                 )
 
             result = train(run, folder, self.resume, show, film)
@@ -149,8 +149,10 @@ class Evaluate(Command):
         which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
         say(f"{which}, {agent.frames:,} frames of training: {result.text}")
         if self.json is not None:
-            found = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
-            write_json(self.json, found | {"mean": result.mean, "half_width_95": result.half_width})
+            episodes = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
+            write_json(
+                self.json, episodes | {"mean": result.mean, "half_width_95": result.half_width}
+            )
         return 0
 
 
@@ -172,9 +174,9 @@ def _flags(argv: Sequence[str]) -> dict[str, str]:
     """Names and values of options before they are read: of ``--total-frames 5`` or
     ``--total-frames=5``.
     """
-    found = {}
+    values = {}
     for word, following in zip(argv, [*argv[1:], ""], strict=True):
         name, equals, value = word.partition("=")
         if name.startswith("--"):
-            found[name[2:].replace("-", "_")] = value if equals else following
-    return found
+            values[name[2:].replace("-", "_")] = value if equals else following
+    return values

@@ -256,7 +256,7 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
     module, maker = entry.maker.split(".")
     make = getattr(import_module(f"arcade_torch.tools.figures.{module}"), maker)
     with drawing(options.style):
-        made: Made = make(options, progress)
-        for picture in made.pictures:
-            made.files += save(options, picture)
-    return made
+        result: Made = make(options, progress)
+        for picture in result.pictures:
+            result.files += save(options, picture)
+    return result

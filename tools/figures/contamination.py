@@ -43,21 +43,21 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
     at_least(options, horizon=2, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.contamination, vars(options), progress)
-    made = Made([], notes, [_table(label, changes) for label, changes in measured])
+    result = Made([], notes, [_table(label, changes) for label, changes in measured])
     tasks = style.agents_by_task(pool(by_task(measured), options.confidence))
     for (game, twin), agents in tasks.items():
         seeds = [pair for pair in measured if pair[0].task[1:] == (game, twin)]
-        made.pictures.append(_picture(game, twin, agents, seeds[0][1], options))
+        result.pictures.append(_picture(game, twin, agents, seeds[0][1], options))
         label = seeds[0][0]
         try:
             settings = vars(options) | {"sigma": max(options.sigmas)}
             _, example = measure_run(label.path, measure.contamination_example, settings)
         except ValueError as error:  # episodes too short
-            made.notes.append(f"no example of {label}: {error}")
+            result.notes.append(f"no example of {label}: {error}")
         else:
             name = f"contamination-{_kind(options)}-example-{game}-{twin}"
-            made.pictures.append(Picture(name, *_example(label, example)))
-    return made
+            result.pictures.append(Picture(name, *_example(label, example)))
+    return result
 
 
 def _kind(options: ContaminationOptions) -> str:

@@ -60,25 +60,25 @@ COLUMNS = {
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
     """The figure ``gap-bias``: right and down is better."""
-    made, table, note = _table(options)
+    result, table, note = _table(options)
     figure, axes = panels(1, 1, (7.4, 5.4))
     plot(table.rows, axes[0, 0])
-    made.pictures = [Picture("gap-bias", figure, note, table.table())]
-    return made
+    result.pictures = [Picture("gap-bias", figure, note, table.table())]
+    return result
 
 
 def returns(options: ScoreOptions, progress: Progress | None) -> Made:
     """Two figures: ``returns`` and, with several games, ``returns-without`` (one game left out at a
     time).
     """
-    made, table, note = _table(options)
+    result, table, note = _table(options)
     figure, axes = panels(1, 3, (12.5, 4.2))
     for axis, name in zip(axes[0], DRAWN, strict=True):
         plot_bars(table.rows, axis, name)
-    made.pictures = [Picture("returns", figure, note, table.table())]
+    result.pictures = [Picture("returns", figure, note, table.table())]
     if table.without:
-        made.pictures.append(Picture("returns-without", _without_each(table), note))
-    return made
+        result.pictures.append(Picture("returns-without", _without_each(table), note))
+    return result
 
 
 def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
@@ -289,10 +289,10 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
     if not options.runs:
         raise ValueError("name at least one study folder, run folder or CSV file")
     folders = [path for path in options.runs if table_of(path) is None]
-    found = find_runs(folders) if folders else Runs(())
+    runs = find_runs(folders) if folders else Runs(())
     scores = read_scores(options.runs, options.metric)
     table = _computed(scores, options)
-    notes = found.notes + found.single_seeds()
+    notes = runs.notes + runs.single_seeds()
     unfinished = sum(_count_unfinished(path) for path in options.runs if path not in folders)
     if unfinished:
         notes.append(f"left out, not finished: {unfinished} run{'s' * (unfinished > 1)}")
@@ -337,7 +337,7 @@ def _seeds(tables: Sequence[GapBias], options: SweepOptions) -> str:
     return seeds_note(seeds, options.confidence, share=min(shares, default=None))
 
 
-def _printed(table: GapBias, what: str) -> Table:
+def _printed(table: GapBias, title: str) -> Table:
     """The table as it is printed; an interval stands under its value."""
 
     rows = list[tuple[Any, ...]]()
@@ -352,7 +352,7 @@ def _printed(table: GapBias, what: str) -> Table:
         )
     else:
         caption = "no intervals: a single seed"
-    return Table(f"gap and bias over {what}", ("agent", "seeds", *COLUMNS.values()), rows, caption)
+    return Table(f"gap and bias over {title}", ("agent", "seeds", *COLUMNS.values()), rows, caption)
 
 
 def _cell(interval: Interval) -> str:

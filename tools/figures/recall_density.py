@@ -34,7 +34,7 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
     """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
     at_least(options, bins=1, episodes=1, seed=0)
     measured, notes = _measure(options, progress)
-    made = Made([], notes)
+    result = Made([], notes)
     frames = np.concatenate([density.lengths for _, density in measured])
     counts = _range([len(density.lengths) for _, density in measured])
     end = "the one that ended the episode" if options.end == "last" else "at a random step"
@@ -52,9 +52,9 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
             note += "; dotted: uniform memory; without memory: all in the most recent part"
         arrays = _arrays(measured) if bins == options.bins[0] else {}
         rows = _rows(masses, bins)
-        made.pictures.append(Picture(f"recall-density-{bins}", figure, note, rows, arrays))
-    made.tables.append(_table(measured))
-    return made
+        result.pictures.append(Picture(f"recall-density-{bins}", figure, note, rows, arrays))
+    result.tables.append(_table(measured))
+    return result
 
 
 def _masses(measured: Densities, bins: int, confidence: float) -> Masses:

@@ -163,7 +163,7 @@ def whiskers(value: Array, low: Array, high: Array) -> Any:
 
 
 def seeds_note(
-    seeds: Sequence[int], confidence: float, what: str = "bars", share: float | None = None
+    seeds: Sequence[int], confidence: float, drawn_as: str = "bars", share: float | None = None
 ) -> str:
     """How many seeds, which interval, and what it is worth: its coverage ``share``, that of one
     cell's mean by default.
@@ -179,7 +179,7 @@ def seeds_note(
         return f"{count}, no interval (needs two)"
     share = measured_coverage((max(low, 2),), (), confidence) if share is None else share
     return (
-        f"{count}; {what}: {100 * confidence:g} % bootstrap interval over seeds, "
+        f"{count}; {drawn_as}: {100 * confidence:g} % bootstrap interval over seeds, "
         f"measured coverage with {max(low, 2)} seeds {100 * share:.0f} %"
     )
 

@@ -117,10 +117,10 @@ class Study:
         missing keys.
         """
         require(isinstance(values, Mapping), "a study", values, "a table of names and values")
-        known = [item.name for item in fields(cls)]
+        names = [item.name for item in fields(cls)]
         for key in values:
-            if key not in known:
-                raise ValueError(f"unknown key {key!r} in a study; known are {', '.join(known)}")
+            if key not in names:
+                raise ValueError(f"unknown key {key!r} in a study; known are {', '.join(names)}")
         missing = [key for key in ("name", "games", "memories", "seeds") if key not in values]
         if missing:
             raise ValueError(f"a study needs {', '.join(missing)}")

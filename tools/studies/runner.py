@@ -51,7 +51,7 @@ class StudyResult:
 
 
 def study(
-    what: Study | str | Path,
+    plan_or_file: Study | str | Path,
     out: str | Path,
     engine: Engine | str = "auto",
     workers: int = 0,
@@ -65,7 +65,7 @@ def study(
     tried again.
 
     Args:
-        what: a study or the path of its TOML file.
+        plan_or_file: a study or the path of its TOML file.
         out: folder of the study; made if it is missing, continued if it holds this study.
         engine: where the runs are carried out: ``auto``, ``inline``, ``processes``, ``ray`` or an
             object with a method ``run``.
@@ -85,13 +85,14 @@ def study(
             study.
         DiskFullError: there is no space left for results; what is finished is kept.
     """
-    what = what if isinstance(what, Study) else Study.load(what)
+    is_file = not isinstance(plan_or_file, Study)
+    definition = Study.load(plan_or_file) if is_file else plan_or_file
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
-    plan = planned(what, shard)
+    plan = planned(definition, shard)
     folder = StudyFolder(Path(out))
     try:
-        folder.claim(what, command)
-        results = Results(folder, what)
+        folder.claim(definition, command)
+        results = Results(folder, definition)
         results.write()
         jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
         for run, job in jobs.items():
@@ -126,19 +127,19 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes, ray")
 
 
-def planned(what: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
+def planned(plan: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and
     all checked.
     """
-    _check_names(what)
+    _check_names(plan)
     match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
     part, parts = map(int, match.groups()) if match else (0, 0)
     if not 1 <= part <= parts:
         raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
-    return what.configs(what.runs()[part - 1 :: parts])
+    return plan.configs(plan.runs()[part - 1 :: parts])
 
 
-def _check_names(what: Study) -> None:
+def _check_names(plan: Study) -> None:
     """Refuse games and memories that do not exist, or stand there twice by two names, and an
     untrained baseline.
     """
@@ -148,20 +149,20 @@ def _check_names(what: Study) -> None:
 
     games = dict[str, str]()
     memories = dict[str, str]()
-    for game in what.games:
+    for game in plan.games:
         make(game)
         bare = resolve_id(game).rpartition("-v")[0]
         first = games.setdefault(bare, game)
         if first != game:
             raise ValueError(f"games = {first}, {game} are one game: give it once, in one version")
-    for memory in what.memories:
+    for memory in plan.memories:
         if memory not in (*memory_names(), "feedforward"):
             make_memory(memory, 1, 1)  # refuses it
         first = memories.setdefault(ALIASES.get(memory, memory), memory)
         if first != memory:
             raise ValueError(f"memories = {first}, {memory} are one memory model: give it once")
-    if what.baseline != Study.baseline:
-        what.require_baseline()
+    if plan.baseline != Study.baseline:
+        plan.require_baseline()
 
 
 class Results:
@@ -198,12 +199,13 @@ def _carry_out(
 def _watch(
     results: Results, plan: list[RunSpec], jobs: list[Job], engine: Engine, stream: Any
 ) -> dict[str, str]:
-    what = results.study
     folder = results.folder
     runs = {run.name: run for run in plan}
     errors = dict[str, str]()
     ended = set(runs) - {job.name for job in jobs}
-    bars = shown(what.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream)
+    bars = progress_bars(
+        results.study.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream
+    )
     with bars as note, contextlib.closing(engine.run(jobs)) as ends:  # type: ignore[type-var]
         if ended:
             note(f"{len(ended)} of {len(runs)} runs are finished already")
@@ -229,7 +231,7 @@ def _watch(
 
 
 @contextlib.contextmanager
-def shown(
+def progress_bars(
     title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None
 ) -> Iterator[Callable[[str], None]]:
     """Show how far a study is, from the ``progress.json`` of its runs, a bar for all and one for
@@ -244,7 +246,7 @@ def shown(
         pace = Pace(LOOK_EVERY_S)
 
         def look() -> None:
-            show_progress(bars, title, runs, ended, kept)
+            draw_progress(bars, title, runs, ended, kept)
 
         def loop() -> None:
             while not stop.wait(pace.rest_s):
@@ -260,7 +262,7 @@ def shown(
             look()
 
 
-def show_progress(
+def draw_progress(
     bars: Bars,
     title: str,
     runs: Mapping[str, Run],
