@@ -9,7 +9,6 @@ from arcade_torch.agents.config import flatten
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.text import printable
 
-_SIZE = ("layers", "hidden_size")
 _VERSION = re.compile(r"-v\d+$")
 
 
@@ -30,16 +29,20 @@ class AgentKey:
         if not isinstance(options, Mapping) or not isinstance(config.get("memory"), str):
             raise ValueError("its memory or its network_options are of no use")
         network = str(config.get("network", "paper"))
+        rest = {}
+        for name, value in flatten(options).items():
+            rest[name] = str(plain_number(value))
+        layers = rest.pop("layers", None)
+        width = rest.pop("hidden_size", None)
         size = ""
-        flat = {name: str(plain_number(value)) for name, value in flatten(options).items()}
-        if any(name in flat for name in _SIZE):
+        if layers is not None or width is not None:
             default = preset_size(network)
-            chosen = "x".join(
-                flat.get(name, base) for name, base in zip(_SIZE, default.split("x"), strict=True)
-            )
-            size = "" if chosen == default else chosen
-        rest = tuple(sorted((name, value) for name, value in flat.items() if name not in _SIZE))
-        return cls(str(config.get("algorithm", "pqn")), config["memory"], network, size, rest)
+            default_layers, default_width = default.split("x")
+            size = f"{layers or default_layers}x{width or default_width}"
+            if size == default:
+                size = ""
+        algorithm = str(config.get("algorithm", "pqn"))
+        return cls(algorithm, config["memory"], network, size, tuple(sorted(rest.items())))
 
 
 def plain_number(value: Any) -> Any:
@@ -71,24 +74,33 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
         >>> list(agent_names([AgentKey("pqn", "lru"), AgentKey("ppo", "lru")]).values())
         ['pqn-lru', 'ppo-lru']
     """
-    every = list(dict.fromkeys(keys))
-    algorithms = {key.algorithm for key in every if key.algorithm}
-    networks = {key.network for key in every if key.network}
-    found = {}
-    for key in every:
-        same = [other for other in every if other.memory == key.memory]
-        name = (
-            f"{key.algorithm}-{key.memory}" if len(algorithms) > 1 and key.algorithm else key.memory
-        )
-        several = sized or len({other.size for other in same}) > 1
-        parts = [key.size or preset_size(key.network or "paper")] if several else []
-        parts += [key.network] if len(networks) > 1 and key.network else []
-        shared = set.intersection(*(set(other.options) for other in same))
-        parts += [
-            f"{option}={value}" for option, value in key.options if (option, value) not in shared
-        ]
-        found[key] = printable(" ".join([name, *parts]))
-    return found
+    agents = list(dict.fromkeys(keys))
+    several_algorithms = _several(key.algorithm for key in agents)
+    several_networks = _several(key.network for key in agents)
+    by_memory: dict[str, list[AgentKey]] = {}
+    for key in agents:
+        by_memory.setdefault(key.memory, []).append(key)
+    names = {}
+    for key in agents:
+        rivals = by_memory[key.memory]
+        parts = [key.memory]
+        if several_algorithms and key.algorithm:
+            parts = [f"{key.algorithm}-{key.memory}"]
+        if sized or len({rival.size for rival in rivals}) > 1:
+            parts.append(key.size or preset_size(key.network or "paper"))
+        if several_networks and key.network:
+            parts.append(key.network)
+        shared = set.intersection(*(set(rival.options) for rival in rivals))
+        for option, value in key.options:
+            if (option, value) not in shared:
+                parts.append(f"{option}={value}")
+        names[key] = printable(" ".join(parts))
+    return names
+
+
+def _several(words: Iterable[str]) -> bool:
+    """Whether there are several different words; empty ones do not count."""
+    return len(set(words) - {""}) > 1
 
 
 def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
@@ -102,18 +114,25 @@ def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
     """Agent -> the memory-free agent of its algorithm, where there is one; that of the very name or
     of PQN is first.
     """
-    algorithm = {
-        agent: found[1].lower() for agent in agents if (found := memory_free(agent, baseline))
-    }
-    free = sorted(
-        algorithm, key=lambda agent: (agent.lower() != baseline.lower(), algorithm[agent] != "pqn-")
-    )
-    first = {algorithm[agent]: agent for agent in reversed(free)}
-    own = {
-        agent: [start for start in first if agent.lower().startswith(start)]
-        for agent in (*free, *agents)
-    }
-    return {agent: first[max(starts, key=len)] for agent, starts in own.items() if starts}
+    prefixes = {}  # of the memory-free agents: ``ppo-``, or empty
+    for agent in agents:
+        match = memory_free(agent, baseline)
+        if match is not None:
+            prefixes[agent] = match[1].lower()
+
+    def rank(agent: str) -> tuple[bool, bool]:
+        return agent.lower() != baseline.lower(), prefixes[agent] != "pqn-"
+
+    free = sorted(prefixes, key=rank)
+    first: dict[str, str] = {}
+    for agent in free:
+        first.setdefault(prefixes[agent], agent)
+    baselines = {}
+    for agent in (*free, *agents):
+        fitting = [prefix for prefix in first if agent.lower().startswith(prefix)]
+        if fitting:
+            baselines[agent] = first[max(fitting, key=len)]
+    return baselines
 
 
 def game_names(written: Iterable[str]) -> dict[str, str]:
@@ -127,15 +146,27 @@ def game_names(written: Iterable[str]) -> dict[str, str]:
         >>> game_names(["NoisyPoleEasy", "NoisyCartPoleEasy-v0", "TetrisEasy"])["NoisyPoleEasy"]
         'NoisyCartPoleEasy-v0'
     """
-    bare = {name: bare_name(name) for name in dict.fromkeys(written)}
-    names = dict[str, str]()
-    for name, game in bare.items():
-        same = [other for other in bare if bare[other] == game]
-        versions = [match[0] for other in same if (match := _VERSION.search(other))]
-        match = _VERSION.search(name)
-        newest = max(versions, key=lambda version: int(version[2:]), default="")
-        names[name] = printable(name if len(same) == 1 else game + (match[0] if match else newest))
+    spellings: dict[str, list[str]] = {}  # of the games
+    for name in dict.fromkeys(written):
+        spellings.setdefault(bare_name(name), []).append(name)
+    names: dict[str, str] = {}
+    for game, spelt in spellings.items():
+        newest = max(map(_version, spelt), key=_number)
+        for name in spelt:
+            one_name = name if len(spelt) == 1 else game + (_version(name) or newest)
+            names[name] = printable(one_name)
     return names
+
+
+def _version(game: str) -> str:
+    """The version in the name of a game, such as ``-v0``; empty if it has none."""
+    match = _VERSION.search(game)
+    return match[0] if match else ""
+
+
+def _number(version: str) -> int:
+    """The number of a version; -1 of an empty one."""
+    return int(version.removeprefix("-v") or -1)
 
 
 def bare_name(game: str) -> str:

@@ -1,6 +1,6 @@
 """``arcade-torch play`` and ``arcade-torch record``."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,13 +10,14 @@ import tyro
 from arcade_torch.agents.config import require
 from arcade_torch.tools.commands import Command
 from arcade_torch.tools.options import at_least, at_most, name_and_value
+from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 
 LARGEST_SCALE = 32
 
 
 @dataclass(kw_only=True)
-class Shown(Command):
+class GameCommand(Command):
     """What both commands are told about the game and its picture."""
 
     game: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
@@ -31,9 +32,13 @@ class Shown(Command):
         at_most(self, scale=LARGEST_SCALE)
         at_least(self, scale=1)
 
+    def game_options(self) -> dict[str, Any]:
+        """The options of the game, by name."""
+        return dict(map(name_and_value, self.env_option))
+
 
 @dataclass(kw_only=True)
-class Play(Shown):
+class Play(GameCommand):
     """Play a game by hand, in a window or (without pygame or a display, or with --terminal) in the
     terminal.
 
@@ -66,7 +71,7 @@ class Play(Shown):
         self.check_scale()
         fits = self.scores is None or self.scores.suffix == ".csv"
         require(fits, "--scores", str(self.scores), "a file that ends in .csv")
-        options = dict(map(name_and_value, self.env_option))
+        options = self.game_options()
         compiled = compiled_game(self.game, self.obs_size, self.rules, options)
         game: Any = compiled.batched.game
         said: list[str] = []
@@ -77,18 +82,18 @@ class Play(Shown):
             """Write a score, and remember to say it when the screen is the terminal's again."""
             said.append(f"seed {attempt.seed} ({attempt.observability}): {attempt}")
             if self.scores is not None:
-                scores.append_score(
-                    self.scores, scores.score_row(attempt, game, options, self.player)
-                )
+                row = scores.score_row(attempt, game, options, self.player)
+                scores.append_score(self.scores, row)
 
-        views = {"partial": self.partial, "both": self.both}
-        session = Session(compiled, seed=seed, episodes=self.episodes, on_attempt=keep, **views)
-        reason = None if self.terminal else screens.why_no_window()
-        if reason is not None:
-            if (blocked := screens.why_no_terminal()) is not None:
-                raise ValueError(f"playing needs a window or a terminal: {reason}, and {blocked}")
-            say(f"playing in the terminal: {reason}")
-        if self.terminal or reason is not None:
+        session = Session(
+            compiled,
+            seed=seed,
+            episodes=self.episodes,
+            partial=self.partial,
+            both=self.both,
+            on_attempt=keep,
+        )
+        if self.plays_in_terminal():
             screens.play_in_terminal(session)
         else:
             print(LEGEND)
@@ -97,9 +102,39 @@ class Play(Shown):
             say(line)
         return 0
 
+    def plays_in_terminal(self) -> bool:
+        """Whether to play in the terminal, because it was asked for or because there is no window;
+        a ``ValueError`` if there is neither.
+        """
+        from arcade_torch.tools.play import screens
+
+        if self.terminal:
+            return True
+        no_window = screens.why_no_window()
+        if no_window is None:
+            return False
+        no_terminal = screens.why_no_terminal()
+        if no_terminal is not None:
+            raise ValueError(
+                f"playing needs a window or a terminal: {no_window}, and {no_terminal}"
+            )
+        say(f"playing in the terminal: {no_window}")
+        return True
+
+
+@dataclass
+class Scene:
+    """What a recording shows: the game, the twin, and the agent that plays, if one does."""
+
+    obs_size: int
+    rules: str
+    partial: bool
+    options: dict[str, Any]
+    agent: Any = None
+
 
 @dataclass(kw_only=True)
-class Record(Shown):
+class Record(GameCommand):
     """Record episodes of a player as a GIF or, with the extra video, as an MP4.
 
     Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP
@@ -128,7 +163,6 @@ class Record(Shown):
         from arcade_torch.envs_jax import resolve_id
         from arcade_torch.tools.play import recording
         from arcade_torch.tools.play.session import Session
-        from arcade_torch.tools.progress import Bars
 
         write = recording.writer_for(self.out)
         at_least(self, episodes=1, max_steps=1)
@@ -141,55 +175,81 @@ class Record(Shown):
             f"at least 0.01 and at most {fastest} for {self.out.suffix}",
         )
         game_id = resolve_id(self.game)
-        options = dict(map(name_and_value, self.env_option))
-        obs_size = self.obs_size or 128
-        rules = self.rules or "default"
-        partial = self.player == "frames-oracle"
-        agent: Any = None
-        if self.player not in recording.SCRIPTED:
-            from arcade_torch.agents import load
-
-            known = ", ".join(recording.SCRIPTED)
-            require(
-                Path(self.player).is_dir(), "--player", self.player, f"{known}, or a run folder"
-            )
-            agent = load(self.player)
-            config = agent.config
-            if self.obs_size not in (None, config.obs_size):
-                raise ValueError(
-                    f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}"
-                )
-            obs_size = config.obs_size
-            rules = self.rules or config.rules
-            partial = config.observability != "full"
-            if resolve_id(config.env) == game_id:
-                options = {**config.env_options, **options}
-            else:
-                say(f"note: this agent was trained on {config.env}")
-        if self.observability is not None:
-            partial = self.observability == "partial"
-
-        def tell(attempt: Any) -> None:
-            say(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
-
-        game = compiled_game(game_id, obs_size, rules, options)
-        views = {"partial": partial, "both": self.both}
-        session = Session(game, seed=self.seed, episodes=self.episodes, on_attempt=tell, **views)
-        player = (
-            recording.trained(agent, partial)
-            if agent
-            else recording.scripted(self.player, session.game, self.seed)
+        scene = self.scene(game_id)
+        game = compiled_game(game_id, scene.obs_size, scene.rules, scene.options)
+        session = Session(
+            game,
+            seed=self.seed,
+            episodes=self.episodes,
+            partial=scene.partial,
+            both=self.both,
+            on_attempt=_say_attempt,
         )
-        how = {"max_steps": self.max_steps, "hold": max(1, round(self.fps)), "scale": self.scale}
+        if scene.agent is None:
+            player = recording.scripted(self.player, session.game, self.seed)
+        else:
+            player = recording.trained(scene.agent, scene.partial)
+        hold = max(1, round(self.fps))
+        frames = recording.recorded_frames(
+            session, player, max_steps=self.max_steps, hold=hold, scale=self.scale
+        )
         with Bars() as bars:
-
-            def counted() -> Iterator[Any]:
-                for count, frame in enumerate(
-                    recording.recorded_frames(session, player, **how), start=1
-                ):
-                    bars.update(str(self.out), count, 0, f"frame {count}")
-                    yield frame
-
-            write(self.out, counted(), self.fps)
+            write(self.out, _counted(frames, bars, str(self.out)), self.fps)
         say(f"recording: {self.out}")
         return 0
+
+    def scene(self, game_id: str) -> Scene:
+        """What is recorded: as the options say, then as the agent was trained, then by default."""
+        from arcade_torch.tools.play import recording
+
+        if self.player in recording.SCRIPTED:
+            scene = Scene(
+                obs_size=self.obs_size or 128,
+                rules=self.rules or "default",
+                partial=self.player == "frames-oracle",
+                options=self.game_options(),
+            )
+        else:
+            scene = self.scene_of_agent(game_id)
+        if self.observability is not None:
+            scene.partial = self.observability == "partial"
+        return scene
+
+    def scene_of_agent(self, game_id: str) -> Scene:
+        """What is recorded of the agent in a run folder."""
+        from arcade_torch.agents import load
+        from arcade_torch.envs_jax import resolve_id
+        from arcade_torch.tools.play import recording
+
+        allowed = f"{', '.join(recording.SCRIPTED)}, or a run folder"
+        require(Path(self.player).is_dir(), "--player", self.player, allowed)
+        agent = load(self.player)
+        config = agent.config
+        if self.obs_size not in (None, config.obs_size):
+            raise ValueError(
+                f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}"
+            )
+        options = self.game_options()
+        if resolve_id(config.env) == game_id:
+            options = dict(config.env_options) | options
+        else:
+            say(f"note: this agent was trained on {config.env}")
+        return Scene(
+            obs_size=config.obs_size,
+            rules=self.rules or config.rules,
+            partial=config.observability != "full",
+            options=options,
+            agent=agent,
+        )
+
+
+def _say_attempt(attempt: Any) -> None:
+    """Say what came of an episode."""
+    say(f"seed {attempt.seed}: {attempt}".replace("abandoned", "cut at --max-steps"))
+
+
+def _counted(frames: Iterable[Any], bars: Bars, name: str) -> Iterator[Any]:
+    """The same frames; their number is shown."""
+    for count, frame in enumerate(frames, start=1):
+        bars.update(name, count, 0, f"frame {count}")
+        yield frame
