@@ -85,8 +85,7 @@ def study(
             study.
         DiskFullError: there is no space left for results; what is finished is kept.
     """
-    is_file = not isinstance(plan_or_file, Study)
-    definition = Study.load(plan_or_file) if is_file else plan_or_file
+    definition = plan_or_file if isinstance(plan_or_file, Study) else Study.load(plan_or_file)
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
     plan = planned(definition, shard)
     folder = StudyFolder(Path(out))
@@ -246,7 +245,7 @@ def progress_bars(
         pace = Pace(LOOK_EVERY_S)
 
         def look() -> None:
-            draw_progress(bars, title, runs, ended, kept)
+            show_progress(bars, title, runs, ended, kept)
 
         def loop() -> None:
             while not stop.wait(pace.rest_s):
@@ -262,7 +261,7 @@ def progress_bars(
             look()
 
 
-def draw_progress(
+def show_progress(
     bars: Bars,
     title: str,
     runs: Mapping[str, Run],
