@@ -40,7 +40,6 @@ LIBRARIES = {
     },
     "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},
 }
-MAX_FUNCTION_LINES = 100
 
 
 @cache
@@ -280,24 +279,3 @@ def test_nothing_is_unpickled() -> None:
             if name in {"np.load", "numpy.load", "jnp.load"} and is_true(call, "allow_pickle"):
                 wrong.append(f"{where}:{call.lineno} {name} with allow_pickle=True")
     assert not wrong, "\n".join(wrong)
-
-
-def test_functions_stay_small() -> None:
-    wrong = []
-    for path in modules().values():
-        for node in ast.walk(tree(path)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length = (node.end_lineno or node.lineno) - node.lineno + 1 - docstring_lines(node)
-                if length > MAX_FUNCTION_LINES:
-                    wrong.append(
-                        f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {length} lines"
-                    )
-    assert not wrong, "\n".join(wrong)
-
-
-def docstring_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """How many lines the docstring takes: documentation does not make a function long."""
-    if ast.get_docstring(function) is None:
-        return 0
-    first = function.body[0]
-    return (first.end_lineno or first.lineno) - first.lineno + 1

@@ -126,10 +126,9 @@ def measure(
         if name in kept:
             keep_freed_memory()
         for table, row in module_of(name).run(benches[name], log):
-            short = {
-                key: float(f"{value:.4g}") if isinstance(value, float) else value
-                for key, value in row.items()
-            }
+            short = {}
+            for key, value in row.items():
+                short[key] = float(f"{value:.4g}") if isinstance(value, float) else value
             tables.setdefault(table, {"rows": []})["rows"].append(short)
     about = machine() | {"keep_memory": ", ".join(kept) or "no"}
     return {"format": FORMAT, "machine": about, "size": size, "tables": tables}
@@ -166,23 +165,27 @@ def _numbers(results: Mapping[str, Any]) -> dict[tuple[str, str, str], float]:
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise ValueError(f"table {name} has no list of rows")
         for row in rows:
-            if missing := [column for column in (*kind.key, *kind.numbers) if column not in row]:
-                raise ValueError(f"a row of table {name} has no {missing[0]}")
-            about = " ".join(", ".join(f"{column} {row[column]}" for column in kind.key).split())
+            for column in (*kind.key, *kind.numbers):
+                if column not in row:
+                    raise ValueError(f"a row of table {name} has no {column}")
+            keys = ", ".join(f"{column} {row[column]}" for column in kind.key)
+            subject = " ".join(keys.split())  # on one line
             for column in kind.numbers:
                 value = row[column]
-                if (
-                    isinstance(value, bool)
-                    or not isinstance(value, int | float)
-                    or not 0 <= value < 1e15
-                ):
+                if not _is_measured(value):
                     raise ValueError(
-                        f"{name}, {about}: {column} is {value!r}, wanted a number from 0 up"
+                        f"{name}, {subject}: {column} is {value!r}, wanted a number from 0 up"
                     )
-                if (name, about, column) in numbers_of_rows:
-                    raise ValueError(f"table {name} has two rows for {about}")
-                numbers_of_rows[name, about, column] = float(value)
+                if (name, subject, column) in numbers_of_rows:
+                    raise ValueError(f"table {name} has two rows for {subject}")
+                numbers_of_rows[name, subject, column] = float(value)
     return numbers_of_rows
+
+
+def _is_measured(value: Any) -> bool:
+    """Whether a value is a number that a benchmark can have measured."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and 0 <= value < 1e15
 
 
 def compare(
@@ -194,29 +197,50 @@ def compare(
     before = _numbers(old)
     after = _numbers(new)
     verdicts: dict[str, list[str]] = {
-        verdict: [] for verdict in ("same", "worse", "better", "missing", "new")
+        "same": [],
+        "worse": [],
+        "better": [],
+        "missing": [],
+        "new": [],
     }
     for key in before | after:
-        (table, row, column) = key
+        table, row, column = key
         was = before.get(key)
         now = after.get(key)
-        ratio = 1.0
         unit = TABLES[table].numbers[column]
-        if was is None or now is None:
-            verdict = "new" if was is None else "missing"
+        ratio = 1.0
+        if was is None:
+            verdict = "new"
+        elif now is None:
+            verdict = "missing"
         else:
-            good, bad = (now, was) if unit in MORE_IS_BETTER else (was, now)
-            ratio = 1.0 if was == now else good / bad if bad else math.inf
-            verdict = (
-                "worse"
-                if ratio < 1 - tolerance
-                else "better"
-                if ratio > 1 / (1 - tolerance)
-                else "same"
-            )
-        values = " -> ".join("none" if value is None else f"{value:,.4g}" for value in (was, now))
+            ratio = _improvement(was, now, unit)
+            verdict = _verdict(ratio, tolerance)
+        values = f"{_short(was)} -> {_short(now)}"
         verdicts[verdict].append(f"{table}: {row}: {column} {values} {unit} (x {ratio:.2f})")
     return verdicts
+
+
+def _improvement(was: float, now: float, unit: str) -> float:
+    """How many times as good a number has become."""
+    if was == now:
+        return 1.0
+    good, bad = (now, was) if unit in MORE_IS_BETTER else (was, now)
+    return good / bad if bad else math.inf
+
+
+def _verdict(ratio: float, tolerance: float) -> str:
+    """One word for an improvement; a share of tolerance is the same."""
+    if ratio < 1 - tolerance:
+        return "worse"
+    if ratio > 1 / (1 - tolerance):
+        return "better"
+    return "same"
+
+
+def _short(value: float | None) -> str:
+    """A number with four digits."""
+    return "none" if value is None else f"{value:,.4g}"
 
 
 def page(results: Mapping[str, Any]) -> str:
