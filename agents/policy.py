@@ -47,7 +47,7 @@ def make_policy(
         A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it
         samples. Random numbers come from torch's global generator.
     """
-    if "logits" in network.out_keys:
+    if "logits" in getattr(network, "out_keys", ()):
         return make_actor(network, deterministic=not explore)
     greedy = QValueModule(action_space="categorical")
     if not explore:
