@@ -380,9 +380,16 @@ class ArcadeEnv(EnvBase):
             batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1
         )
 
-    def _go_on_from(self, state: TensorDictBase | None, ends: torch.Tensor | None = None) -> None:
-        """Put a snapshot in place."""
+    def _go_on_from(
+        self,
+        state: TensorDictBase | None,
+        ends: torch.Tensor | None = None,
+        partial: jax.Array | None = None,
+    ) -> None:
+        """Put a snapshot in place; ``partial`` (bool [N]) says which twins to show in its place."""
         batch = self._snapshots.load(state)
+        if partial is not None:
+            batch = batch._replace(partial=partial)
         terminated, truncated = self._batched.ends(batch)
         some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
         ended = (terminated, truncated) if some_ended else None
@@ -438,9 +445,7 @@ class ArcadeEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # go on from the state the caller handed over, and show the twin that was set last
         if self._state_in_td:
-            twin = self._live.batch.partial
-            self._go_on_from(tensordict.get("state", None))
-            self._live.batch = self._live.batch._replace(partial=twin)
+            self._go_on_from(tensordict.get("state", None), partial=self._live.batch.partial)
         action = self._integers(validation.tensor(tensordict, "action"))
         argument = int32_argument(action, self._jax_device)
         before = Live(self._live.batch, self._live.ended, self._live.ends)
