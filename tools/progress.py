@@ -121,12 +121,12 @@ _FORMATS = {
 
 
 def describe_row(row: Mapping[str, Any]) -> str:
-    """How a run stands by a row of ``metrics.csv``, in a few words; what there is not yet is left
+    """Describe a run by a row of ``metrics.csv``, in a few words; values that are missing are left
     out.
 
     Example:
         >>> row = {"train_return_ewm": 0.5, "eval_return": None, "loss": 0.0123, "lr": 5e-5}
-        >>> standing({**row, "epsilon": 0.2})
+        >>> describe_row({**row, "epsilon": 0.2})
         'return 0.500, loss 0.0123, epsilon 0.20, lr 5.0e-05'
     """
     parts = []
