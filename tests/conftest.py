@@ -2,6 +2,7 @@
 cannot run.
 """
 
+import gc
 import importlib.util
 import os
 import sys
@@ -101,3 +102,32 @@ def _memories_as_before() -> Iterator[None]:
     if registry is not None and before is not None:
         registry._FACTORIES.clear()
         registry._FACTORIES.update(before)
+
+
+_GIGABYTE = 2**30
+_most_bytes = 4 * _GIGABYTE
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _memory_is_given_back() -> Iterator[None]:
+    """Drop JAX's compiled programs after a file of tests when the process has become large.
+
+    Two processes that keep every program of every game hold eight gigabytes each at the end, and
+    one was seen to crash while it compiled one more.
+    """
+    global _most_bytes
+    yield
+    if "jax" not in sys.modules or _resident_bytes() < _most_bytes:
+        return
+    sys.modules["jax"].clear_caches()
+    gc.collect()
+    _most_bytes = max(_most_bytes, _resident_bytes() + 2 * _GIGABYTE)
+
+
+def _resident_bytes() -> int:
+    """Memory that this process holds; 0 where the system does not say."""
+    try:
+        pages = Path("/proc/self/statm").read_text().split()[1]
+    except OSError:
+        return 0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
