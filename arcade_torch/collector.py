@@ -218,9 +218,9 @@ class ArcadeCollector(BaseCollector):
         first_window = self._acted == 0
         # Taken away until the window is whole: whatever ends it early, the next one begins with new
         # storage.
+        self._seen = (-1, -1)  # first, for then it is known that the others are gone
         self._buffer = None
         self._obs = {}  # nothing holds the first frames
-        self._seen = (-1, -1)
         first = buffer.begin(carry=not first_window, reuse=self.return_same_td, dense=dense)
         began_with = {key: value for key, value in obs.items() if key != "pixels"}
         random = random or self.policy is None or self._frames < self.init_random_frames
