@@ -61,7 +61,7 @@ class FrameMemory:
 
     def spare(self) -> Spare:
         """Memory to be given to the function that draws, once; None where nothing is reused."""
-        new = partial(jnp.empty, self._shape, jnp.uint8, device=self._device)
+        new = partial(jnp.empty, self._shape, np.uint8, device=self._device)
         return self._reused.take(new) if self._reuses else None
 
     def show(self, frames: jax.Array) -> jax.Array | npt.NDArray[np.uint8]:
@@ -86,7 +86,7 @@ class Canvas:
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        memory = jnp.empty(shape, jnp.uint8, device=jax.devices("cpu")[0]).block_until_ready()
+        memory = jnp.empty(shape, np.uint8, device=jax.devices("cpu")[0]).block_until_ready()
         self._results: deque[tuple[jax.Array, ...]] = deque([(memory,)], maxlen=1)
         self.address = memory.unsafe_buffer_pointer()
         self.__array_interface__ = {
