@@ -119,7 +119,7 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
                     answers.setdefault(fact, []).append(cells)
         explores = rng.random(num_envs) < 0.5
         action = np.where(explores, rng.integers(0, 5, num_envs), action).astype(np.int32)
-        batch, _, outcome, pixels = batched.step_auto(batch, action)
+        batch, _, outcome, pixels = batched.step_autoreset(batch, action)
         is_init = np.asarray(outcome.done)
     return torch.cat(seen), {
         fact: torch.from_numpy(np.concatenate(rows)) for fact, rows in answers.items()

@@ -34,6 +34,8 @@ class LRU(Memory):
     Source: Orvieto et al. (2023), arXiv 2303.06349, eq. 8 and lemma 3.2.
     """
 
+    scan = staticmethod(linear_scan)
+
     def __init__(
         self,
         input_size: int,
@@ -67,10 +69,7 @@ class LRU(Memory):
         decay = torch.polar(torch.exp(-torch.exp(self.nu)), torch.exp(self.theta))
         scaled = (self.input * torch.exp(self.gamma)[:, None, None]).flatten(0, 1)
         b = F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2))
-        h = torch.view_as_real(
-            linear_scan(
-                decay, torch.view_as_complex(b), is_init, torch.view_as_complex(h0.contiguous())
-            )
-        )
+        start = torch.view_as_complex(h0.contiguous())
+        h = torch.view_as_real(self.scan(decay, torch.view_as_complex(b), is_init, start))
         passed = x * self.skip if self.skip.ndim == 1 else F.linear(x, self.skip)
         return F.linear(h.flatten(-2), self.output.flatten(1)) + passed, h

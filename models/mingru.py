@@ -33,6 +33,8 @@ class MinGRU(Memory):
     Source: POPGym Arcade, appendix on memory models; Feng et al. (2024), arXiv 2410.01201.
     """
 
+    scan = staticmethod(linear_scan)
+
     def __init__(
         self,
         input_size: int,
@@ -56,5 +58,5 @@ class MinGRU(Memory):
         gate = torch.sigmoid(gate)
         if self.candidate == "tanh":
             candidate = torch.tanh(candidate)
-        h = linear_scan(1 - gate, gate * candidate, is_init, h0)
+        h = self.scan(1 - gate, gate * candidate, is_init, h0)
         return h, h

@@ -77,7 +77,7 @@ def ours(game: str, partial_obs: bool) -> Measure:
     action = actions()
 
     def work() -> Any:
-        carry[0], _, _, pixels = batched.step_auto(carry[0], next(action))
+        carry[0], _, _, pixels = batched.step_autoreset(carry[0], next(action))
         return pixels.block_until_ready()
 
     return Measure(work, read_all, ENVS)

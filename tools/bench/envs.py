@@ -99,7 +99,7 @@ def _bare(game: str, size: int, count: int) -> dict[str, Measure]:
         return batched.reset_where(stepped, outcome.done), outcome.reward
 
     def draw_work() -> Any:
-        state["step+draw"], _, _, pixels = batched.step_auto(state["step+draw"], next(actions))
+        state["step+draw"], _, _, pixels = batched.step_autoreset(state["step+draw"], next(actions))
         return pixels.block_until_ready()
 
     def step_work() -> Any:

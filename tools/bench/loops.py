@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from arcade_torch.models import matrix_scan_loop
 from arcade_torch.models.gdn import GatedDeltaNet
@@ -43,26 +42,13 @@ def unbind_loop(
 class LoopLRU(LRU):
     """The LRU, solved by `unbind_loop`."""
 
-    def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
-        """As the LRU has it, but for the loop."""
-        decay = torch.polar(torch.exp(-torch.exp(self.nu)), torch.exp(self.theta))
-        scaled = (self.input * torch.exp(self.gamma)[:, None, None]).flatten(0, 1)
-        b = torch.view_as_complex(F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2)))
-        states = unbind_loop(decay, b, is_init, torch.view_as_complex(h0.contiguous()))
-        h = torch.view_as_real(states)
-        passed = x * self.skip if self.skip.ndim == 1 else F.linear(x, self.skip)
-        return F.linear(h.flatten(-2), self.output.flatten(1)) + passed, h
+    scan = staticmethod(unbind_loop)
 
 
 class LoopMinGRU(MinGRU):
-    """MinGRU with its default candidate, solved by `unbind_loop`."""
+    """MinGRU, solved by `unbind_loop`."""
 
-    def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
-        """As MinGRU has it, but for the loop."""
-        gate, candidate = self.gate_and_candidate(x).chunk(2, dim=-1)
-        gate = torch.sigmoid(gate)
-        h = unbind_loop(1 - gate, gate * torch.tanh(candidate), is_init, h0)
-        return h, h
+    scan = staticmethod(unbind_loop)
 
 
 class MatrixLoop:
