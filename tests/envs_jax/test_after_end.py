@@ -138,6 +138,42 @@ def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     assert np.array_equal(again.done[~mask], outcome.done[-1][~mask])
 
 
+@pytest.mark.parametrize("which", BATCHES)
+def test_a_batch_that_says_that_every_episode_runs_steps_to_the_same_bits(which):
+    """A batch without flags has nothing to hold; the bridge carries such batches."""
+    batched = BATCHES[which]()
+    flagged = batched.init(env_keys(3, 6), np.zeros(6, bool))
+    running = batched.without_ends(flagged)
+    assert len(jax.tree.leaves(running)) < len(jax.tree.leaves(flagged))
+    for number in range(40):
+        action = np.full(6, number % 5, np.int32)
+        flagged, _, outcome, frames = batched.step_autoreset(flagged, action)
+        running, _, running_outcome, running_frames = batched.step_autoreset(running, action)
+        pairs = zip(
+            jax.tree.leaves((flagged, outcome, frames)),
+            jax.tree.leaves((running, running_outcome, running_frames)),
+            strict=True,
+        )
+        for one, other in pairs:
+            assert np.array_equal(one, other)
+        running = batched.without_ends(running)
+
+
+@pytest.mark.parametrize("which", BATCHES)
+def test_flags_can_be_taken_from_a_batch_and_put_back(which):
+    batched = BATCHES[which]()
+    batch = batched.init(env_keys(3, 6), np.zeros(6, bool))
+    terminated = np.arange(6) % 2 == 0
+    truncated = np.arange(6) > 3
+    ended = batched.with_ends(batched.without_ends(batch), terminated, truncated)
+    assert np.array_equal(batched.ends(ended), (terminated, truncated))
+    assert jax.tree.structure(ended) == jax.tree.structure(batch)
+    stepped, outcome = batched.step(ended, np.zeros(6, np.int32))
+    held = terminated | truncated
+    assert (np.asarray(outcome.done)[held]).all() and not np.asarray(outcome.reward)[held].any()
+    assert (np.asarray(stepped.step_count) == ~held).all()
+
+
 def test_step_env_of_the_adapter_stays_and_step_begins_anew():
     env, params = gymnax.make("MineSweeperEasy")
     obs, state = env.reset(jax.random.PRNGKey(0), params)
