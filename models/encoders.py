@@ -17,14 +17,18 @@ class Encoder(nn.Module):
 
     Args:
         obs_size: S, side of a full frame in pixels.
-        stored_size: s, side of a compressed frame in pixels.
+        stored_shape: of a compressed frame, three numbers.
         feature_size: E.
     """
 
-    def __init__(self, obs_size: int, stored_size: int, feature_size: int) -> None:
+    def __init__(
+        self, obs_size: int, stored_shape: tuple[int, int, int], feature_size: int
+    ) -> None:
         super().__init__()
         self.obs_size = obs_size
-        self.stored_size = stored_size
+        self.sides: tuple[int, ...] = (obs_size,)
+        """Sides of the pictures that ``compress`` takes."""
+        self.stored_shape = stored_shape
         self.feature_size = feature_size
         self.amp = False
         """Whether convolutions and products are taken in bfloat16; weights and features stay as
@@ -41,7 +45,7 @@ class Encoder(nn.Module):
             pixels: uint8 (or float, 0..255) [..., S, S, 3].
 
         Returns:
-            same dtype, [..., s, s, 3].
+            same dtype, [..., *stored_shape].
         """
         return pixels
 
@@ -54,7 +58,8 @@ class Encoder(nn.Module):
         """Encode frames.
 
         Args:
-            pixels: uint8 or float (0..255), full [..., S, S, 3] or compressed [..., s, s, 3].
+            pixels: uint8 or float (0..255), full [..., S, S, 3] or compressed
+                [..., *stored_shape].
 
         Returns:
             float [..., E], dtype of the parameters.
@@ -72,27 +77,24 @@ class Encoder(nn.Module):
         return features.reshape(*pixels.shape[:-3], self.feature_size)
 
     def features(self, frames: Tensor) -> Tensor:
-        """Encode compressed frames [N, s, s, 3] -> [N, E]."""
+        """Encode compressed frames [N, *stored_shape] -> [N, E]."""
         raise NotImplementedError
 
     def _frames(self, pixels: Tensor) -> Tensor:
-        """Compressed frames with one batch dimension, [N, s, s, 3]."""
-        size = tuple(pixels.shape[-3:])
-        full = (self.obs_size, self.obs_size, 3)
-        stored = (self.stored_size, self.stored_size, 3)
-        if size not in (full, stored):
+        """Compressed frames with one batch dimension, [N, *stored_shape]."""
+        shape = tuple(pixels.shape[-3:])
+        is_stored = shape == self.stored_shape
+        if not is_stored and shape not in [(side, side, 3) for side in self.sides]:
+            size = f"[..., {self.obs_size}, {self.obs_size}, 3]"
+            stored = f"[..., {', '.join(map(str, self.stored_shape))}]"
             raise ValueError(
-                f"frames must be [..., {self.obs_size}, {self.obs_size}, 3] (height, width, colour)"
-                + (
-                    ""
-                    if full == stored
-                    else f" or compressed [..., {self.stored_size}, {self.stored_size}, 3]"
-                )
+                f"frames must be {size} (height, width, colour)"
+                + ("" if stored == size else f" or compressed {stored}")
                 + f", got {list(pixels.shape)}"
             )
         _check_floats(pixels)
-        frames = pixels.reshape(-1, *size)
-        return frames if size == stored else self.compress(frames)
+        frames = pixels.reshape(-1, *shape)
+        return frames if is_stored else self.compress(frames)
 
 
 def _check_floats(pixels: Tensor) -> None:
@@ -166,7 +168,8 @@ class PaperEncoder(Encoder):
         if obs_size not in _PAPER_LAYERS:
             raise ValueError(f"the paper's encoder exists for obs_size 128 and 256, got {obs_size}")
         seen = _side_seen(_PAPER_LAYERS[obs_size])
-        super().__init__(obs_size, seen + seen % 2, _PAPER_CHANNELS[-1])
+        side = seen + seen % 2
+        super().__init__(obs_size, (side, side, 3), _PAPER_CHANNELS[-1])
         layers: list[nn.Module] = []
         for i, ((kernel, stride), pool) in enumerate(_PAPER_LAYERS[obs_size]):
             layers.append(nn.Conv2d(_PAPER_CHANNELS[i], _PAPER_CHANNELS[i + 1], kernel, stride))
@@ -185,7 +188,8 @@ class PaperEncoder(Encoder):
         Returns:
             a view, [..., s, s, 3] with s = 120 for S = 128 and 218 for 256.
         """
-        return pixels[..., : self.stored_size, : self.stored_size, :]
+        rows, columns, _ = self.stored_shape
+        return pixels[..., :rows, :columns, :]
 
     def features(self, frames: Tensor) -> Tensor:
         """[N, s, s, 3] -> [N, 512]."""
@@ -193,14 +197,19 @@ class PaperEncoder(Encoder):
         return self.layers(x).flatten(1)  # type: ignore[no-any-return]
 
 
+PATCHES = 8  # patches of the small encoder on a side of a frame
+
+
 class SmallEncoder(Encoder):
     """A CNN for one CPU core: frames pooled, 8 x 8 patches, one convolution, one layer over all
     places, 128 features.
 
-    Pooled frames are uint8 (floor of the block's mean; 3 KiB at 32 pixels), so they are pooled once
-    and stored pooled. Input scaling: minus a per-pixel mean, divided by one number, the RMS of the
-    centred pixels; :meth:`calibrate` sets both (before that: division by 255). Float frames are
-    pooled without the floor.
+    A compressed frame is pooled to side x side pixels (uint8, floor of the block's mean) and stands
+    in patches, uint8 [8, 8, k * k * 3] with k = side / 8: 3 KiB for 32 pixels, 12 for 64. So
+    frames are pooled and ordered once, and the first layer, a convolution whose windows do not
+    overlap, is one product of patches and weights. Input scaling: minus a per-pixel mean, divided
+    by one number, the RMS of the centred pixels; :meth:`calibrate` sets both (before that: division
+    by 255). Float frames are pooled without the floor.
 
     Args:
         obs_size: S, 32 times a power of two up to 256.
@@ -217,8 +226,11 @@ class SmallEncoder(Encoder):
                 "obs_size must be 32, 64, 128 or 256, and side 32 or 64 and no larger; got "
                 f"{obs_size} and {side}"
             )
-        super().__init__(obs_size, side, 128)
-        self.conv1 = nn.Conv2d(3, channels, side // 8, side // 8)
+        patch = side // PATCHES
+        super().__init__(obs_size, (PATCHES, PATCHES, patch * patch * 3), 128)
+        self.side = side
+        self.sides = (obs_size, side)
+        self.conv1 = nn.Conv2d(3, channels, patch, patch)
         self.conv2 = nn.Conv2d(channels, 32, 3)
         self.linear = nn.Conv2d(32, 128, 6)
         self.linear.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -228,46 +240,57 @@ class SmallEncoder(Encoder):
         self.inverse_rms: Tensor
 
     def compress(self, pixels: Tensor) -> Tensor:
-        """Average pooling.
+        """Average pooling, and the order of patches.
 
         Args:
-            pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3].
+            pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3], or
+                pooled already, [..., side, side, 3].
 
         Returns:
-            same dtype, [..., s, s, 3].
+            same dtype, [..., 8, 8, k * k * 3].
         """
         lead = pixels.shape[:-3]
-        side = self.stored_size
-        block = self.obs_size // self.stored_size
         if pixels.is_floating_point():
-            return pixels.reshape(*lead, side, block, side, block, 3).mean(dim=(-4, -2))
+            block = pixels.shape[-2] // self.side
+            blocks = pixels.reshape(*lead, self.side, block, self.side, block, 3)
+            return self._patches(blocks.mean(dim=(-4, -2)))
         # beyond that the sums leave the cache: half as fast
         if pixels.device.type == "cpu" and lead.numel() > 64:
             chunks = pixels.reshape(-1, *pixels.shape[-3:]).split(64)
-            return torch.cat([self._pool(chunk) for chunk in chunks]).reshape(*lead, side, side, 3)
-        return self._pool(pixels).reshape(*lead, side, side, 3)
+            pooled = torch.cat([self._patches(self._pool(chunk)) for chunk in chunks])
+        else:
+            pooled = self._patches(self._pool(pixels))
+        return pooled.reshape(*lead, *self.stored_shape)
+
+    def _patches(self, pooled: Tensor) -> Tensor:
+        """Pooled frames [..., side, side, 3] in patches, [..., 8, 8, k * k * 3]."""
+        patch = self.side // PATCHES
+        lead = pooled.shape[:-3]
+        squares = pooled.reshape(*lead, PATCHES, patch, PATCHES, patch, 3)
+        return squares.transpose(-4, -3).reshape(*lead, *self.stored_shape)
 
     def _pool(self, pixels: Tensor) -> Tensor:
-        """uint8 [..., S, S, 3] -> uint8 [N * s, s, 3], floor of the block mean."""
-        block = self.obs_size // self.stored_size
+        """uint8 [..., S, S, 3] -> uint8 [N, side, side, 3], floor of the block mean."""
+        size = pixels.shape[-2]
+        block = size // self.side
         # Sums fit int16 (8 * 8 * 255). Whole lines are added, never pixels of three values: rows
         # first, then each line to itself, moved by 1, 2 and 4 pixels; what every block-th pixel
         # then holds is the sum of its block.
-        lines = pixels.reshape(-1, block, self.obs_size * 3).unbind(1)
+        lines = pixels.reshape(-1, block, size * 3).unbind(1)
         total = lines[0].to(torch.int16)
         for line in lines[1:]:
             total = total.add_(line)
         for step in (3, 6, 12)[: block.bit_length() - 1]:
             total = total[:, :-step] + total[:, step:]
         mean = total.unfold(1, 3, 3 * block) >> (2 * (block.bit_length() - 1))
-        return mean.to(torch.uint8)
+        return mean.to(torch.uint8).reshape(-1, self.side, self.side, 3)
 
     @torch.no_grad()
     def calibrate(self, pixels: Tensor) -> None:
         """Set mean and RMS from frames of random play (3,200 frames are plenty).
 
         Args:
-            pixels: uint8, full [..., S, S, 3] or compressed [..., s, s, 3].
+            pixels: uint8, full [..., S, S, 3] or compressed [..., 8, 8, k * k * 3].
 
         Raises:
             ValueError: no frames, or of another size.
@@ -280,16 +303,37 @@ class SmallEncoder(Encoder):
         mean = centred.mean(0)
         # one grey level: frames that never change
         rms = (centred - mean).square().mean().sqrt().clamp_min(1.0)
-        self.mean.copy_(mean.permute(2, 0, 1))
+        patch = self.side // PATCHES
+        squares = mean.reshape(PATCHES, PATCHES, patch, patch, 3).transpose(1, 2)
+        self.mean.copy_(squares.reshape(self.side, self.side, 3).permute(2, 0, 1))
         self.inverse_rms.copy_(1 / rms)
 
     def features(self, frames: Tensor) -> Tensor:
-        """[N, s, s, 3] -> [N, 128]."""
-        # colours stay last, as they arrive
-        x = torch.sub(frames, self.mean.permute(1, 2, 0)).permute(0, 3, 1, 2)
+        """[N, 8, 8, k * k * 3] -> [N, 128]."""
+        mean = self._patches(self.mean.permute(1, 2, 0))
         weight = self.conv1.weight * self.inverse_rms  # rather the weights than every pixel
-        # three channels: bfloat16 takes twice as long on a CPU
-        with torch.autocast(x.device.type, enabled=False):
-            x = F.leaky_relu_(F.conv2d(x, weight, self.conv1.bias, self.conv1.stride))
+        weight = weight.permute(0, 2, 3, 1).flatten(1)  # [C, k * k * 3], the order of a patch
+        layers = self._in_products if self.amp else self._in_convolutions
+        return F.leaky_relu_(F.layer_norm(layers(frames, mean, weight), (self.feature_size,)))
+
+    def _in_convolutions(self, frames: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
+        """The three layers in float32, where convolutions are faster than products on many
+        processors.
+        """
+        x = torch.sub(frames, mean).permute(0, 3, 1, 2)  # patches stay last in memory
+        x = F.leaky_relu_(F.conv2d(x, weight[:, :, None, None], self.conv1.bias))
         x = F.leaky_relu_(self.conv2(x))
-        return F.leaky_relu_(F.layer_norm(self.linear(x).flatten(1), (self.feature_size,)))
+        return self.linear(x).flatten(1)  # type: ignore[no-any-return]
+
+    def _in_products(self, frames: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
+        """The same in bfloat16.
+
+        Pixels minus a whole number are exact there; what that leaves of the mean goes, times the
+        weights, into a bias for every place.
+        """
+        whole = mean.round()
+        bias = F.linear(whole - mean, weight, self.conv1.bias).to(torch.bfloat16)
+        x = F.linear(torch.sub(frames, whole.to(torch.bfloat16)), weight) + bias
+        x = F.leaky_relu_(x).permute(0, 3, 1, 2)
+        x = F.leaky_relu_(self.conv2(x)).permute(0, 2, 3, 1).flatten(1)
+        return F.linear(x, self.linear.weight.permute(0, 2, 3, 1).flatten(1), self.linear.bias)

@@ -266,8 +266,9 @@ class MemoryNetwork(TensorDictModuleBase):
             pixels: uint8 [..., S, S, 3].
 
         Returns:
-            uint8 [..., s, s, 3]: 32x32 block means for "small", the upper left 120x120 (of 256:
-            218x218) for "paper".
+            uint8 [..., 8, 8, k * k * 3] for "small": patches of a picture of 32 x 32 block means (k
+            = 4; "small64": 64 x 64, k = 8); for "paper" the upper left [..., 120, 120, 3] (of 256:
+            218).
         """
         return self.encoder.compress(pixels)
 
@@ -278,8 +279,8 @@ class MemoryNetwork(TensorDictModuleBase):
         self.encoder.calibrate(pixels)
 
     def encode(self, pixels: Tensor) -> Tensor:
-        """Frames, uint8 or float 0..255, full or compressed [..., S or s, S or s, 3], to features
-        float [..., E].
+        """Frames, uint8 or float 0..255, full [..., S, S, 3] or compressed, to features float
+        [..., E].
         """
         return self.encoder(pixels)  # type: ignore[no-any-return]
 

@@ -14,6 +14,14 @@ def frames(*shape, size=128):
     return torch.randint(0, 256, (*shape, size, size, 3), dtype=torch.uint8)
 
 
+def picture(patches):
+    """The pooled picture [..., side, side, 3] of a small encoder's compressed frame."""
+    *lead, rows, columns, values = patches.shape
+    side = round((values / 3) ** 0.5)
+    squares = patches.reshape(*lead, rows, columns, side, side, 3).transpose(-4, -3)
+    return squares.reshape(*lead, rows * side, columns * side, 3)
+
+
 @pytest.mark.parametrize(("size", "count"), [(128, 505_472), (256, 1_558_656)])
 def test_the_papers_encoder_has_the_published_size_and_512_features(size, count):
     encoder = PaperEncoder(size)
@@ -64,10 +72,10 @@ def test_small_pooling_is_the_floor_of_the_block_mean(side, block, lead, high, s
     sums = pixels.long().reshape(*lead, side, block, side, block, 3).sum((-4, -2))
     assert (
         pooled.dtype == torch.uint8
-        and pooled.shape == (*lead, side, side, 3)
+        and pooled.shape == (*lead, 8, 8, 3 * (side // 8) ** 2)
         and pooled.is_contiguous()
     )
-    assert torch.equal(pooled, (sums // block**2).to(torch.uint8))
+    assert torch.equal(picture(pooled), (sums // block**2).to(torch.uint8))
 
 
 def test_pooling_does_not_write_to_the_frames():
@@ -114,7 +122,7 @@ def test_the_papers_encoder_depends_on_the_upper_left_part_which_is_all_it_store
     size, seen, stored
 ):
     encoder, pixels = PaperEncoder(size).eval(), frames(2, size=size)
-    assert encoder.stored_size == stored
+    assert encoder.stored_shape == (stored, stored, 3)
     assert encoder.compress(pixels).shape == (2, stored, stored, 3)
     with torch.no_grad():
         features = encoder(pixels)
@@ -150,8 +158,17 @@ def test_float_frames_equal_uint8_frames_and_have_gradients(make):
 
 def test_compressed_float_frames_are_read_too():
     encoder = SmallEncoder()
-    pooled = frames(2, size=32)
+    pooled = encoder.compress(frames(2))
     assert torch.equal(encoder(pooled.float()), encoder(pooled))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_picture_that_is_pooled_already_is_taken_as_it_is(dtype):
+    encoder = SmallEncoder()
+    pooled = frames(2, 3, size=32).to(dtype)
+    assert torch.equal(picture(encoder.compress(pooled)), pooled)
+    large = pooled.repeat_interleave(4, -3).repeat_interleave(4, -2)
+    assert torch.equal(encoder(pooled), encoder(large))
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -162,7 +179,7 @@ def test_calibration_centres_each_pixel_and_scales_all_to_rms_one(compressed):
     )
     pooled = encoder.compress(pixels)
     encoder.calibrate(pooled if compressed else pixels)
-    x = (pooled.permute(0, 1, 4, 2, 3) - encoder.mean) * encoder.inverse_rms
+    x = (picture(pooled).permute(0, 1, 4, 2, 3) - encoder.mean) * encoder.inverse_rms
     torch.testing.assert_close(x.mean((0, 1)), torch.zeros(3, 32, 32), rtol=0, atol=1e-4)
     torch.testing.assert_close(x.square().mean(), torch.tensor(1.0), rtol=0, atol=1e-4)
     assert {"mean", "inverse_rms"} <= set(encoder.state_dict())
@@ -177,7 +194,7 @@ def test_calibration_on_frames_that_never_change_stays_finite():
 def test_wrong_sizes_get_one_clear_line():
     with pytest.raises(
         ValueError,
-        match=r"\[\.\.\., 128, 128, 3\].*compressed \[\.\.\., 32, 32, 3\], got \[2, 3, 128, 128\]",
+        match=r"\[\.\.\., 128, 128, 3\].*compressed \[\.\.\., 8, 8, 48\], got \[2, 3, 128, 128\]",
     ):
         SmallEncoder()(torch.zeros(2, 3, 128, 128))
     with pytest.raises(ValueError, match="128 and 256, got 64"):
@@ -200,7 +217,7 @@ def test_the_small_encoder_and_its_gradients_are_those_of_the_documented_stack_o
     encoder.to(dtype)
     weights = [encoder.conv1, encoder.conv2, encoder.linear]
     x = (
-        encoder.compress(pixels).permute(0, 3, 1, 2).to(dtype) - encoder.mean
+        picture(encoder.compress(pixels)).permute(0, 3, 1, 2).to(dtype) - encoder.mean
     ) * encoder.inverse_rms
     x = F.leaky_relu(
         F.conv2d(x.contiguous(), encoder.conv1.weight, encoder.conv1.bias, stride=side // 8)
@@ -234,3 +251,25 @@ def test_frames_that_were_divided_by_255_already_are_refused(make):
         encoder(frames / 255)
     vectorised = torch.func.vmap(encoder)(frames.float()[:, None])
     torch.testing.assert_close(vectorised.squeeze(1), encoder(frames.float()), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("side", [32, 64])
+def test_in_bfloat16_the_small_encoder_is_as_near_as_its_rounding(side):
+    """Pixels minus their mean are exact there: what is left is the rounding of weights and
+    layers.
+    """
+    encoder = SmallEncoder(128, side, side)
+    pixels = frames(40) // 2
+    encoder.calibrate(pixels)
+    exact = encoder(pixels)
+    wanted = torch.autograd.grad(exact, list(encoder.parameters()), exact.detach())
+    encoder.amp = True
+    rounded = encoder(pixels)
+    assert rounded.dtype == torch.float32
+    assert (rounded - exact).norm() < 0.02 * exact.norm()
+    gradients = torch.autograd.grad(rounded, list(encoder.parameters()), exact.detach())
+    for one, other in zip(gradients, wanted, strict=True):
+        assert (one - other).norm() < 0.2 * other.norm()
+    smooth = pixels.float().requires_grad_()
+    encoder(smooth).square().sum().backward()
+    assert (smooth.grad != 0).any()
