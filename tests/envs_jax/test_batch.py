@@ -124,8 +124,14 @@ def test_the_frame_is_a_function_of_state_and_twin_alone(id):
         assert np.array_equal(game.render(again), frames)
 
 
-@pytest.mark.parametrize("id", ALL_IDS)
-@pytest.mark.parametrize("rules", ["default", "reference"])
+# Every game, every difficulty, and the published rules at the easiest and the hardest.
+LONG_ROLLOUTS = [(id, "default") for id in ALL_IDS]
+for _id in ALL_IDS:
+    _rarely = [pytest.mark.slow] if "Medium" in _id else []
+    LONG_ROLLOUTS.append(pytest.param(_id, "reference", marks=_rarely))
+
+
+@pytest.mark.parametrize(("id", "rules"), LONG_ROLLOUTS)
 def test_long_random_rollouts_keep_the_contract(id, rules):
     game = batched(id, rules=rules)
     low, high = game.game.return_range
