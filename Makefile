@@ -14,6 +14,7 @@ PAGE    ?= $(if $(filter cuda,$(DEVICE)),results,$(OUT))/gpu.md
 VENV := .venv
 OLDEST := .venv-oldest
 NEWEST := .venv-newest
+SUITES := .venv-suites
 OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
   models/test_memory_models.py agents/runs/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
 NEWEST_TESTS := $(addprefix tests/,contracts agents/test_identities.py agents/test_torchrl_batches.py \
@@ -29,7 +30,7 @@ PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow test-oldest test-newest test-triton lint bench gpu parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-oldest test-newest test-suites test-triton lint bench gpu parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -40,6 +41,7 @@ help:
 	@echo "make test-oldest  a part of the tests with the oldest supported versions, in $(OLDEST)"
 	@echo "make test-newest  the contracts, the bridge, the losses and a run with the newest versions there are, in $(NEWEST)"
 	@echo "                (NEWEST_TORCHRL=torchrl: its newest release in the place of its nightly build)"
+	@echo "make test-suites  from_jax on gymnax and Craftax, in $(SUITES)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
@@ -68,6 +70,17 @@ $(VENV)/.docs: $(VENV)/.installed
 $(VENV)/.triton: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[triton]'
 	@touch $@
+
+# Not in $(VENV): popgym-arcade brings another package of the name gymnax.
+$(SUITES)/.installed: setup.cfg pyproject.toml
+	@$(SUITES)/bin/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(SUITES)
+	$(SUITES)/bin/python -m pip install --quiet torch==2.13.0 setuptools wheel
+	$(SUITES)/bin/python -m pip install --quiet --no-build-isolation -e '.[suites]' hypothesis pytest pytest-timeout
+	@touch $@
+
+test-suites: $(SUITES)/.installed
+	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(SUITES)/jax-cache SUITES_ARE_THERE=1 \
+	  $(SUITES)/bin/python -m pytest tests/contracts/test_jax_suites.py -k "not popgym" $(ARGS)
 
 $(VENV)/.parity: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[parity]'
@@ -122,6 +135,7 @@ gpu:
 
 parity: $(VENV)/.parity
 	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity --timeout=3600 tests/parity $(ARGS)
+	SUITES_ARE_THERE=1 $(ONE_THREAD) $(RUN) -m pytest tests/contracts/test_jax_suites.py -k popgym
 
 bench-parity: $(VENV)/.parity
 	$(RUN) -m tests.parity.bench $(ARGS)
@@ -135,4 +149,4 @@ clean:
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(OLDEST) $(NEWEST)
+	rm -rf $(VENV) $(OLDEST) $(NEWEST) $(SUITES)

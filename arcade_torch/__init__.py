@@ -25,6 +25,8 @@ __version__ = "0.2.0"
 _PUBLIC = {
     "ArcadeCollector": "arcade_torch.collector",
     "ArcadeEnv": "arcade_torch.env",
+    "JaxEnv": "arcade_torch.jax_env",
+    "from_jax": "arcade_torch.jax_env",
     "make": "arcade_torch.factory",
     "registered_ids": "arcade_torch.envs_jax",
 }
@@ -34,8 +36,17 @@ if TYPE_CHECKING:
     from arcade_torch.env import ArcadeEnv
     from arcade_torch.envs_jax import registered_ids
     from arcade_torch.factory import make
+    from arcade_torch.jax_env import JaxEnv, from_jax
 
-__all__ = ["ArcadeCollector", "ArcadeEnv", "__version__", "make", "registered_ids"]
+__all__ = [
+    "ArcadeCollector",
+    "ArcadeEnv",
+    "JaxEnv",
+    "__version__",
+    "from_jax",
+    "make",
+    "registered_ids",
+]
 
 
 if not TYPE_CHECKING:  # a checker is to find misspelt names

@@ -505,14 +505,7 @@ class ArcadeEnv(EnvBase):
             ended = self._live.batch._replace(state=raw.final[0])
             drawn = self._ends.show(self._compiled.draw(ended, self._ends.spare()))
             following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
-        # what the policy wrote for the next step, such as its recurrent state
-        preset = tensordict.get("next", None)
-        if preset is not None:
-            unknown = preset.exclude(*following.keys(True, True))
-            following.update(unknown)
-            keys = tuple(unknown.keys(True, True))
-            if keys:
-                validation.warn_state_is_dropped(*keys)  # by _step_mdp below
+        validation.keep_what_was_written(tensordict, following)
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
         counts = raw.root_numbers(("is_init", "step_count", "episode_reward"))

@@ -50,16 +50,28 @@ def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
     return leaf
 
 
-class Snapshots:
-    """Turns batches of one game, or of a mixture of games, into TensorDicts and back; ``batch`` is
-    any one of them.
+class TreeSnapshots:
+    """Turns one pytree of arrays [N, ...] into a TensorDict [N] and back.
+
+    Args:
+        tree: Any such tree; shapes and types are taken from it.
+        num_envs: N.
+        device: Of the tensors.
+        jax_device: Of the arrays.
+        kind: What the tree is called in messages.
+        may_lack: Names of leaves that an older TensorDict lacks; zeros stand in for them.
     """
 
     def __init__(
-        self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device
+        self,
+        tree: Any,
+        num_envs: int,
+        device: torch.device,
+        jax_device: jax.Device,
+        kind: str,
+        may_lack: tuple[str, ...] = (),
     ) -> None:
-        shapes = jax.eval_shape(batched.pad, batch)
-        leaves, self._tree = jax.tree_util.tree_flatten_with_path(shapes)
+        leaves, self._tree = jax.tree_util.tree_flatten_with_path(tree)
         self._keys: list[tuple[str, ...]] = []
         self._dtypes: list[np.dtype[Any]] = []
         self._shapes: list[torch.Size] = []
@@ -68,15 +80,92 @@ class Snapshots:
             self._keys.append(tuple(name.split("/")))
             self._dtypes.append(np.dtype(leaf.dtype))
             self._shapes.append(torch.Size(leaf.shape))
-        self._num_envs = int(batch.step_count.shape[0])
+        self._num_envs = num_envs
+        self._device = device
+        self._jax_device = jax_device
+        self._kind = kind
+        self._may_lack = may_lack
+
+    def export(self, tree: Any) -> TensorDict:
+        """Copy a tree out of JAX, every leaf under its path."""
+        out = TensorDict({}, batch_size=[self._num_envs], device=self._device)
+        for key, array in zip(self._keys, jax.tree.leaves(tree), strict=True):
+            tensor = to_torch(array, self._device)
+            signed = _SIGNED.get(np.dtype(array.dtype))
+            out[key] = (tensor if signed is None else tensor.view(signed)).clone()
+        return out
+
+    def load(self, td: TensorDictBase) -> Any:
+        """Copy into JAX what ``export`` gave.
+
+        Raises:
+            ValueError: Another batch size, or leaves that are missing, or of another shape or type.
+            TypeError: Not a TensorDict, or a leaf that is no tensor.
+        """
+        self.check_batch(td)
+        wait_for_torch(self._device, self._jax_device)
+        arrays = []
+        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
+            name = ".".join(key)
+            is_older = key[-1] in self._may_lack and td.get(key, None) is None
+            tensor = (
+                torch.zeros(shape, dtype=torch.bool, device="cpu") if is_older else _entry(td, key)
+            )
+            same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
+            if tensor.dtype not in same_bits or tensor.shape != shape:
+                given = str(tensor.dtype).removeprefix("torch.")
+                raise ValueError(
+                    f"state entry {name!r} is {given} {tuple(tensor.shape)}, {self._kind} with "
+                    f"{self._num_envs} envs expects {dtype} {tuple(shape)}"
+                )
+            value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
+            arrays.append(jax.device_put(value, self._jax_device))
+        return jax.tree_util.tree_unflatten(self._tree, arrays)
+
+    def spec(self) -> Composite:
+        """Spec of what ``export`` gives."""
+        num_envs = self._num_envs
+        device = self._device
+        spec = Composite(shape=(num_envs,), device=device)
+        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
+            torch_dtype = _SIGNED.get(dtype) or _torch_dtype(dtype)
+            inner = spec
+            for name in key[:-1]:
+                if name not in inner:
+                    inner[name] = Composite(shape=(num_envs,), device=device)
+                inner = inner[name]
+            inner[key[-1]] = Unbounded(shape=shape, dtype=torch_dtype, device=device)
+        return spec
+
+    def check_batch(self, td: Any) -> None:
+        """Refuse, with TypeError or ValueError, what is no such TensorDict."""
+        if not isinstance(td, TensorDictBase):
+            raise TypeError(f"the state is a {type(td).__name__}: pass what get_state() gave")
+        if td.batch_size != (self._num_envs,):
+            raise ValueError(
+                f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} "
+                "envs"
+            )
+
+
+class Snapshots:
+    """Turns batches of one game, or of a mixture of games, into TensorDicts and back; ``batch`` is
+    any one of them.
+    """
+
+    def __init__(
+        self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device
+    ) -> None:
+        num_envs = int(batch.step_count.shape[0])
+        padded = jax.eval_shape(batched.pad, batch)
+        self._leaves = TreeSnapshots(
+            padded, num_envs, device, jax_device, batched.game.id, may_lack=_ENDS
+        )
         self._batched = batched
         self._game_id = batched.game.id
         numbers = [fingerprint(group.game.id) for group in batched.groups]
-        self._games = torch.tensor(numbers, device="cpu")[
-            torch.from_numpy(batched.task(self._num_envs))
-        ]
+        self._games = torch.tensor(numbers, device="cpu")[torch.from_numpy(batched.task(num_envs))]
         self._device = device
-        self._jax_device = jax_device
 
     def export(self, batch: Batch) -> TensorDict:
         """Copy a batch out of JAX.
@@ -87,13 +176,8 @@ class Snapshots:
             bool [N], ``last_action`` and ``step_count`` int32 [N], ``episode_reward`` float32 [N],
             ``terminated`` and ``truncated`` bool [N], ``game`` int64 [N].
         """
-        game = self._games.to(self._device, copy=True)
-        out = TensorDict({"game": game}, batch_size=[self._num_envs], device=self._device)
-        leaves = jax.tree.leaves(self._batched.pad(batch))
-        for key, array in zip(self._keys, leaves, strict=True):
-            tensor = to_torch(array, self._device)
-            signed = _SIGNED.get(np.dtype(array.dtype))
-            out[key] = (tensor if signed is None else tensor.view(signed)).clone()
+        out = self._leaves.export(self._batched.pad(batch))
+        out["game"] = self._games.to(self._device, copy=True)
         return out
 
     def load(self, td: TensorDictBase) -> Batch:
@@ -105,41 +189,17 @@ class Snapshots:
                 another shape or type.
             TypeError: Not a TensorDict, or a leaf that is no tensor.
         """
+        self._leaves.check_batch(td)
         self._check_game(td)
-        wait_for_torch(self._device, self._jax_device)
-        arrays = []
-        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
-            name = ".".join(key)
-            is_older = key[-1] in _ENDS and td.get(key, None) is None
-            tensor = (
-                torch.zeros(shape, dtype=torch.bool, device="cpu") if is_older else _entry(td, key)
-            )
-            same_bits = (_SIGNED.get(dtype), _torch_dtype(dtype))
-            if tensor.dtype not in same_bits or tensor.shape != shape:
-                kind = str(tensor.dtype).removeprefix("torch.")
-                raise ValueError(
-                    f"state entry {name!r} is {kind} {tuple(tensor.shape)}, {self._game_id} with "
-                    f"{self._num_envs} "
-                    f"envs expects {dtype} {tuple(shape)}"
-                )
-            value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
-            arrays.append(jax.device_put(value, self._jax_device))
-        return self._batched.unpad(jax.tree_util.tree_unflatten(self._tree, arrays))
+        return self._batched.unpad(self._leaves.load(td))
 
     def _check_game(self, td: TensorDictBase) -> None:
-        """Refuse the state of another game or of another number of envs."""
-        if not isinstance(td, TensorDictBase):
-            raise TypeError(f"the state is a {type(td).__name__}: pass what get_state() gave")
-        if td.batch_size != (self._num_envs,):
-            raise ValueError(
-                f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} "
-                "envs"
-            )
+        """Refuse the state of another game."""
         game = _entry(td, ("game",))
-        if game.dtype is not torch.int64 or game.shape != (self._num_envs,):
+        if game.dtype is not torch.int64 or game.shape != self._games.shape:
             raise ValueError(
                 f"state entry 'game' is {game.dtype} {tuple(game.shape)}, expected torch.int64 "
-                f"({self._num_envs},)"
+                f"{tuple(self._games.shape)}"
             )
         differs = (game.cpu() != self._games).nonzero()
         if len(differs):
@@ -152,16 +212,7 @@ class Snapshots:
 
     def spec(self) -> Composite:
         """Spec of what ``export`` gives."""
-        num_envs = self._num_envs
-        device = self._device
-        spec = Composite(shape=(num_envs,), device=device)
-        spec["game"] = Unbounded(shape=(num_envs,), dtype=torch.int64, device=device)
-        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
-            torch_dtype = _SIGNED.get(dtype) or _torch_dtype(dtype)
-            inner = spec
-            for name in key[:-1]:
-                if name not in inner:
-                    inner[name] = Composite(shape=(num_envs,), device=device)
-                inner = inner[name]
-            inner[key[-1]] = Unbounded(shape=shape, dtype=torch_dtype, device=device)
+        spec = self._leaves.spec()
+        games = self._games
+        spec["game"] = Unbounded(shape=games.shape, dtype=torch.int64, device=self._device)
         return spec

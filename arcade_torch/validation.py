@@ -153,6 +153,20 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
             )
 
 
+def keep_what_was_written(td: TensorDictBase, following: TensorDictBase) -> None:
+    """Add what the policy wrote for the next step, such as its recurrent state, to the ``"next"``
+    that the env gives; say so if it ends there, since no spec of the env names it.
+    """
+    written = td.get("next", None)
+    if written is None:
+        return
+    unknown = written.exclude(*following.keys(True, True))
+    following.update(unknown)
+    keys = tuple(unknown.keys(True, True))
+    if keys:
+        warn_state_is_dropped(*keys)
+
+
 @functools.cache
 def warn_state_is_dropped(*keys: NestedKey) -> None:
     """Say once that what a policy wrote for the next step does not get there: TorchRL carries what

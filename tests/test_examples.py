@@ -5,9 +5,11 @@ import importlib.util
 import math
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import pytest
 import torch
 
@@ -48,6 +50,30 @@ def test_the_loop_replays_every_window_as_it_was_acted() -> None:
     result = script.main(frames=4 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")
     assert 0 <= result.log_ratio < 1e-5  # over all four windows, each before its own update
     assert len(result.returns) == 4 and all(-1 <= value <= 1 for value in result.returns)
+
+
+class Chain:
+    """A sign at the first of five steps, and a reward at the last for having remembered it."""
+
+    action_space = SimpleNamespace(n=2)
+
+    def reset(self, key: jax.Array) -> tuple[jax.Array, Any]:
+        sign = jax.random.bernoulli(key).astype(jnp.int32)
+        return jnp.stack([2.0 * sign - 1, 0.0]), (sign, jnp.int32(0))
+
+    def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
+        sign, time = state
+        is_last = time == 4
+        reward = jnp.where(is_last, 2.0 * (action == sign) - 1, 0.0)
+        return jnp.stack([0.0, (time + 1) / 4]), (sign, time + 1), reward, is_last, {}
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ppo_with_a_memory_learns_an_env_of_another_suite_and_without_one_does_not() -> None:
+    assert len((EXAMPLES / "gymnax_ppo.py").read_text(encoding="utf-8").splitlines()) <= 100
+    script = example("gymnax_ppo")
+    assert script.main(Chain(), memory="gru", windows=12)[-1] > 0.9
+    assert abs(script.main(Chain(), memory="mlp", windows=4)[-1]) < 0.3
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -1,0 +1,541 @@
+"""``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from arcade_torch import validation
+from arcade_torch.devices import pick_devices, wait_for_torch
+from arcade_torch.dlpack import is_host, to_jax, to_torch
+from arcade_torch.envs_jax.batch import choose_rows, env_keys
+from arcade_torch.envs_jax.validation import check_num_envs
+from arcade_torch.process import check_process
+from arcade_torch.snapshot import TreeSnapshots
+
+__all__ = ["JaxEnv", "from_jax"]
+
+# names that params and envs of the suites have for a time limit
+_LIMITS = ("max_steps_in_episode", "max_timesteps", "max_steps")
+_OWN_KEYS = (
+    *("action", "last_action", "is_init", "step_count", "episode_reward"),
+    *("reward", "done", "terminated", "truncated", "next"),
+)
+
+
+class Outcome(NamedTuple):
+    """What one step gives beside observation and state; [N] each, of one env scalars."""
+
+    reward: jax.Array  # float32
+    terminated: jax.Array  # bool
+    truncated: jax.Array  # bool
+
+
+class Episodes(NamedTuple):
+    """Everything that is known about N running episodes."""
+
+    key: Any  # uint32 [N, 2], advanced by every step of its env
+    reset_key: Any  # uint32 [N, 2], of the next episode
+    state: Any  # the env's own, leaves [N, ...]
+    obs: Any  # leaves [N, ...]
+    last_action: jax.Array  # [N, ...], zeros before the first step; survives resets
+    step_count: jax.Array  # int32 [N]
+    episode_reward: jax.Array  # float32 [N]
+
+
+class Suite:
+    """One env of a suite, by two functions without batch, params or automatic resets.
+
+    Args:
+        env: Has ``reset_env`` and ``step_env`` as gymnax's have, or ``reset`` and ``step`` that
+            begin no episode by themselves.
+        params: Given to both as last argument; None: the env's ``default_params``, or none at all.
+        max_steps: Time limit; None: that of the params, or none but the env's own.
+    """
+
+    def __init__(self, env: Any, params: Any = None, max_steps: int | None = None) -> None:
+        if params is None:
+            params = getattr(env, "default_params", None)
+        if max_steps is not None:
+            max_steps = validation.whole("max_steps", max_steps)
+            if max_steps < 1:
+                raise ValueError(f"max_steps is {max_steps}, expected 1 or more")
+        self.env = env
+        self.params = params
+        self.extra = () if params is None else (params,)
+        self._begin = _function(env, "reset")
+        self._go_on = _function(env, "step")
+        self.tells_truncation = callable(getattr(env, "is_truncated", None))
+        if max_steps is None and not self.tells_truncation:
+            max_steps = _limit_of(params)
+        self.max_steps = max_steps
+
+    def reset(self, key: jax.Array) -> tuple[Any, Any]:
+        """The first observation and state of an episode."""
+        obs, state = self._begin(key, *self.extra)
+        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, state)
+
+    def step(
+        self, key: jax.Array, state: Any, action: jax.Array, count: jax.Array
+    ) -> tuple[Any, Any, Outcome]:
+        """Take the step number ``count`` of an episode, from 1 on: observation, state, outcome."""
+        result = self._go_on(key, state, action, *self.extra)
+        if not isinstance(result, tuple) or len(result) not in (5, 6):
+            raise TypeError(
+                f"step of {_name(self.env)} gives {_described(result)}, expected observation, "
+                "state, reward, done (or terminated, truncated), info"
+            )
+        obs, after, reward = result[:3]
+        terminated, truncated = self._ends(result[3:-1], after, count)
+        outcome = Outcome(
+            jnp.asarray(reward, jnp.float32).reshape(()),
+            jnp.asarray(terminated, bool).reshape(()),
+            jnp.asarray(truncated, bool).reshape(()),
+        )
+        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, after), outcome
+
+    def _ends(self, flags: tuple[Any, ...], after: Any, count: jax.Array) -> tuple[Any, Any]:
+        """``terminated`` and ``truncated`` of a step, whatever the env itself tells apart.
+
+        An env that only knows ``done`` is taken to be truncated by an end at the time limit.
+        """
+        is_limit = jnp.bool_(False) if self.max_steps is None else count >= self.max_steps
+        if len(flags) == 2:
+            return flags[0], jnp.logical_or(flags[1], is_limit)
+        if self.tells_truncation:
+            truncated = self.env.is_truncated(after, *self.extra)
+            return flags[0], jnp.logical_or(truncated, is_limit)
+        return jnp.logical_and(flags[0], jnp.logical_not(is_limit)), is_limit
+
+
+def _function(env: Any, name: str) -> Callable[..., Any]:
+    """``reset_env`` or ``step_env``, else ``reset`` or ``step``."""
+    function = getattr(env, f"{name}_env", None) or getattr(env, name, None)
+    if not callable(function):
+        raise TypeError(
+            f"{_name(env)} has no {name}(key, ...): from_jax takes an env with gymnax's functions, "
+            "reset(key, params) -> (obs, state) and "
+            "step(key, state, action, params) -> (obs, state, reward, done, info); give another "
+            "suite's env these two"
+        )
+    checked: Callable[..., Any] = function
+    return checked
+
+
+def _limit_of(params: Any) -> int | None:
+    """The time limit that params name."""
+    for name in _LIMITS:
+        limit = getattr(params, name, None)
+        if limit is not None:
+            return int(limit)
+    return None
+
+
+def _name(env: Any) -> str:
+    """What an env is called in messages."""
+    return type(env).__name__
+
+
+def _described(value: Any) -> str:
+    """A result in a message: its kind, of a tuple also how many things it holds."""
+    size = f" of {len(value)}" if isinstance(value, tuple) else ""
+    return f"a {type(value).__name__}{size}"
+
+
+class JaxEnv(EnvBase):
+    """N episodes of one JAX environment, as a TorchRL environment with ``batch_size=[N]``; made by
+    :func:`from_jax`.
+
+    Every key of the root and of ``"next"``: the observation (one array under ``obs_key``, a tree of
+    arrays under the names that it has), ``last_action`` [N, ...], ``is_init`` bool [N, 1],
+    ``step_count`` int64 [N, 1], ``episode_reward`` float32 [N, 1], ``done``, ``terminated``,
+    ``truncated`` bool [N, 1]; ``"next"`` has ``reward`` float32 [N, 1] too. At an end the
+    observation in ``"next"`` is the true final one, and the following root begins a new episode.
+
+    Observations are the memory that JAX wrote: **never write to them in place**. Env ``i`` has
+    random keys of its own, so that it walks the same path whatever N is. ``step_and_maybe_reset``,
+    which ``rollout`` and TorchRL's ``Collector`` use, is one compiled call, and gives the bits of
+    ``step`` and ``reset``.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        suite: Suite,
+        num_envs: int,
+        *,
+        obs_key: str | None,
+        action_spec: TensorSpec | None,
+        seed: int | None,
+        device: torch.device | str | None,
+        debug: bool,
+    ) -> None:
+        check_process()
+        num_envs = check_num_envs(num_envs)
+        validation.check_flags("debug", (debug,))
+        torch_device, jax_device = pick_devices(device)
+        super().__init__(device=torch_device, batch_size=[num_envs])
+        self.suite = suite
+        self._jax_device = jax_device
+        self._check_actions = debug or is_host(torch_device)
+        self.action_spec = _action_spec(suite, action_spec, num_envs, torch_device)
+        self._action_dtype = np.dtype(
+            np.int32 if isinstance(self.action_spec, Categorical) else np.float32
+        )
+        self._reset_rows = jax.jit(self._begin_anew)
+        self._step_alone = jax.jit(self._advance)
+        self._step_fused = jax.jit(self._advance_and_begin_anew)
+        self._live: Episodes
+        self._set_seed(seed)
+        self._obs_key = obs_key
+        names = _leaf_names(self._live.obs, obs_key)
+        self._obs_names = names
+        self.observation_spec = self._observation_spec()
+        self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=torch_device)
+        self.done_spec = Composite(
+            done=self._flag(),
+            terminated=self._flag(),
+            truncated=self._flag(),
+            shape=(num_envs,),
+            device=torch_device,
+        )
+        self._snapshots = TreeSnapshots(
+            self._live, num_envs, torch_device, jax_device, kind=f"a state of {_name(suite.env)}"
+        )
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs in the batch."""
+        return int(self.batch_size[0])
+
+    @property
+    def max_steps(self) -> int | None:
+        """The time limit that is counted here; None where there is none, or the suite counts."""
+        return self.suite.max_steps
+
+    def __repr__(self) -> str:
+        """Env, number and device."""
+        return f"JaxEnv({_name(self.suite.env)}, num_envs={self.num_envs}, device='{self.device}')"
+
+    def get_state(self) -> TensorDict:
+        """Copy everything that determines the future.
+
+        Returns:
+            TensorDict [N] of plain tensors: keys, the env's state, observation, counts.
+        """
+        return self._snapshots.export(self._live)
+
+    def set_state(self, state: TensorDictBase) -> TensorDict:
+        """Go on from what ``get_state`` gave.
+
+        Returns:
+            The root tensordict to act on next; ``done`` is false everywhere.
+
+        Raises:
+            ValueError: The state of another env or batch size.
+            TypeError: No tensordict.
+        """
+        self._live = self._snapshots.load(state)
+        return self._root()
+
+    def _flag(self) -> Categorical:
+        return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
+
+    def _observation_spec(self) -> Composite:
+        """The spec of everything but action, reward and ends."""
+        shape = (self.num_envs, 1)
+        spec = Composite(shape=(self.num_envs,), device=self.device)
+        for name, leaf in zip(self._obs_names, jax.tree.leaves(self._live.obs), strict=True):
+            value = to_torch(leaf, self.device)
+            if value.dtype is torch.bool:
+                spec[name] = Categorical(2, shape=value.shape, dtype=torch.bool, device=self.device)
+            else:
+                spec[name] = Unbounded(value.shape, dtype=value.dtype, device=self.device)
+        spec["last_action"] = self.action_spec.clone()
+        spec["is_init"] = self._flag()
+        spec["step_count"] = Unbounded(shape, dtype=torch.int64, device=self.device)
+        spec["episode_reward"] = Unbounded(shape, dtype=torch.float32, device=self.device)
+        return spec
+
+    def _begin_anew(self, live: Episodes, mask: jax.Array) -> Episodes:
+        """Begin a new episode where ``mask`` (bool [N]) is true."""
+        obs, state = jax.vmap(self.suite.reset)(live.reset_key)
+        following = jax.vmap(jax.random.fold_in, in_axes=(0, None))(live.reset_key, 1)
+        fresh = live._replace(
+            reset_key=following,
+            state=state,
+            obs=obs,
+            step_count=jnp.zeros_like(live.step_count),
+            episode_reward=jnp.zeros_like(live.episode_reward),
+        )
+        chosen: Episodes = choose_rows(mask, fresh, live)
+        return chosen
+
+    def _advance(self, live: Episodes, action: jax.Array) -> tuple[Episodes, Outcome]:
+        """Take one action in every env.
+
+        Keys go as in gymnax's own ``step``: one for the step, one for the episode after it.
+        """
+        key, use = _split(live.key)
+        now, reset_key = _split(use)
+        count = live.step_count + 1
+        obs, state, outcome = jax.vmap(self.suite.step)(now, live.state, action, count)
+        total = live.episode_reward + outcome.reward
+        return Episodes(key, reset_key, state, obs, action, count, total), outcome
+
+    def _advance_and_begin_anew(
+        self, live: Episodes, action: jax.Array
+    ) -> tuple[Episodes, Episodes, Outcome]:
+        """Take one action, and begin anew where that ended an episode.
+
+        Returns:
+            What to go on with; observation and counts that the step led to, without the rest, since
+            every array that a compiled function gives is written; and what it gave.
+        """
+        after, outcome = self._advance(live, action)
+        root = self._begin_anew(after, outcome.terminated | outcome.truncated)
+        return root, after._replace(key=None, reset_key=None, state=None), outcome
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Draw all episodes anew."""
+        if seed is None:
+            seed = int(torch.randint(2**32, (), device="cpu"))
+        wait_for_torch(self.device, self._jax_device)
+        keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
+        self._live = jax.jit(self._first)(keys)
+
+    def _first(self, keys: jax.Array) -> Episodes:
+        """Episodes that begin."""
+        key, reset_key = _split(keys)
+        obs, state = jax.vmap(self.suite.reset)(reset_key)
+        action = jnp.zeros(tuple(self.action_spec.shape), self._action_dtype)
+        counts = jnp.zeros(len(keys), jnp.int32)
+        return Episodes(key, reset_key, state, obs, action, counts, counts.astype(jnp.float32))
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        rows = np.ones(self.num_envs, np.bool_)
+        if tensordict is not None and "_reset" in tensordict:
+            rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
+        wait_for_torch(self.device, self._jax_device)
+        self._live = self._reset_rows(self._live, rows)
+        return self._root()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = validation.tensor(tensordict, "action")
+        self._live, outcome = self._step_alone(self._live, self._argument(action))
+        return self._next(self._live, outcome, action)
+
+    def _step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        self._assert_tensordict_shape(tensordict)
+        if "_step" in tensordict or self._post_step_mdp_hooks is not None:
+            stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
+            return stock
+        action = validation.tensor(tensordict, "action")
+        live, after, outcome = self._step_fused(self._live, self._argument(action))
+        self._live = live
+        following = self._next(after, outcome, action)
+        validation.keep_what_was_written(tensordict, following)
+        tensordict.set("next", following)
+        root: TensorDictBase = self._step_mdp(tensordict)
+        root.update(self._root())
+        return tensordict, root
+
+    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
+        validation.check_tensordict(tensordict, self.num_envs)
+
+    def _argument(self, action: torch.Tensor) -> np.ndarray | jax.Array:
+        """A private copy of the actions for a compiled function, checked."""
+        if isinstance(self.action_spec, Categorical):
+            validation.check_integers(
+                action, self.num_envs, self.action_spec.space.n, self._check_actions
+            )
+            dtype = torch.int32
+        else:
+            validation.check_tensor(action, "action")
+            if action.shape != self.action_spec.shape:
+                expected = list(self.action_spec.shape)
+                raise ValueError(f"action has shape {list(action.shape)}, expected {expected}")
+            dtype = torch.float32
+        if is_host(self._jax_device):
+            return action.detach().to("cpu", dtype, copy=True).numpy()
+        return to_jax(action.detach().to(dtype, copy=True))
+
+    def _root(self) -> TensorDict:
+        """The root tensordict of the live episodes."""
+        live = self._live
+        step_count = to_torch(live.step_count, self.device).to(torch.int64).unsqueeze(-1)
+        no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        entries = self._observation(live)
+        last_action = to_torch(live.last_action, self.device)
+        entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
+        entries["is_init"] = step_count == 0
+        entries["step_count"] = step_count
+        episode_reward = to_torch(live.episode_reward, self.device)
+        entries["episode_reward"] = episode_reward.clone().unsqueeze(-1)
+        entries["done"] = no
+        entries["terminated"] = no.clone()
+        entries["truncated"] = no.clone()
+        return self._tensordict(entries)
+
+    def _next(self, after: Episodes, outcome: Outcome, action: torch.Tensor) -> TensorDict:
+        """The ``"next"`` tensordict."""
+        terminated = to_torch(outcome.terminated, self.device).unsqueeze(-1).clone()
+        truncated = to_torch(outcome.truncated, self.device).unsqueeze(-1).clone()
+        step_count = to_torch(after.step_count, self.device).to(torch.int64)
+        entries = self._observation(after)
+        entries["last_action"] = action.to(self.action_spec.dtype, copy=True)
+        entries["is_init"] = torch.zeros_like(terminated)
+        entries["step_count"] = step_count.unsqueeze(-1)
+        episode_reward = to_torch(after.episode_reward, self.device)
+        entries["episode_reward"] = episode_reward.clone().unsqueeze(-1)
+        entries["reward"] = to_torch(outcome.reward, self.device).clone().unsqueeze(-1)
+        entries["done"] = terminated | truncated
+        entries["terminated"] = terminated
+        entries["truncated"] = truncated
+        return self._tensordict(entries)
+
+    def _observation(self, episodes: Episodes) -> dict[Any, torch.Tensor]:
+        """The observation by name, zero copy."""
+        entries = {}
+        for name, leaf in zip(self._obs_names, jax.tree.leaves(episodes.obs), strict=True):
+            entries[name] = to_torch(leaf, self.device)
+        return entries
+
+    def _tensordict(self, entries: dict[Any, torch.Tensor]) -> TensorDict:
+        """Entries as a tensordict [N]; names may be nested."""
+        if all(isinstance(name, str) for name in entries):
+            return TensorDict._new_unsafe(entries, batch_size=self.batch_size, device=self.device)
+        td = TensorDict({}, batch_size=self.batch_size, device=self.device)
+        for name, value in entries.items():
+            td.set(name, value)
+        return td
+
+
+def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Two keys of each, uint32 [N, 2]."""
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _leaf_names(obs: Any, obs_key: str | None) -> list[Any]:
+    """A key of a tensordict for every leaf of an observation, a string or a tuple of strings."""
+    leaves = jax.tree_util.tree_flatten_with_path(obs)[0]
+    if len(leaves) == 1 and not leaves[0][0]:
+        array = leaves[0][1]
+        is_picture = array.dtype == np.uint8 and array.ndim == 4
+        return [obs_key or ("pixels" if is_picture else "observation")]
+    names: list[Any] = []
+    for path, _ in leaves:
+        parts = tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/"))
+        if parts[0] in _OWN_KEYS:
+            raise ValueError(
+                f"the observation has an entry {parts[0]!r}, which is a key of the env itself: "
+                "give it another name"
+            )
+        names.append(parts[0] if len(parts) == 1 else parts)
+    return names
+
+
+def _action_spec(
+    suite: Suite, given: TensorSpec | None, num_envs: int, device: torch.device
+) -> TensorSpec:
+    """The spec of actions [N, ...], from the env's action space."""
+    if given is not None:
+        if not isinstance(given, Categorical | Bounded | Unbounded) or isinstance(given, OneHot):
+            kind = type(given).__name__
+            raise TypeError(f"action_spec is a {kind}, expected Categorical or Bounded")
+        if given.shape[:1] != (num_envs,):
+            raise ValueError(
+                f"action_spec has shape {list(given.shape)}, expected [{num_envs}, ...]"
+            )
+        return given.to(device)
+    space: Any = getattr(suite.env, "action_space", None)
+    if callable(space):
+        space = space(*suite.extra)
+    categories = getattr(space, "n", None)
+    if categories is not None:
+        return Categorical(int(categories), shape=(num_envs,), dtype=torch.int64, device=device)
+    if hasattr(space, "low") and hasattr(space, "high"):
+        shape = tuple(space.shape)
+        bounds = []
+        for bound in (space.low, space.high):
+            full = np.broadcast_to(np.asarray(bound, np.float32), (num_envs, *shape))
+            bounds.append(torch.from_numpy(full.copy()).to(device))
+        return Bounded(*bounds, shape=(num_envs, *shape), dtype=torch.float32, device=device)
+    raise ValueError(
+        f"the actions of {_name(suite.env)} are {_described(space)}, expected a space with n, or "
+        "with low, high and shape: pass action_spec=, for instance "
+        f"torchrl.data.Categorical(4, shape=({num_envs},))"
+    )
+
+
+def from_jax(
+    env: Any,
+    params: Any = None,
+    num_envs: int = 16,
+    *,
+    max_steps: int | None = None,
+    obs_key: str | None = None,
+    action_spec: TensorSpec | None = None,
+    seed: int | None = 0,
+    device: torch.device | str | None = None,
+    debug: bool = False,
+) -> JaxEnv:
+    """See a JAX environment as a batch of TorchRL envs: stepped on the device, reset where an
+    episode ends, observations handed over without a copy.
+
+    It has to have gymnax's two functions, pure and without a batch: ``reset_env(key, params) ->
+    (obs, state)`` and ``step_env(key, state, action, params) -> (obs, state, reward, done, info)``,
+    or ``reset`` and ``step`` that begin no episodes by themselves. ``terminated, truncated`` may
+    stand in the place of ``done``; gymnax's ``is_truncated`` is asked where it exists.
+
+    Args:
+        env: The environment.
+        params: Its parameters; None for ``env.default_params``, or for functions without the last
+            argument where there are none.
+        num_envs: Number of envs in the batch.
+        max_steps: Time limit in steps: there an episode is truncated. Give it for an env that only
+            knows ``done`` and counts itself, or its limits look like terminations. None: what the
+            params say (``max_steps_in_episode``, ``max_timesteps``), or no limit.
+        obs_key: Key of one array; None: ``"pixels"`` for uint8 [H, W, C], else ``"observation"``.
+        action_spec: Spec of the actions [num_envs, ...]; None: from ``env.action_space``.
+        seed: Seed of the batch; None draws one from torch.
+        device: Device of all tensors; None for the one that JAX computes on.
+        debug: Whether actions are checked on CUDA too.
+
+    Returns:
+        The env, for TorchRL's transforms and collectors; ``ArcadeCollector`` is for our games.
+
+    Raises:
+        TypeError: The env lacks a function, or its step gives something else.
+        ValueError: A size out of range, an unknown action space, or an observation with a name of
+            the env's own keys.
+
+    Example:
+        >>> class Count:  # any object with the two functions
+        ...     def reset(self, key):
+        ...         return jnp.zeros(1), jnp.int32(0)
+        ...     def step(self, key, state, action):
+        ...         return jnp.ones(1) * state, state + 1, action * 1.0, state >= 2, {}
+        >>> env = from_jax(Count(), num_envs=1, action_spec=Categorical(3, shape=(1,)))
+        >>> env.rollout(4, break_when_any_done=False)["next", "done"].flatten().tolist()
+        [False, False, True, False]
+    """
+    return JaxEnv(
+        Suite(env, params, max_steps),
+        num_envs,
+        obs_key=obs_key,
+        action_spec=action_spec,
+        seed=seed,
+        device=device,
+        debug=debug,
+    )
