@@ -1,5 +1,6 @@
 """What holds across devices, processes and threads, shown without a GPU as far as that goes."""
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -142,6 +143,15 @@ print(used == {(id(memory), jax.devices()[0]) for memory in (env._memory, env._e
 """
     options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
     assert output_of(code, options) == "True"
+
+
+def test_an_env_on_the_second_device_leaves_nothing_on_the_first() -> None:
+    """Random keys were drawn, and the mask of a partial step was put, on JAX's default device."""
+    code = "from tests.arcade_torch.second_device import main; main()"
+    options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    report = json.loads(output_of(code, options))
+    assert report["on the second"] > 0
+    assert report["left"] == {} and report["programs"] == []
 
 
 def output_of(code: str, environment: dict[str, str] | None = None) -> str:
