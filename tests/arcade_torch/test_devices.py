@@ -69,6 +69,23 @@ def test_a_tensor_on_a_gpu_that_begins_where_jax_cannot_compute_is_refused() -> 
 
 
 @pytest.mark.parametrize(
+    "cuda, said",
+    [
+        (None, r"torch \S+ is without CUDA, install one with it"),
+        ("13.0", "its CUDA is 13.0, but .*nvidia-smi"),
+    ],
+)
+def test_without_a_gpu_torch_built_for_cuda_is_not_told_to_be_installed(
+    monkeypatch: pytest.MonkeyPatch, cuda: str | None, said: str
+) -> None:
+    """Without a driver, torch built for CUDA was to be installed with CUDA."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    with pytest.raises(ValueError, match=f"torch sees no GPU: {said}.*, or use 'cpu'$"):
+        devices.pick_devices("cuda")
+
+
+@pytest.mark.parametrize(
     "change", ["reset", "observe", "set_seed", "set_observability", "set_state"]
 )
 def test_what_brings_no_actions_waits_until_torch_has_read_its_frames(
