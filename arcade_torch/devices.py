@@ -25,6 +25,18 @@ def share_gpu() -> bool:
     return os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false").lower() in ("false", "0")
 
 
+def why_no_cuda() -> str:
+    """Say why torch cannot use a GPU, and how that is mended; empty where it can."""
+    if torch.cuda.is_available():
+        return ""
+    if torch.version.cuda is None:
+        return f"torch sees no GPU: torch {torch.__version__} is without CUDA, install one with it"
+    return (
+        f"torch sees no GPU: its CUDA is {torch.version.cuda}, but there is no usable driver or "
+        "card, see what nvidia-smi says"
+    )
+
+
 def wait_for_torch(device: torch.device, jax_device: jax.Device) -> None:
     """Wait until torch has read the frames that it has let go of: on a GPU, JAX may take their
     memory for what is next.
@@ -67,11 +79,9 @@ def pick_devices(device: torch.device | str | None) -> tuple[torch.device, jax.D
         return torch.device("cpu"), jax.devices("cpu")[0]
     if wanted.type != "cuda":
         raise ValueError(f"device is {str(device)!r}, allowed: 'cpu', 'cuda', 'cuda:0', ...")
-    if not torch.cuda.is_available():
-        raise ValueError(
-            f"device is {str(device)!r}, but torch sees no GPU: use 'cpu', or install torch with "
-            "CUDA"
-        )
+    problem = why_no_cuda()
+    if problem:
+        raise ValueError(f"device is {str(device)!r}, but {problem}, or use 'cpu'")
     index = wanted.index if wanted.index is not None else torch.cuda.current_device()
     if index >= torch.cuda.device_count():
         raise ValueError(

@@ -153,7 +153,7 @@ class ArcadeEnv(EnvBase):
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
         wait_for_torch(torch_device, jax_device)
-        keys = jax.device_put(env_keys(0, num_envs), jax_device)
+        keys = self._keys(0)
         partial = jax.device_put(flags, jax_device)
         first = self._batched.init(keys, partial)
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
@@ -406,7 +406,12 @@ class ArcadeEnv(EnvBase):
 
     def _with_ends(self) -> Batch:
         """The live batch with the flags of an end."""
-        return self._batched.with_ends(self._live.batch, *self._live.ended)
+        return self._flagged(self._live.batch, self._live.ended)
+
+    def _flagged(self, batch: Batch, ended: Ended) -> Batch:
+        """A batch with the flags of an end; those that a mixture adds are made where the env is."""
+        with jax.default_device(self._jax_device):
+            return self._batched.with_ends(batch, *ended)
 
     def _integers(self, action: torch.Tensor) -> torch.Tensor:
         """The actions as integers [N]; raises if they are not what the spec says."""
@@ -475,7 +480,7 @@ class ArcadeEnv(EnvBase):
         # where it stays if the next line refuses
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
-        mask = jax.numpy.asarray(marked.cpu().numpy())
+        mask = jax.device_put(marked.cpu().numpy(), self._jax_device)
         padded = self._batched.pad(stepped.batch)
         padded_before = self._batched.pad(before.batch)
         batch = choose_rows(mask, padded, padded_before)
@@ -514,6 +519,13 @@ class ArcadeEnv(EnvBase):
             root._set_str(key, value, **_UNCHECKED)  # set() takes eight times as long
         return tensordict, root
 
+    def _keys(self, seed: int) -> jax.Array:
+        """The random keys of a seed, uint32 [N, 2]; computed where the env is, too."""
+        with jax.default_device(self._jax_device):
+            computed = env_keys(seed, self.num_envs)
+        keys: jax.Array = jax.device_put(computed, self._jax_device)
+        return keys
+
     def _set_seed(self, seed: int | None) -> None:
         """Give every env a new random key and forget the last action; running episodes go on until
         they are reset.
@@ -522,7 +534,7 @@ class ArcadeEnv(EnvBase):
             seed = int(torch.randint(2**32, (), device="cpu"))
         default_seeds.forget(self)
         wait_for_torch(self.device, self._jax_device)
-        key = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
+        key = self._keys(seed)
         last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
         seeded = self._live.batch._replace(key=key, last_action=last_action)
         self._go_on(seeded, self._live.ended, self._live.ends)
@@ -542,7 +554,7 @@ class ArcadeEnv(EnvBase):
         ends = self._live.ends & (step_count > 0)
         root = self._entries(frames, to_torch(batch.last_action, self.device), counts, ends)
         if self._state_in_td:
-            root["state"] = self._snapshots.export(self._batched.with_ends(batch, *ended))
+            root["state"] = self._snapshots.export(self._flagged(batch, ended))
         return TensorDict(root, batch_size=self.batch_size, device=self.device)
 
     def _next(

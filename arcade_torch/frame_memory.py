@@ -3,7 +3,7 @@
 import weakref
 from collections import deque
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -61,8 +61,12 @@ class FrameMemory:
 
     def spare(self) -> Spare:
         """Memory to be given to the function that draws, once; None where nothing is reused."""
-        new = partial(jnp.empty, self._shape, np.uint8, device=self._device)
-        return self._reused.take(new) if self._reuses else None
+        return self._reused.take(self._allocate) if self._reuses else None
+
+    def _allocate(self) -> jax.Array:
+        """New memory; without the context JAX makes it on its default device and copies it."""
+        with jax.default_device(self._device):
+            return jnp.empty(self._shape, np.uint8, device=self._device)
 
     def show(self, frames: jax.Array) -> jax.Array | npt.NDArray[np.uint8]:
         """What may be handed out of the frames that were drawn: a read-only view, on a GPU the

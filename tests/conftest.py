@@ -36,22 +36,23 @@ settings.load_profile("arcade")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--device cpu`` rehearses the tests marked `gpu` on the CPU, as far as they make sense
-    there.
+    there; so does the default where there is no card, lest they rot unseen.
     """
     parser.addoption(
-        "--device", choices=("cuda", "cpu"), default="cuda", help="device of the tests marked gpu"
+        "--device",
+        choices=("auto", "cuda", "cpu"),
+        default="auto",
+        help="device of the tests marked gpu; auto: cuda where torch has it, or else cpu",
     )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip `gpu` and `ray` tests with a reason where the machine lacks what they need."""
-    rehearsed = config.getoption("device") == "cpu"
     needing_gpu = [item for item in items if item.get_closest_marker("gpu")]
-    needing_gpu = [
-        item
-        for item in needing_gpu
-        if not (rehearsed and "device" in getattr(item, "fixturenames", ()))
-    ]
+    if needing_gpu and _device_of_gpu_tests(config) == "cpu":
+        needing_gpu = [
+            item for item in needing_gpu if "device" not in getattr(item, "fixturenames", ())
+        ]
     needing_ray = [item for item in items if item.get_closest_marker("ray")]
     if needing_gpu and not _has_cuda():
         for item in needing_gpu:
@@ -67,10 +68,18 @@ def _has_cuda() -> bool:
     return torch.cuda.is_available()
 
 
+def _device_of_gpu_tests(config: pytest.Config) -> str:
+    """``cuda`` or ``cpu``."""
+    device = str(config.getoption("device"))
+    if device != "auto":
+        return device
+    return "cuda" if _has_cuda() else "cpu"
+
+
 @pytest.fixture
 def device(request: pytest.FixtureRequest) -> str:
     """Where a test marked `gpu` runs: ``cuda``, or ``cpu`` in a rehearsal."""
-    return str(request.config.getoption("device"))
+    return _device_of_gpu_tests(request.config)
 
 
 @pytest.fixture

@@ -29,6 +29,8 @@ from arcade_torch.envs_jax.render.text import (
 )
 from arcade_torch.envs_jax.validation import format_value
 
+WORD = 4  # bytes that a thread of a GPU combines at once
+
 
 @dataclass(frozen=True, eq=False)
 class Slot:
@@ -116,6 +118,39 @@ def recognise(cutouts: npt.NDArray[np.uint8], pictures: Picture) -> npt.NDArray[
     return np.where((flat[codes] == cutouts).all(-1), codes, -1)
 
 
+def combine_lines(lines: npt.NDArray[Any], index: Array) -> Array:
+    """Combine the pictures of each line of the screen by exclusive or.
+
+    Args:
+        lines: Unsigned integers [M, W], all lines there are.
+        index: uint32 [J, S], the number of each of the J lines that meet in a line of the screen.
+
+    Returns:
+        Of the type of ``lines``, [S, W].
+    """
+    table = jnp.asarray(lines)
+    pictures = [table.at[numbers].get(mode="promise_in_bounds") for numbers in index]
+    return functools.reduce(operator.xor, pictures)
+
+
+def combine_words(lines: Picture, index: Array) -> Array:
+    """Combine lines as :func:`combine_lines` does, four bytes at a time.
+
+    XLA gives a thread of a GPU four elements. With words that is 16 bytes for the arithmetic of
+    one index, so drawing takes a quarter of the instructions. On a CPU words are several times
+    slower than bytes.
+
+    Args:
+        lines: uint8 [M, B], with a multiple of four for B.
+        index: As for :func:`combine_lines`.
+
+    Returns:
+        uint8 [S, B].
+    """
+    words = combine_lines(lines.view(np.uint32), index)
+    return jax.lax.bitcast_convert_type(words, jnp.uint8).reshape(len(words), -1)
+
+
 class Layers:
     """A whole screen: a background and the places on it, of which a later one covers those before
     it.
@@ -159,10 +194,12 @@ class Layers:
         flat = [array.astype(jnp.uint32).reshape(-1) for array in arrays]
         code_of_slot = jnp.concatenate([*flat, jnp.zeros(1, jnp.uint32)])
         index = start + stride * code_of_slot.at[slot].get(mode="promise_in_bounds")
-        pictures = [
-            jnp.asarray(lines).at[numbers].get(mode="promise_in_bounds") for numbers in index
-        ]
-        frame = functools.reduce(operator.xor, pictures)
+        by_bytes = functools.partial(combine_lines, lines)
+        if lines.shape[1] % WORD:
+            frame = by_bytes(index)
+        else:
+            by_words = functools.partial(combine_words, lines)
+            frame = jax.lax.platform_dependent(index, cuda=by_words, default=by_bytes)
         return frame.reshape(self.background.shape)
 
     def _check_codes(self, number: int, codes: npt.NDArray[Any]) -> None:

@@ -1,5 +1,6 @@
 """What holds across devices, processes and threads, shown without a GPU as far as that goes."""
 
+import json
 import subprocess
 import sys
 from collections import Counter
@@ -66,6 +67,23 @@ def test_a_tensor_on_a_gpu_that_begins_where_jax_cannot_compute_is_refused() -> 
     """XLA's programs refuse it when they run; only the CPU's alignment was checked."""
     with pytest.raises(ValueError, match="multiple of 16 bytes, JAX cannot compute with it"):
         dlpack.to_jax(torch.zeros(64).as_subclass(CudaStandIn)[1:])
+
+
+@pytest.mark.parametrize(
+    "cuda, said",
+    [
+        (None, r"torch \S+ is without CUDA, install one with it"),
+        ("13.0", "its CUDA is 13.0, but .*nvidia-smi"),
+    ],
+)
+def test_without_a_gpu_torch_built_for_cuda_is_not_told_to_be_installed(
+    monkeypatch: pytest.MonkeyPatch, cuda: str | None, said: str
+) -> None:
+    """Without a driver, torch built for CUDA was to be installed with CUDA."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    with pytest.raises(ValueError, match=f"torch sees no GPU: {said}.*, or use 'cpu'$"):
+        devices.pick_devices("cuda")
 
 
 @pytest.mark.parametrize(
@@ -142,6 +160,15 @@ print(used == {(id(memory), jax.devices()[0]) for memory in (env._memory, env._e
 """
     options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
     assert output_of(code, options) == "True"
+
+
+def test_an_env_on_the_second_device_leaves_nothing_on_the_first() -> None:
+    """Random keys were drawn, and the mask of a partial step was put, on JAX's default device."""
+    code = "from tests.arcade_torch.second_device import main; main()"
+    options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    report = json.loads(output_of(code, options))
+    assert report["on the second"] > 0
+    assert report["left"] == {} and report["programs"] == []
 
 
 def output_of(code: str, environment: dict[str, str] | None = None) -> str:

@@ -10,8 +10,10 @@ page made of them.
 
 A stage is a process; its output is FOLDER/NAME.log. FOLDER/NAME.done says that it never runs again.
 What failed does not stop the others, and is tried again by the next call, after them. Where the
-time ran out, a study goes on; any other stage begins anew. Exit code: 0 all is done, 1 something
-failed, 2 there is more to do.
+time ran out, a study goes on; any other stage begins anew. Tests of which none passed have failed.
+Exit code: 0 all is done, 1 something failed, 2 there is more to do.
+
+Nothing begins where a package is missing, or where torch or JAX sees no card: one line says so.
 """
 
 import argparse
@@ -29,12 +31,16 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from tests.gpu.needs import ROOT, stop_without_packages, why_no_card
+
+if __name__ == "__main__":
+    stop_without_packages()  # before the imports below fail, one after the other
+
 from arcade_torch.agents.runs.files import read_csv, write_atomic
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.tools.bench.registry import TABLES
 from arcade_torch.tools.files import write_csv
 
-ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
     "bridge": ("tests/arcade_torch", "tests/gpu/test_bridge.py"),
     "models": ("tests/models", "tests/gpu/test_memories.py"),
@@ -52,6 +58,8 @@ from arcade_torch.tools.files import write_csv
 row = machine()
 write_csv(Path(sys.argv[1]), [row], list(row))
 """
+NOTHING_PASSED = 5
+"""The exit code of tests that were all skipped: that of pytest where it has none to run."""
 _GRACE_S, _LEAST_S, _TAIL = 30.0, 45.0, 15
 
 
@@ -62,6 +70,11 @@ class Stage:
     name: str
     argv: tuple[str, ...]
     resumes: bool = False
+
+    @property
+    def is_tests(self) -> bool:
+        """Whether pytest runs, and reports."""
+        return any(word.startswith("--junitxml=") for word in self.argv)
 
 
 def stages(folder: Path, device: str) -> list[Stage]:
@@ -172,10 +185,7 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
     waiting.
     """
     end, first = time.monotonic() + seconds, True
-    state = {
-        stage.name: "done" if (folder / f"{stage.name}.done").exists() else "waiting"
-        for stage in chosen
-    }
+    state = {stage.name: "done" if is_done(stage, folder) else "waiting" for stage in chosen}
     todo = [stage for stage in chosen if state[stage.name] == "waiting"]
     for stage in sorted(todo, key=lambda stage: (folder / f"{stage.name}.failed").exists()):
         left = end - time.monotonic()
@@ -185,6 +195,8 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
         began = time.monotonic()
         code = launch(stage, folder / f"{stage.name}.log", left)
         collect(stage, folder)
+        if code == 0 and stage.is_tests and not any_passed(stage, folder):
+            code = NOTHING_PASSED
         took = time.monotonic() - began
         goes_on = code is None and (
             stage.resumes or not first
@@ -194,10 +206,43 @@ def run(chosen: Sequence[Stage], folder: Path, seconds: float) -> dict[str, str]
         (folder / f"{stage.name}.failed").unlink(missing_ok=True)
         if not goes_on:
             write_atomic(folder / f"{stage.name}.{found}", f"exit code {code}, {took:.0f} s\n")
-        print(f"{stage.name}: {found}, {took:.0f} s", flush=True)
+        why = ", no test passed" if code == NOTHING_PASSED else ""
+        print(f"{stage.name}: {found}{why}, {took:.0f} s", flush=True)
         if found == "failed":
             print(*tail(folder / f"{stage.name}.log"), sep="\n", flush=True)
     return state
+
+
+def is_done(stage: Stage, folder: Path) -> bool:
+    """Whether a mark says that a stage never runs again; tests are asked whether any passed."""
+    marked = (folder / f"{stage.name}.done").exists()
+    return marked and (not stage.is_tests or any_passed(stage, folder))
+
+
+def any_passed(stage: Stage, folder: Path) -> bool:
+    """Whether a test of a stage passed, by its CSV file."""
+    path = folder / f"{stage.name}.csv"
+    return path.exists() and any(row["outcome"] == "passed" for row in read_csv(path))
+
+
+def forget_marks_without_a_card(folder: Path) -> None:
+    """Delete the marks of a folder whose machine had no card, with what it says of the machine: its
+    stages measured a CPU.
+    """
+    path = folder / "machine.csv"
+    if not path.exists():
+        return
+    row = read_csv(path)[0]
+    if row["torch_device"] == "cuda" and row["jax_device"].startswith(("gpu", "cuda")):
+        return
+    marks = sorted(folder.glob("*.done"))
+    for mark in [*marks, path]:
+        mark.unlink()
+    print(
+        f"{len(marks)} stages were marked as done on a machine without a card "
+        f"(torch on {row['torch_device']}, JAX on {row['jax_device']}): they run again",
+        flush=True,
+    )
 
 
 def launch(stage: Stage, log: Path, seconds: float) -> int | None:
@@ -336,8 +381,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--page", type=Path, help="Markdown page; FOLDER/gpu.md by default")
     options = parser.parse_args(argv)
+    if options.device == "cuda":
+        problem = why_no_card()
+        if problem:
+            sys.exit(f"no stage was begun: {problem} (a rehearsal without a card: DEVICE=cpu)")
     folder: Path = options.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
+    if options.device == "cuda":
+        forget_marks_without_a_card(folder)
     found = stages(folder, options.device)
     chosen = [
         stage for stage in found if any(fnmatch(stage.name, pattern) for pattern in options.only)

@@ -28,6 +28,8 @@ from tests.arcade_torch.test_collector import Recurrent, assert_same, scripted
 pytestmark = pytest.mark.gpu
 ROOT = Path(__file__).resolve().parents[2]
 EASY = [id for id in registered_ids() if "Easy" in id]
+REHEARSED = ("MineSweeperEasy-v0", "CartPoleEasy-v0")
+"""A game of whole numbers and one of fractions."""
 N = 6
 
 
@@ -93,14 +95,19 @@ def test_a_tensor_that_begins_where_jax_cannot_compute_is_refused(device: str) -
     assert (to_jax(aligned) + 1).tolist() == (aligned + 1).tolist()
 
 
-def test_the_frames_of_a_step_are_the_memory_that_jax_wrote(device: str) -> None:
+def test_the_frames_of_a_step_are_the_memory_that_jax_wrote(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     env = arcade_torch.make("MineSweeperEasy", num_envs=N, device=device)
-    raw = env.step_raw(torch.zeros(N, dtype=torch.int64, device=device))
-    assert (
-        raw.pixels.device == env.device
-        and raw.pixels.data_ptr() == raw.step.pixels.unsafe_buffer_pointer()
+    written = []
+    step = env._compiled.step
+    monkeypatch.setattr(
+        env._compiled, "step", lambda *args: written.append(step(*args)) or written[-1]
     )
-    assert raw.numbers.data_ptr() == raw.step.numbers.unsafe_buffer_pointer()
+    raw = env.step_raw(torch.zeros(N, dtype=torch.int64, device=device))
+    assert len(written) == 1 and raw.pixels.device == raw.numbers.device == env.device
+    assert raw.pixels.data_ptr() == written[0].pixels.unsafe_buffer_pointer()
+    assert raw.numbers.data_ptr() == written[0].numbers.unsafe_buffer_pointer()
 
 
 # -- the order of the streams ----------------------------------------------------------------------
@@ -203,6 +210,8 @@ def test_the_paths_of_torchrl_give_the_frames_of_the_cpu(path: str, device: str)
 @pytest.mark.parametrize("game", EASY)
 def test_a_card_draws_the_frames_of_the_cpu(game: str, device: str) -> None:
     """From equal states. Where states are fractions of a pixel, a card may round another way."""
+    if device == "cpu" and game not in REHEARSED:
+        pytest.skip("a rehearsal draws two games: the others say something on a CUDA device alone")
     here, there = (
         arcade_torch.make(game, num_envs=8, observability="partial", device=d)
         for d in ("cpu", device)

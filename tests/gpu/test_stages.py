@@ -2,18 +2,20 @@
 page.
 """
 
+import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.registry import TABLES
 from arcade_torch.tools.studies.grid import Study
-from tests.gpu import stages
+from tests.gpu import needs, stages
 from tests.gpu.stages import ROOT, Stage, run
 
 FAILS = "import sys; print('one'); sys.exit('no card at hand')"
@@ -24,9 +26,14 @@ def script(name: str, code: str, resumes: bool = False) -> Stage:
 
 
 def in_this_process(stage: Stage, log: Path, seconds: float) -> int | None:
-    """Commands as they are, without the seconds that a process needs to begin; of the tests one."""
+    """Commands as they are, without the seconds that a process needs to begin. Of the tests those
+    of one stage run, four of them, and those of the others are said to pass.
+    """
     log.write_text("")
-    if "pytest" in stage.argv:
+    if stage.name == "tests-bridge":
+        words = (*stage.argv, "-k", "test_an_array_becomes")
+        return subprocess.run([sys.executable, *words], cwd=ROOT, check=False).returncode
+    if stage.is_tests:
         report = Path(stage.argv[-1].removeprefix("--junitxml="))
         report.write_text(
             '<testsuite><testcase classname="a.b" name="test_c" time="0.1"/></testsuite>'
@@ -64,10 +71,79 @@ def test_a_rehearsal_runs_every_stage_and_writes_a_page(
     assert (
         machine["torch"] in page
         and machine["jax_device"] in page
-        and "| tests-bridge | 1 |" in page
+        and "| tests-bridge | 4 |" in page
     )
     monkeypatch.setattr(stages, "launch", None)
     assert stages.main([str(tmp_path), "--device", "cpu"]) == 0  # all is done: nothing runs again
+
+
+SKIPPED = """
+import pytest
+
+@pytest.mark.skip(reason="needs a CUDA device")
+def test_on_a_card(): pass
+"""
+
+
+def stage_of_tests(folder: Path, code: str) -> Stage:
+    """Tests of a file of one's own, run by pytest as any stage runs it."""
+    file = folder / "test_on_a_card.py"
+    file.write_text(code)
+    report = f"--junitxml={folder / 'tests-one.xml'}"
+    options = ("-q", "-p", "no:cacheprovider", "-c", os.devnull, f"--rootdir={folder}")
+    return Stage("tests-one", ("-m", "pytest", *options, str(file), report))
+
+
+def test_tests_that_were_all_skipped_have_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """pytest ends with 0: without a card the stage was done, and never ran again."""
+    assert run([stage_of_tests(tmp_path, SKIPPED)], tmp_path, 60) == {"tests-one": "failed"}
+    assert "tests-one: failed, no test passed" in capsys.readouterr().out
+    assert [row["outcome"] for row in read_csv(tmp_path / "tests-one.csv")] == ["skipped"]
+    both = stage_of_tests(tmp_path, f"{SKIPPED}\ndef test_on_any_machine(): pass\n")
+    assert run([both], tmp_path, 60) == {"tests-one": "done"}
+    assert not (tmp_path / "tests-one.failed").exists()
+
+
+def test_a_mark_of_tests_that_were_all_skipped_is_not_believed(tmp_path: Path) -> None:
+    stage = stage_of_tests(tmp_path, "def test_on_any_machine(): pass")
+    (tmp_path / "tests-one.done").write_text("exit code 0, 9 s\n")
+    (tmp_path / "tests-one.csv").write_text("test,outcome,seconds,message\na::b,skipped,0,\n")
+    assert run([stage], tmp_path, 60) == {"tests-one": "done"}
+    assert [row["outcome"] for row in read_csv(tmp_path / "tests-one.csv")] == ["passed"]
+    (tmp_path / "test_on_a_card.py").unlink()
+    assert run([stage], tmp_path, 60) == {"tests-one": "done"}  # this one is believed
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="here is a card")
+def test_without_a_card_one_line_says_so_and_no_stage_begins(tmp_path: Path) -> None:
+    with pytest.raises(
+        SystemExit, match=r"^no stage was begun: torch sees no GPU: .*DEVICE=cpu\)$"
+    ):
+        stages.main([str(tmp_path / "new")])
+    assert not (tmp_path / "new").exists()
+
+
+def test_marks_of_a_machine_without_a_card_are_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(stages, "why_no_card", lambda: "")
+    monkeypatch.setattr(stages, "launch", lambda _, log, seconds: log.write_text("no card"))
+    for device, believed in (("cpu (cpu)", False), ("gpu (NVIDIA H100)", True)):
+        (tmp_path / "machine.csv").write_text(f"jax_device,torch_device\n{device},cuda\n")
+        (tmp_path / "machine.done").write_text("exit code 0, 9 s\n")
+        assert stages.main([str(tmp_path), "--only", "machine"]) == (0 if believed else 1)
+        assert ("JAX on cpu (cpu)): they run again" in capsys.readouterr().out) != believed
+
+
+def test_a_bare_python_is_told_of_all_that_is_missing_in_one_line() -> None:
+    bare = [sys.executable, "-S", "-m", "tests.gpu.stages", "build/never"]
+    answer = subprocess.run(bare, cwd=ROOT, capture_output=True, text=True, env={}, check=False)
+    assert answer.returncode == 1 and answer.stdout == "" and answer.stderr.count("\n") == 1
+    for requirement in needs.needed():
+        assert requirement.replace("jax>", "jax[cuda13]>") in answer.stderr
+    assert "-m pip install 'torch>=" in answer.stderr and needs.missing_packages() == []
 
 
 def test_every_command_for_a_card_is_one_that_the_parser_takes(tmp_path: Path) -> None:
@@ -151,5 +227,5 @@ def test_an_unknown_stage_is_refused_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
-        stages.main([str(tmp_path), "--only", "trian-*"])
+        stages.main([str(tmp_path), "--device", "cpu", "--only", "trian-*"])
     assert "no stage is called trian-*; there are machine, tests-bridge" in capsys.readouterr().err
