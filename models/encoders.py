@@ -177,7 +177,6 @@ class PaperEncoder(Encoder):
                 layers.append(nn.MaxPool2d(*pool))
             layers.append(nn.LeakyReLU(inplace=True))
         self.layers = nn.Sequential(*layers)
-        self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def compress(self, pixels: Tensor) -> Tensor:
         """The upper left part, which is all that the features depend on.
@@ -233,7 +232,6 @@ class SmallEncoder(Encoder):
         self.conv1 = nn.Conv2d(3, channels, patch, patch)
         self.conv2 = nn.Conv2d(channels, 32, 3)
         self.linear = nn.Conv2d(32, 128, 6)
-        self.linear.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.register_buffer("mean", torch.zeros(side, side, 3).permute(2, 0, 1))
         self.register_buffer("inverse_rms", torch.tensor(1 / 255))
         self.mean: Tensor

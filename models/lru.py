@@ -69,7 +69,7 @@ class LRU(Memory):
         decay = torch.polar(torch.exp(-torch.exp(self.nu)), torch.exp(self.theta))
         scaled = (self.input * torch.exp(self.gamma)[:, None, None]).flatten(0, 1)
         b = F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2))
-        start = torch.view_as_complex(h0.contiguous())
+        start = torch.complex(h0[..., 0], h0[..., 1])
         h = torch.view_as_real(self.scan(decay, torch.view_as_complex(b), is_init, start))
         passed = x * self.skip if self.skip.ndim == 1 else F.linear(x, self.skip)
         return F.linear(h.flatten(-2), self.output.flatten(1)) + passed, h

@@ -27,7 +27,7 @@ MAY_IMPORT = {
 LIBRARIES = {
     "envs_jax": {"jax", "jaxlib", "numpy"},
     "bridge": {"torch", "torchrl", "tensordict", "jax", "jaxlib", "numpy", "gymnasium", "pygame"},
-    "models": {"torch", "torchrl", "tensordict", "numpy", "triton"},
+    "models": {"torch", "torchrl", "tensordict", "numpy", "triton", "sb3_contrib"},
     "agents": {
         "torch",
         "torchrl",

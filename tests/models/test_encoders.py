@@ -273,3 +273,15 @@ def test_in_bfloat16_the_small_encoder_is_as_near_as_its_rounding(side):
     smooth = pixels.float().requires_grad_()
     encoder(smooth).square().sum().backward()
     assert (smooth.grad != 0).any()
+
+
+@pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
+def test_weights_can_be_made_orthogonal(make):
+    """Before: torch refused the order of their memory, and Stable-Baselines3 does it to all."""
+    encoder = make()
+    for layer in encoder.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.orthogonal_(layer.weight)
+    rows = encoder.conv2.weight.flatten(1) if make is SmallEncoder else encoder.layers[0].weight
+    rows = rows.flatten(1)
+    torch.testing.assert_close(rows @ rows.T, torch.eye(len(rows)), rtol=0, atol=1e-4)
