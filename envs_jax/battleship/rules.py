@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass
 from functools import reduce
-from operator import or_
+from operator import add, or_
 from typing import NamedTuple
 
 import jax
@@ -56,55 +56,104 @@ class BattleShipState(NamedTuple):
     truncated: Array = UNSET  # bool, whether the time limit was reached
 
 
-def free_places(occupied: Array, length: int) -> Array:
-    """Where a ship of ``length`` cells fits: bool [2, side, side], its first cell if it lies along
-    x, then along y.
+def free_lines(columns: list[Array], length: int) -> list[Array]:
+    """Where a ship of ``length`` cells fits: the bits of its first cell, int32 a line.
 
-    ``occupied``, bool [side, side], are cells that are taken; touching them is allowed.
+    Args:
+        columns: int32 a column of the sea, bit y is set where the cell is taken. Touching such
+            cells is allowed.
+        length: Cells of the ship.
+
+    Returns:
+        The columns for a ship along x, then those for one along y.
     """
-    side = occupied.shape[0]
-    padded = jnp.pad(occupied, (0, length - 1), constant_values=True)
-    along_x = reduce(or_, (padded[k : k + side, :side] for k in range(length)))
-    along_y = reduce(or_, (padded[:side, k : k + side] for k in range(length)))
-    return ~jnp.stack([along_x, along_y])
+    side = len(columns)
+    sea = (1 << side) - 1
+    along_x = []
+    along_y = []
+    for x, column in enumerate(columns):
+        fits = x + length <= side
+        taken = reduce(or_, columns[x : x + length])
+        along_x.append(sea & ~taken if fits else jnp.int32(0))
+        with_border = column | ~sea
+        along_y.append(sea & ~reduce(or_, [with_border >> y for y in range(length)]))
+    return along_x + along_y
 
 
-def place_ship(draw: Array, occupied: Array, length: int) -> Array:
-    """Put a ship at one of the places where it fits, ``free_places``: bool [side, side], its cells.
+def pick_line(draw: Array, lines: list[Array]) -> tuple[Array, Array, Array]:
+    """Find the place of a number among the bits of lines, counted line by line.
+
+    Args:
+        draw: uint32, the number; counted round.
+        lines: int32 each, some bits.
+
+    Returns:
+        The line that holds the place, its bits, and how many of them come before it; int32 each.
+    """
+    bits = jnp.stack(lines)
+    number = jnp.arange(len(lines))
+    in_line = jax.lax.population_count(bits)
+    before = jnp.sum(jnp.where(number < number[:, None], in_line, 0), 1)
+    rest = (draw % in_line.sum().astype(jnp.uint32)).astype(jnp.int32) - before
+    chosen = (rest >= 0) & (rest < in_line)
+    return (
+        jnp.sum(jnp.where(chosen, number, 0)),
+        jnp.sum(jnp.where(chosen, bits, 0)),
+        jnp.sum(jnp.where(chosen, rest, 0)),
+    )
+
+
+def pick_line_in_turn(draw: Array, lines: list[Array]) -> tuple[Array, Array, Array]:
+    """:func:`pick_line` without reductions: on a GPU each would be a kernel of its own."""
+    in_line = [jax.lax.population_count(line) for line in lines]
+    total = reduce(add, in_line)
+    rest = (draw % total.astype(jnp.uint32)).astype(jnp.int32)
+    chosen_line = jnp.int32(0)
+    bits = jnp.int32(0)
+    rank = jnp.int32(0)
+    for number, line in enumerate(lines):
+        chosen = (rest >= 0) & (rest < in_line[number])
+        chosen_line |= jnp.where(chosen, number, 0)
+        bits |= jnp.where(chosen, line, 0)
+        rank |= jnp.where(chosen, rest, 0)
+        rest -= in_line[number]
+    return chosen_line, bits, rank
+
+
+def place_ship(draw: Array, columns: list[Array], length: int) -> list[Array]:
+    """Put a ship at one of the places where it fits, ``free_lines``: its cells as bits, int32 a
+    column.
 
     ``draw``, uint32, is which of the places, counted round: a uniform draw picks each with equal
     chance (the remainder favours some by less than one in ten million).
     """
-    side = occupied.shape[0]
-    places = free_places(occupied, length).reshape(2 * side, side)
-    in_line = places.sum(1)
-    line = jnp.arange(2 * side)
-    cell = jnp.arange(side)
+    side = len(columns)
+    lines = free_lines(columns, length)
     # First the line that holds the chosen place, then the place in it: far cheaper than ranking all
     # places.
-    before = jnp.sum(jnp.where(line < line[:, None], in_line, 0), 1)
-    rest = (draw % in_line.sum().astype(jnp.uint32)).astype(jnp.int32) - before
-    chosen = (rest >= 0) & (rest < in_line)
-    open_cells = (places & chosen[:, None]).any(0)
-    rank = jnp.sum((cell < cell[:, None]) & open_cells, 1)
-    y = jnp.sum(jnp.where(open_cells & (rank == jnp.sum(jnp.where(chosen, rest, 0))), cell, 0))
-    first = jnp.sum(jnp.where(chosen, line, 0))
-    x = first % side
-    lies_along_y = first >= side
-    columns = cell[:, None] - x
-    rows = cell - y
-    end_x = jnp.where(lies_along_y, 1, length)
-    end_y = jnp.where(lies_along_y, length, 1)
-    return (columns >= 0) & (columns < end_x) & (rows >= 0) & (rows < end_y)
+    line, bits, rank = jax.lax.platform_dependent(
+        draw, lines, cuda=pick_line_in_turn, default=pick_line
+    )
+    for lower in range(side - 1):
+        bits = jnp.where(lower < rank, bits & (bits - 1), bits)  # without the lowest
+    first = bits & -bits
+    ship = []
+    for x in range(side):
+        is_across = (line <= x) & (x < line + length)
+        along = jnp.where(line == side + x, first * ((1 << length) - 1), 0)
+        ship.append(jnp.where(is_across, first, along))
+    return ship
 
 
 def draw_board(key: Array, level: Params) -> Array:
     """Ships one after the other, each uniform over the places left to it: int8 [side, side]."""
     draws = jax.random.bits(key, (len(SHIPS),))
-    occupied = jnp.zeros((level.side, level.side), bool)
+    columns = [jnp.int32(0)] * level.side
     for draw, length in zip(draws, SHIPS, strict=True):
-        occupied |= place_ship(draw, occupied, length)
-    return occupied.astype(jnp.int8)
+        ship = place_ship(draw, columns, length)
+        columns = [taken | cells for taken, cells in zip(columns, ship, strict=True)]
+    bits = jnp.stack(columns)[:, None] >> jnp.arange(level.side)
+    return (bits & 1).astype(jnp.int8)
 
 
 def reset(key: Array, level: Params, rules: Rules) -> BattleShipState:

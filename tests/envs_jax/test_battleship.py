@@ -13,7 +13,12 @@ from hypothesis.extra import numpy as hnp
 from arcade_torch.envs_jax import env_keys, make
 from arcade_torch.envs_jax.battleship.oracle import ship_scores
 from arcade_torch.envs_jax.battleship.renderer import COVERED, HIT, KINDS, MISS
-from arcade_torch.envs_jax.battleship.rules import SHIPS, place_ship
+from arcade_torch.envs_jax.battleship.rules import (
+    SHIPS,
+    pick_line,
+    pick_line_in_turn,
+    place_ship,
+)
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.render.palette import BRASS, NICKEL, RED
 
@@ -88,10 +93,18 @@ def test_every_sea_holds_straight_ships_of_two_three_three_and_four_cells(id):
         assert (counter == 0).all()
 
 
+def put_ship(draw, occupied, length):
+    """The cells of a ship, bool [side, side], where cells of a bool [side, side] are taken."""
+    cells = jnp.arange(len(occupied))
+    columns = list((occupied.astype(jnp.int32) << cells).sum(1))
+    ship = jnp.stack(place_ship(draw, columns, length))
+    return (ship[:, None] >> cells) & 1 == 1
+
+
 def test_a_ship_takes_every_free_place_with_equal_chance():
     """Counting through the draws visits each legal place exactly once and then begins again."""
     put = {
-        n: jax.jit(jax.vmap(place_ship, in_axes=(0, None, None)), static_argnums=2)
+        n: jax.jit(jax.vmap(put_ship, in_axes=(0, None, None)), static_argnums=2)
         for n in set(SHIPS)
     }
     generator = np.random.default_rng(0)
@@ -107,6 +120,20 @@ def test_a_ship_takes_every_free_place_with_equal_chance():
             assert found[len(expected) :] == [
                 found[i % len(expected)] for i in range(len(expected), 112)
             ]
+
+
+@pytest.mark.parametrize("side", [8, 12])
+def test_a_gpu_picks_the_lines_that_a_cpu_picks(side):
+    generator = np.random.default_rng(side)
+    lines = generator.integers(0, 1 << side, (500, 2 * side), np.int32)
+    lines[generator.random(lines.shape) < 0.3] = 0
+    draws = generator.integers(0, 2**32, 500, np.uint32)
+    picks = [jax.vmap(pick)(draws, list(lines.T)) for pick in (pick_line, pick_line_in_turn)]
+    for one_way, other_way in zip(*picks, strict=True):
+        assert np.array_equal(one_way, other_way)
+    number, bits, rank = picks[0]
+    assert np.array_equal(bits, lines[np.arange(500), number])
+    assert (rank >= 0).all() and (rank < np.bitwise_count(bits)).all()
 
 
 def test_touching_ships_are_allowed():
