@@ -11,6 +11,8 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
+from arcade_torch.models.sequence_checks import SequenceChecks
+
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
@@ -276,6 +278,8 @@ class MemoryModule(TensorDictModuleBase):
         store: "step": a stored sequence holds the state of every step; "sequence": that of its
             first step; None: "step" unless a state takes more than 49,152 bytes, the size of a
             frame, or its start is not zeros, or learned.
+        check_sequences: refuse shuffled or cut steps in recurrent mode, and warn of a missing
+            recurrent state in sequential mode, where the batch shows it.
 
     Raises:
         ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
@@ -289,7 +293,7 @@ class MemoryModule(TensorDictModuleBase):
         >>> module = MemoryModule(memory, in_key="features", out_key="remembered")
         >>> module.in_keys, module.out_keys
         (['features', ('memory', 'h'), 'is_init'], ['remembered', ('next', 'memory', 'h')])
-        >>> flags = torch.zeros(2, 1, dtype=torch.bool)
+        >>> flags = torch.ones(2, 1, dtype=torch.bool)
         >>> step = TensorDict({"features": torch.ones(2, 3), "is_init": flags}, [2])
         >>> module(step)["next", "memory", "h"].shape
         torch.Size([2, 4])
@@ -310,12 +314,14 @@ class MemoryModule(TensorDictModuleBase):
         is_init_key: Key = "is_init",
         default_recurrent_mode: bool = False,
         store: Store | None = None,
+        check_sequences: bool = True,
     ) -> None:
         super().__init__()
         self.memory = memory
         self.in_key = unravel_key(in_key)
         self.out_key = unravel_key(out_key)
         self.recurrence = Recurrence(memory, state_key, is_init_key, default_recurrent_mode, store)
+        self.recurrence.checks.enabled = check_sequences
         self.is_init_key = self.recurrence.is_init_key
         self.store = self.recurrence.store
         self.in_keys = [self.in_key, *self.state_keys, self.is_init_key]
@@ -349,8 +355,8 @@ class MemoryModule(TensorDictModuleBase):
             ``out_key`` only; so do not call it with keywords there).
 
         Raises:
-            ValueError: recurrent mode without a time dimension, or start flags that are not
-                [*batch, 1].
+            ValueError: recurrent mode without a time dimension, start flags that are not
+                [*batch, 1], or steps that do not follow each other.
             KeyError: no input or no start flags.
         """
         y = self.recurrence.read(self.memory, tensordict, tensordict[self.in_key])
@@ -412,6 +418,7 @@ class Recurrence:
     Attributes:
         state_keys: keys of the tensors of the state, without "next".
         next_state_keys: the same under "next".
+        checks: what looks at the batches.
 
     Raises:
         ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
@@ -447,6 +454,7 @@ class Recurrence:
             small = begins_with_zeros and state_bytes <= LARGE_STATE
             store = "step" if small else "sequence"
         self.store: Store = store
+        self.checks = SequenceChecks()
 
     @property
     def recurrent_mode(self) -> bool:
@@ -496,6 +504,10 @@ class Recurrence:
             raise ValueError(
                 "recurrent mode reads the last batch dimension as time, but the batch shape is []"
             )
+        if self.state_keys and recurrent:
+            self.checks.check_order(tensordict, is_init)
+        elif self.state_keys:
+            self.checks.check_state(tensordict, is_init, self.state_keys)
         rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
         x = x.reshape(*rows, x.shape[-1])
         is_init = is_init.reshape(rows)

@@ -131,10 +131,14 @@ def test_a_collected_window_replays_and_so_do_slices_of_it(name: str, recipe: Re
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("sampler", ["slices", "steps"])
+@pytest.mark.parametrize("checks", [True, False])
 def test_torchrls_ppo_trainer_replays_slices_and_not_shuffled_steps(
-    name: str, sampler: str
+    name: str, sampler: str, checks: bool
 ) -> None:
     agent = make_agent(name)
+    for module in agent.modules():
+        if isinstance(module, MemoryModule):
+            module.recurrence.checks.enabled = checks
     policy, critic = agent.get_policy_operator(), agent.get_value_operator()
     loss = ClipPPOLoss(policy, critic)
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
@@ -167,12 +171,16 @@ def test_torchrls_ppo_trainer_replays_slices_and_not_shuffled_steps(
 
     before = [p.detach().clone() for p in loss.parameters()]
     trainer.register_op("process_optim_batch", check)
+    if checks and sampler == "steps" and name != "mlp":
+        with pytest.raises(ValueError, match=r"where is_init is false: .*SliceSampler"):
+            trainer.train()
+        return
     trainer.train()
     assert list(first) == [N * T * window for window in range(1, WINDOWS + 1)]
     assert any(not torch.equal(p, old) for p, old in zip(loss.parameters(), before, strict=True))
     if sampler == "slices" or name == "mlp":
         assert max(first.values()) < CLOSE["atol"]
-    else:  # the trap itself: no error, no warning, another policy
+    else:  # the trap itself, unnoticed: no error, no warning, another policy
         assert min(first.values()) > 100 * CLOSE["atol"]
 
 
