@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from arcade_torch.agents.config import LearnerConfig, QConfig
+from arcade_torch.agents.cuda_graph import GraphedFunction
 from arcade_torch.agents.runs.states import check_optimizer
 
 
@@ -88,7 +88,7 @@ class Learner:
         self.frames_per_step = config.frames_per_update / config.grad_steps_per_update
         self.grad_steps = 0
         self.learning_rate = config.learning_rate
-        self._step = CudaGraphModule(self._plain_step) if training.cuda_graphs else self._plain_step
+        self._step = GraphedFunction(self._plain_step) if training.cuda_graphs else self._plain_step
         self._metrics: list[TensorDictBase] = []
 
     def minibatches(self, data: TensorDictBase) -> Iterator[TensorDictBase]:

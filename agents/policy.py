@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.data import Categorical
+from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueModule
 
@@ -52,9 +52,22 @@ def make_policy(
     greedy = QValueModule(action_space="categorical")
     if not explore:
         return TensorDictSequential(network, greedy)
+    device = next((p.device for p in network.parameters()), None)
     actions = Categorical(num_actions or _num_outputs(network))
-    exploring = EGreedyModule(actions, eps_init=float(epsilon), eps_end=0.0)
+    exploring = EpsilonGreedy(actions, eps_init=float(epsilon), eps_end=0.0).to(device)
     return TensorDictSequential(network, greedy, exploring)
+
+
+class EpsilonGreedy(EGreedyModule):
+    """TorchRL's module, whose random actions are drawn where its numbers are, also after a move.
+
+    TorchRL moves ``eps`` alone and draws actions on the device of the spec.
+    """
+
+    def _apply(self, *args: Any, **kwargs: Any) -> "EpsilonGreedy":
+        super()._apply(*args, **kwargs)
+        self._spec: Composite = self.spec.to(self.eps.device)
+        return self
 
 
 def _num_outputs(network: nn.Module) -> int:

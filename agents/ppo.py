@@ -188,7 +188,7 @@ class PPOLoss(LossModule):
         self.reduction = reduction
         device = next((p.device for p in self.parameters()), torch.device("cpu"))
         for name, number in (("clip_epsilon", clip_epsilon), ("entropy_coeff", entropy_coeff)):
-            value = torch.tensor(number, dtype=torch.float32, device=device)
+            value = torch.full((), number, dtype=torch.float32, device=device)
             self.register_buffer(name, value)
         self.clip_epsilon: Tensor
         self.entropy_coeff: Tensor

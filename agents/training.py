@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import CudaGraphModule
 from torchrl.modules import EGreedyModule
 
 import arcade_torch
 from arcade_torch.agents.averaging import check_return_range, move_mean, window_share
 from arcade_torch.agents.config import TrainConfig, require
+from arcade_torch.agents.cuda_graph import GraphedPolicy
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
 from arcade_torch.agents.learner import Learner, NonFiniteError, Training, epsilon_at
@@ -96,7 +96,7 @@ class Trainer:
             self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs
         )
         self.learner = LEARNERS[config.algorithm](self.network, numbers, training)
-        self.policy = make_policy(self.acting).to(device)
+        self.policy = make_policy(self.acting)
         self.explorers = [
             module for module in self.policy.modules() if isinstance(module, EGreedyModule)
         ]
@@ -106,7 +106,7 @@ class Trainer:
             check_return_range(self.env.game.id, self.return_range)
         self.collector = arcade_torch.ArcadeCollector(
             self.env,
-            CudaGraphModule(self.policy) if config.cuda_graphs else self.policy,
+            GraphedPolicy(self.policy) if config.cuda_graphs else self.policy,
             frames_per_batch=numbers.frames_per_update,
             total_frames=-1,
             overlap=numbers.steps_before,
@@ -492,11 +492,30 @@ def own_settings(config: TrainConfig) -> Iterator[None]:
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(config.threads or threads)
-        with torch.random.fork_rng():
-            torch.manual_seed(config.seed)
+        with own_random_numbers(torch.device(config.device), config.seed):
             yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def own_random_numbers(device: torch.device, seed: int) -> Iterator[None]:
+    """Seed torch's global generators of the CPU and of one GPU, and put them back afterwards; those
+    of other GPUs stay as they are.
+    """
+    generators = [torch.default_generator]
+    if device.type == "cuda":
+        torch.cuda.init()
+        index = torch.cuda.current_device() if device.index is None else device.index
+        generators.append(torch.cuda.default_generators[index])
+    states = [generator.get_state() for generator in generators]
+    try:
+        for generator in generators:
+            generator.manual_seed(seed)
+        yield
+    finally:
+        for generator, state in zip(generators, states, strict=True):
+            generator.set_state(state)
 
 
 @contextmanager
