@@ -3,10 +3,12 @@
 #   PYTHON=python3.12 make install     another interpreter (3.11, 3.12 or 3.13)
 #   make test WORKERS=4                more test processes
 #   make demo ARGS="--help"            ARGS goes to the command behind demo, bench, gpu, test and test-slow
+#   make install GPU=1                 JAX for an NVIDIA card too (GPU=12: for torch with CUDA 12)
 
 PYTHON  ?= python3
 WORKERS ?= 2
 ARGS    ?=
+GPU     ?=
 DEVICE  ?= cuda
 OUT     ?= build/gpu-$(DEVICE)
 PAGE    ?= $(if $(filter cuda,$(DEVICE)),results,$(OUT))/gpu.md
@@ -25,6 +27,7 @@ NEWEST_TESTS := $(addprefix tests/,contracts agents/test_identities.py agents/te
 NEWEST_TORCH ?= torch==2.13.0
 NEWEST_TORCHRL ?= torchrl-nightly
 RUN  := $(VENV)/bin/python
+GPU_EXTRA := $(if $(GPU),$(if $(filter 12,$(GPU)),gpu-cuda12,gpu))
 GPU_PYTHON := $(if $(wildcard $(RUN)),$(RUN),$(PYTHON))
 PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
@@ -35,6 +38,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 help:
 	@echo "make install    build $(VENV) with the versions of constraints.txt"
+	@echo "                (make install GPU=1: with JAX for an NVIDIA card, several GB; GPU=12 where torch has CUDA 12)"
 	@echo "make demo       a small study of memory, ending in an HTML report"
 	@echo "make test       the tests (make test-slow: the long ones)"
 	@echo "                (make test-triton: the Triton kernels on the CPU; installs triton, 1 GB, into $(VENV))"
@@ -45,13 +49,13 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
-	@echo "                (make gpu DEVICE=cpu: a rehearsal of it, a few minutes)"
+	@echo "                (make gpu DEVICE=cpu: a rehearsal of it, five to ten minutes)"
 	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
 	@echo "                (make bench-parity: the ratio of speed to it, game by game)"
 	@echo "make docs       the documentation as a site in build/docs, API reference included"
 	@echo "make clean      remove build output and caches (make distclean: and $(VENV))"
 
-install: $(VENV)/.installed
+install: $(VENV)/.installed $(addprefix $(VENV)/.,$(GPU_EXTRA))
 
 # The stamp is written last: an interrupted installation is taken up again, a finished one is not repeated.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
@@ -61,6 +65,10 @@ $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	@$(RUN) -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(PIP) torch==2.13.0 setuptools wheel
 	$(PIP) --no-build-isolation -e '.[tools,dev]'
+	@touch $@
+
+$(VENV)/.gpu $(VENV)/.gpu-cuda12: $(VENV)/.%: $(VENV)/.installed
+	$(PIP) --no-build-isolation -e '.[$*]'
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

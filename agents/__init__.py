@@ -22,6 +22,7 @@ _MODULES = {
     "pqn": ("PQN", "PQNLoss"),
     "presets": ("preset", "preset_names"),
     "replay": ("SequenceReplay",),
+    "replay_check": ("check_replay",),
     "returns": ("QLambdaEstimator", "SequenceGAE", "gae", "q_lambda_return"),
     "runs.files": ("CheckpointError",),
     "runs.folder": ("RunFolderError",),
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from arcade_torch.agents.pqn import PQN, PQNLoss
     from arcade_torch.agents.presets import preset, preset_names
     from arcade_torch.agents.replay import SequenceReplay
+    from arcade_torch.agents.replay_check import check_replay
     from arcade_torch.agents.returns import QLambdaEstimator, SequenceGAE, gae, q_lambda_return
     from arcade_torch.agents.runs.files import CheckpointError
     from arcade_torch.agents.runs.folder import RunFolderError
@@ -49,8 +51,8 @@ __all__ = [
     "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult",
     "NonFiniteError", "PPOConfig", "PPOLoss", "PQNConfig", "PQNLoss", "QLambdaEstimator",
     "RunFolderError", "SequenceGAE", "SequenceReplay", "TrainConfig", "TrainResult", "Trainer",
-    "build_network", "evaluate", "gae", "held_out_seed", "load", "make_actor", "make_policy",
-    "paper_score", "preset", "preset_names", "q_lambda_return", "train",
+    "build_network", "check_replay", "evaluate", "gae", "held_out_seed", "load", "make_actor",
+    "make_policy", "paper_score", "preset", "preset_names", "q_lambda_return", "train",
 ]  # fmt: skip
 
 

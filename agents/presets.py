@@ -90,6 +90,9 @@ def preset_names() -> list[str]:
 def preset(name: str, **changes: Any) -> TrainConfig:
     """A ready-made config, with some fields changed. Every preset has numbers for each algorithm.
 
+    What a preset means stands here alone: ``train``, ``study`` and Python begin with this config,
+    the algorithm with it, PQN but for ``small``.
+
     * ``paper``: the paper's settings and network; 10 M frames for CartPole, NoisyCartPole and
       AutoEncode, 20 M else.
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the

@@ -10,8 +10,8 @@ each is closed.
    TorchRL's own collector: ``TransformedEnv(env, get_primers_from_module(policy))``).
 5. ``is_init`` says where episodes begin: our environments show it, others need ``InitTracker()``.
 
-Whether all are closed is one number: before the first update the replayed log-probabilities are
-those of the rollout.
+Whether all are closed is one number, that of ``check_replay``: before the first update the replayed
+log-probabilities are those of the rollout.
 
     python examples/torchrl_ppo_trainer.py --memory mingru --frames 60000
 
@@ -39,6 +39,7 @@ from torchrl.objectives.value import GAE
 from torchrl.trainers.algorithms import PPOTrainer
 
 import arcade_torch
+from arcade_torch.agents import check_replay
 from arcade_torch.models import MemoryModule, SmallEncoder, make_memory
 
 NUM_ENVS, NUM_STEPS, SLICE, MINIBATCH, EPOCHS, WIDTH = 64, 20, 5, 320, 4, 128
@@ -112,15 +113,6 @@ def make_trainer(memory: str, frames: int) -> PPOTrainer:
     )
 
 
-def largest_log_ratio(policy: TensorDictSequential, batch: TensorDictBase) -> float:
-    """Run the policy again over what it did: the largest difference in log-probability, 0 up to
-    rounding.
-    """
-    with torch.no_grad(), set_recurrent_mode(True):
-        again = policy.get_dist(batch.select(*policy.in_keys)).log_prob(batch["action"])
-    return float((again - batch["action_log_prob"]).abs().max())
-
-
 def main(frames: int = 60_000, memory: str = "mingru") -> Result:
     """Train on the POMDP twin of SignpostEasy, where forgetting the sign means at most 0.25.
 
@@ -137,7 +129,7 @@ def main(frames: int = 60_000, memory: str = "mingru") -> Result:
 
     def check(batch: TensorDictBase) -> None:
         if not ratios:
-            ratios.append(largest_log_ratio(trainer.loss_module.actor_network, batch))
+            ratios.append(check_replay(trainer.loss_module.actor_network, batch))
             print(f"replay differs from rollout by {ratios[0]:.1e} before the first update")
 
     def watch(batch: TensorDictBase) -> dict[str, float]:

@@ -33,10 +33,10 @@ def test_torchrls_trainer_begins_with_the_policy_that_acted(
     script = example("torchrl_ppo_trainer")
     monkeypatch.setattr(script, "EPOCHS", 1)
     seen: list[int] = []
-    largest = script.largest_log_ratio
+    largest = script.check_replay
     monkeypatch.setattr(
         script,
-        "largest_log_ratio",
+        "check_replay",
         lambda policy, b: (seen.append(b.numel()), largest(policy, b))[1],
     )
     result = script.main(frames=2 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")

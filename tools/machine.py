@@ -44,7 +44,7 @@ def _commit() -> str:
 
 
 def machine() -> dict[str, Any]:
-    """Devices, cores and versions that something is measured with."""
+    """Devices, cores and versions that something is measured with; of cards, empty without one."""
     import jax
     import torch
 
@@ -55,7 +55,34 @@ def machine() -> dict[str, Any]:
         "processor": platform.processor() or platform.machine(),
         "cores": len(available_cores()),
         "torch_threads": torch.get_num_threads(),
+        **_cards(),
     } | versions()
+
+
+def _cards() -> dict[str, Any]:
+    """The first card that torch sees, its memory in GiB, how many there are, the driver, and the
+    CUDA that torch was built for.
+    """
+    import torch
+
+    about = dict.fromkeys(("card", "card_memory_gib", "cards", "driver"), "")
+    if torch.cuda.is_available():
+        properties = torch.cuda.get_device_properties(0)
+        about["card"] = properties.name
+        about["card_memory_gib"] = f"{properties.total_memory / 2**30:.1f}"
+        about["cards"] = str(torch.cuda.device_count())
+        about["driver"] = _driver()
+    return about | {"torch_cuda": torch.version.cuda or ""}
+
+
+def _driver() -> str:
+    """Version of NVIDIA's driver, empty where ``nvidia-smi`` does not say."""
+    words = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        answer = subprocess.run(words, capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return (answer.stdout.split() or [""])[0]
 
 
 def available_cores() -> list[int]:

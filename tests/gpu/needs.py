@@ -23,7 +23,8 @@ major = (torch.version.cuda or "13").split(".")[0]
 if why_no_cuda():
     print(why_no_cuda())
 elif backend != "gpu":
-    print(f"JAX computes on the {backend}, not on the GPU: pip install 'jax[cuda{major}]'")
+    more = "make install GPU=" + ("12" if major == "12" else "1")
+    print(f"JAX computes on the {backend}: pip install 'jax[cuda{major}]', or {more}")
 """
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
@@ -135,6 +136,26 @@ def test_marks_of_a_machine_without_a_card_are_forgotten(
         (tmp_path / "machine.done").write_text("exit code 0, 9 s\n")
         assert stages.main([str(tmp_path), "--only", "machine"]) == (0 if believed else 1)
         assert ("JAX on cpu (cpu)): they run again" in capsys.readouterr().out) != believed
+
+
+def installation(*words: str) -> str:
+    """What ``make install`` would do in a folder where nothing is."""
+    command = ["make", "--dry-run", "install", "VENV=build/never", *words]
+    answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return answer.stdout
+
+
+def test_make_installs_jax_for_a_card_where_it_is_asked_to() -> None:
+    """``make install && make gpu`` on a rented card copied all frames: JAX came for the CPU."""
+    assert "gpu" not in installation()
+    assert installation("GPU=1").count("-e '.[gpu]'") == 1
+    assert installation("GPU=12").count("-e '.[gpu-cuda12]'") == 1
+    setup = ConfigParser(interpolation=None)
+    setup.read(ROOT / "setup.cfg")
+    (jax,) = (line for line in needs.needed() if line.startswith("jax"))
+    for extra, cuda in (("gpu", "cuda13"), ("gpu-cuda12", "cuda12")):
+        line = setup["options.extras_require"][extra].strip()
+        assert line.startswith(jax.replace("jax", f"jax[{cuda}]"))
 
 
 def test_a_bare_python_is_told_of_all_that_is_missing_in_one_line() -> None:

@@ -69,7 +69,7 @@ class StudyCommand(Resumable):
 
     The file names games, memories and seeds, and optionally observability, algorithms, preset,
     total_frames, baseline, sizes, question and a table [settings] with fields of the config that
-    train takes.
+    train takes. Where it names no algorithms, the preset's is trained, as train does.
 
     Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
@@ -102,6 +102,9 @@ class StudyCommand(Resumable):
             definition = study_preset(self.preset)
         else:
             definition = Study.load(str(self.file))
+        warning = definition.overridden_preset()
+        if warning:
+            print(f"warning: {warning}", file=sys.stderr)
         if self.dry_run:
             plan = planned(definition, self.shard)
             total = 0

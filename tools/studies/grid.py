@@ -86,7 +86,7 @@ class Study:
     memories: tuple[str, ...]  # memory models; the memory-free control is one of them
     seeds: tuple[int, ...]  # one run a seed
     observability: tuple[str, ...] = ("full", "partial")  # the twins
-    algorithms: tuple[str, ...] = ("pqn",)  # learners
+    algorithms: tuple[str, ...] = ()  # learners; none given: that of the preset
     preset: str = "paper"  # settings that all runs start from
     total_frames: int | None = None  # environment steps of each run; None keeps the preset's
     # fields of ``TrainConfig``: ``{"pqn": {"gamma": 0.9}}``
@@ -99,6 +99,8 @@ class Study:
     def __post_init__(self) -> None:
         for name, kind in _OTHERS.items():
             object.__setattr__(self, name, coerce(name, getattr(self, name), kind))
+        if not self.algorithms:
+            object.__setattr__(self, "algorithms", (preset(self.preset).algorithm,))
         for axis in _AXES:
             object.__setattr__(self, axis, _axis(axis, getattr(self, axis)))
         for name in self.settings:
@@ -164,6 +166,19 @@ class Study:
                 f"{', '.join(names)}: "
                 "add it to memories, or name one of them"
             )
+
+    def overridden_preset(self) -> str:
+        """Say in one line that the study trains another algorithm than its preset; empty where it
+        does not.
+        """
+        algorithm = preset(self.preset).algorithm
+        if algorithm in self.algorithms:
+            return ""
+        trained = " and ".join(self.algorithms)
+        return (
+            f"the preset {self.preset!r} trains {algorithm}, but this study {trained}, as its "
+            "algorithms say: leave them out for the preset's"
+        )
 
     def fixed(self) -> dict[str, Any]:
         """What may not change between two invocations in one folder: everything that decides a
