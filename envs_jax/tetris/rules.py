@@ -4,6 +4,8 @@ Collisions are tested on rows of bits: bit ``MARGIN + c`` of a row is its column
 beyond the board are set, so that walls and floor are blocks like any other."""
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import and_, or_
 from typing import NamedTuple
 
 import jax
@@ -156,10 +158,17 @@ def rows_of_bits(board: Array) -> Array:
     return jnp.pad(cells.sum(1, dtype=jnp.int32) | _WALLS, (0, _WINDOW), constant_values=_SOLID)
 
 
-def box_of_bits(piece: Array, rot: Array, px: Array) -> Array:
-    """The rows of a piece's box, at its columns: int32 [4]."""
-    rows = (jnp.asarray(_MASKS)[piece, rot] >> (BOX * jnp.arange(BOX))) & ((1 << BOX) - 1)
-    return rows << (px + MARGIN)
+def box_of_bits(piece: Array, rot: Array, px: Array) -> list[Array]:
+    """The four rows of a piece's box, at its columns: int32 each."""
+    mask = jnp.asarray(_MASKS)[piece, rot]
+    rows = [mask >> (BOX * row) & ((1 << BOX) - 1) for row in range(BOX)]
+    return [row << (px + MARGIN) for row in rows]
+
+
+def is_free(box: list[Array], rows: Array) -> Array:
+    """Whether a piece's box meets none of the blocks in four rows of bits, int32 [4]: a bool."""
+    met = [box[row] & rows[row] for row in range(BOX)]  # term by term: a GPU needs no reduction
+    return reduce(or_, met) == 0
 
 
 def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
@@ -173,13 +182,14 @@ def clear_rows(state: TetrisState, rules: Rules) -> tuple[TetrisState, Array]:
     """
     board = state.board
     row = jnp.arange(ROWS)
-    full = complete_rows(board) & state.just_locked
+    bit = jnp.int32(1) << row
+    full = jnp.sum(jnp.where(complete_rows(board) & state.just_locked, bit, 0))
+    lines = state.lines + jax.lax.population_count(full)
     for _ in range(BOX):  # a piece completes four rows at most; the topmost goes first
-        top = jnp.min(jnp.where(full, row, ROWS))
-        falls = ((row <= top) & (top < ROWS))[:, None]
+        top = full & -full
+        falls = (bit <= top)[:, None]
         board = jnp.where(falls, jnp.pad(board[:-1], ((1, 0), (0, 0))), board)
-        full &= row != top
-    lines = state.lines + (complete_rows(state.board) & state.just_locked).sum(dtype=jnp.int32)
+        full &= full - 1
     paid = lines - state.lines
     if rules == "default":
         paid = jnp.minimum(lines, GOAL) - jnp.minimum(state.lines, GOAL)
@@ -215,7 +225,7 @@ def steer(state: TetrisState, action: Array, window: Array) -> TetrisState:
     """
     rot = (state.rot + (action == UP)) % ROTATIONS
     px = state.px + (action == RIGHT).astype(jnp.int32) - (action == LEFT)
-    free = (window[:BOX] & box_of_bits(state.piece, rot, px) == 0).all()
+    free = is_free(box_of_bits(state.piece, rot, px), window[:BOX])
     return state._replace(rot=jnp.where(free, rot, state.rot), px=jnp.where(free, px, state.px))
 
 
@@ -229,16 +239,16 @@ def fall(
     the reference the last one alone.
     """
     box = box_of_bits(state.piece, state.rot, state.px)
-    free = jnp.stack([(window[down : down + BOX] & box == 0).all() for down in range(_DEPTH + 1)])
-    down = jnp.arange(_DEPTH + 1)
+    free = [is_free(box, window[down : down + BOX]) for down in range(_DEPTH + 1)]
     drop = jnp.where(state.frames_since_spawn == 0, 1, level.drop)
     wanted = jnp.where(action == DOWN, drop, level.fall)
+    downs = range(1, _DEPTH + 1)
     if rules == "default":
-        way_is_free = (free | (down > wanted) | (down == 0)).all()
+        way_is_free = reduce(and_, [free[down] | (down > wanted) for down in downs])
     else:
-        way_is_free = (free & (down == wanted)).any()
+        way_is_free = reduce(or_, [free[down] & (down == wanted) for down in downs])
     fallen = jnp.where(way_is_free, wanted, free[1].astype(jnp.int32))
-    lies = ~(free & (down == fallen + 1)).any()
+    lies = ~reduce(or_, [free[down] & (down == fallen + 1) for down in downs])
     new = state._replace(py=state.py + fallen, just_locked=lies)
     tile = (state.piece + 1).astype(jnp.int8)
     return new._replace(board=jnp.where(covers(new) & lies, tile, new.board))
@@ -256,7 +266,7 @@ def step(
     cleared, reward = clear_rows(state, rules)
     new = spawn(key, cleared, level, rules)
     window = jax.lax.dynamic_slice(rows_of_bits(new.board), (new.py,), (_WINDOW,))
-    overlaps = (window[:BOX] & box_of_bits(new.piece, new.rot, new.px) != 0).any()
+    overlaps = ~is_free(box_of_bits(new.piece, new.rot, new.px), window[:BOX])
     terminal = state.just_locked & overlaps
 
     new = steer(new, action, window)
