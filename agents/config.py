@@ -18,9 +18,6 @@ from typing import (
     get_type_hints,
 )
 
-from arcade_torch.agents.differences import differences
-from arcade_torch.agents.differences import flatten as flatten
-
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 # fields that do not belong to a run's identity
 RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")
@@ -191,7 +188,7 @@ class LearnerConfig(Checked):
     """The weights that act and are saved are a mean of those that learn, over about this share of
     the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824). The share grows with the
     training return: none at the lowest that the game can pay, all of it at the highest, a fourth
-    power between (``agents.averaging.window_share``). 0: no mean.
+    power between (``agents.learner.window_share``). 0: no mean.
     """
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the
@@ -523,16 +520,47 @@ def differing_fields(
 def differing_values(
     one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
 ) -> dict[str, tuple[Any, Any]]:
-    """The same with both values; plain settings that lack a field have its default. See
-    `differences`.
+    """The settings in which two runs differ: dotted name -> both values.
+
+    Args:
+        one: settings of a run, as a config or as its ``config.json`` holds them. A setting that is
+            not there has its default: the run may be from before there was that setting. One that
+            is not known here is None where it is missing.
+        other: those of another.
+        free: settings, and groups of settings, that may differ. The groups of learners that neither
+            run uses make no difference.
     """
-    default = TrainConfig().to_dict()
-    return differences(_plain(one), _plain(other), default, GROUPS, free)
+    default = flatten(TrainConfig().to_dict())
+    mine = default | flatten(_stated(one))
+    theirs = default | flatten(_stated(other))
+    used = {str(mine["algorithm"]), str(theirs["algorithm"])}
+    skipped = {*free} | {*GROUPS} - used
+    pairs = dict[str, tuple[Any, Any]]()
+    for name in sorted(mine.keys() | theirs.keys()):
+        group = name.partition(".")[0]
+        values = mine.get(name), theirs.get(name)
+        if values[0] != values[1] and not {name, group} & skipped:
+            pairs[name] = values
+    return pairs
 
 
-def _plain(settings: Settings) -> Mapping[str, Any]:
-    """Settings as a ``config.json`` holds them."""
-    return settings.to_dict() if isinstance(settings, TrainConfig) else settings
+def _stated(settings: Settings) -> dict[str, Any]:
+    """Plain settings without those that are null, which say nothing."""
+    plain = settings.to_dict() if isinstance(settings, TrainConfig) else settings
+    return {name: value for name, value in plain.items() if value is not None}
+
+
+def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has
+    ``pqn.gamma``.
+    """
+    settings = dict[str, Any]()
+    for name, value in plain.items():
+        if isinstance(value, Mapping):
+            settings |= flatten(value, f"{prefix}{name}.")
+        else:
+            settings[prefix + name] = value
+    return settings
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:

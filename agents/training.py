@@ -19,12 +19,19 @@ import torch
 from torchrl.modules import EGreedyModule
 
 import arcade_torch
-from arcade_torch.agents.averaging import check_return_range, move_mean, window_share
 from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.cuda_graph import GraphedPolicy
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_env, make_eval_env
-from arcade_torch.agents.learner import Learner, NonFiniteError, Training, epsilon_at
+from arcade_torch.agents.learner import (
+    Learner,
+    NonFiniteError,
+    Training,
+    check_return_range,
+    epsilon_at,
+    move_mean,
+    window_share,
+)
 from arcade_torch.agents.metrics import EpisodeStats, paper_score
 from arcade_torch.agents.policy import Agent, build_network, compile_network, make_policy
 from arcade_torch.agents.ppo import PPO

@@ -223,6 +223,15 @@ def loaded_after(statement: str) -> set[str]:
         ("import arcade_torch.models", {"jax", "jaxlib"}),
         ("import arcade_torch.agents.presets", {"torch", "tensordict", "torchrl", "jax"}),
         ("import arcade_torch.tools.commands.train", {"torch", "tensordict", "torchrl", "jax"}),
+        ("import arcade_torch.tools.commands.figure", {"torch", "torchrl", "jax", "matplotlib"}),
+        ("import arcade_torch.tools.measures.gap_bias.measure", {"torch", "jax", "matplotlib"}),
+        *(
+            (
+                f"import arcade_torch.tools.measures.{measure}.measure",
+                {"torchrl", "jax", "matplotlib", "tyro"},
+            )
+            for measure in ("saliency", "recall_density", "contamination")
+        ),
     ],
 )
 def test_importing_a_layer_loads_nothing_that_it_does_not_need(

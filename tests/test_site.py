@@ -174,7 +174,7 @@ def test_the_reference_has_every_public_module() -> None:
         "arcade_torch",
         "arcade_torch.env",
         "arcade_torch.models.lru",
-        "arcade_torch.tools.analysis.gap_bias",
+        "arcade_torch.tools.measures.gap_bias.measure",
     ):
         assert (
             f"::: {name}\n" in pages[f"api/{name}.md"] and f"]({name}.md)" in pages["api/index.md"]

@@ -27,7 +27,7 @@ import arcade_torch
 from arcade_torch.agents import Agent, EvalResult, TrainConfig, TrainResult, evaluate, load, preset, preset_names, train
 from arcade_torch.models import make_memory, memory_names
 from arcade_torch.tools import Study, gap_and_bias, report
-from arcade_torch.tools.analysis.gap_bias import GapBias
+from arcade_torch.tools.measures.gap_bias.measure import GapBias
 
 assert_type(arcade_torch.registered_ids(), list[str])
 assert_type(arcade_torch.__version__, str)

@@ -9,26 +9,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _PUBLIC = {
-    "Policy": "analysis.policy",
+    "Policy": "measures.policy",
     "Study": "studies.grid",
-    "contamination": "analysis.contamination",
-    "gap_and_bias": "analysis.gap_bias",
-    "greedy_window": "analysis.windows",
-    "recall_density": "analysis.recall_density",
+    "contamination": "measures.contamination.measure",
+    "gap_and_bias": "measures.gap_bias.measure",
+    "greedy_window": "measures.windows",
+    "recall_density": "measures.recall_density.measure",
     "report": "reports",
-    "saliency": "analysis.pixel_saliency",
-    "saliency_figure": "figures.saliency",
+    "saliency": "measures.saliency.measure",
+    "saliency_figure": "measures.saliency.figure",
     "study": "studies.runner",
 }
 
 if TYPE_CHECKING:
-    from arcade_torch.tools.analysis.contamination import contamination
-    from arcade_torch.tools.analysis.gap_bias import gap_and_bias
-    from arcade_torch.tools.analysis.pixel_saliency import saliency
-    from arcade_torch.tools.analysis.policy import Policy
-    from arcade_torch.tools.analysis.recall_density import recall_density
-    from arcade_torch.tools.analysis.windows import greedy_window
-    from arcade_torch.tools.figures.saliency import saliency_figure
+    from arcade_torch.tools.measures.contamination.measure import contamination
+    from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
+    from arcade_torch.tools.measures.policy import Policy
+    from arcade_torch.tools.measures.recall_density.measure import recall_density
+    from arcade_torch.tools.measures.saliency.figure import saliency_figure
+    from arcade_torch.tools.measures.saliency.measure import saliency
+    from arcade_torch.tools.measures.windows import greedy_window
     from arcade_torch.tools.reports import report
     from arcade_torch.tools.studies.grid import Study
     from arcade_torch.tools.studies.runner import study

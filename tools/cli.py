@@ -23,7 +23,7 @@ from arcade_torch.tools.errors import (
     one_line,
     trouble_of_the_machine,
 )
-from arcade_torch.tools.figures import FIGURES
+from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.options import imported, load_extensions, take_imports
 from arcade_torch.tools.text import printable, warn
 

@@ -5,7 +5,10 @@ kept.
 import ctypes
 import os
 import platform
+import signal
 import subprocess
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +16,9 @@ from typing import Any
 
 _MALLOC = {-4: 0, -1: 2**31 - 1, -2: 2**28}
 """Of <malloc.h>: M_MMAP_MAX, M_TRIM_THRESHOLD, M_TOP_PAD."""
+PARENT_VARIABLE = "ARCADE_TORCH_PARENT"
+"""Process id that a worker watches: when that process is gone the worker stops with a
+checkpoint."""
 
 
 def versions() -> dict[str, str]:
@@ -120,3 +126,18 @@ def keep_freed_memory() -> bool:
         return False
     mallopt = ctypes.CDLL(None).mallopt
     return all(mallopt(name, value) == 1 for name, value in _MALLOC.items())
+
+
+def watch_parent(every_s: float = 2.0) -> None:
+    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing
+    happens.
+    """
+    parent = os.environ.get(PARENT_VARIABLE)
+
+    def look() -> None:
+        while str(os.getppid()) == parent:
+            time.sleep(every_s)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if parent is not None:
+        threading.Thread(target=look, daemon=True, name="watch-parent").start()

@@ -1,5 +1,5 @@
-"""Words of the command line: options read into dataclasses by tyro, and ``--import`` of a user's
-games and models.
+"""Words of the command line: commands and their options, read into dataclasses by tyro, and
+``--import`` of a user's games and models.
 """
 
 import hashlib
@@ -14,9 +14,9 @@ from contextlib import redirect_stderr
 from importlib.machinery import SourceFileLoader
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from arcade_torch.tools.errors import need, one_line
+from arcade_torch.tools.errors import one_line
 
 FLAG = "--import"
 VARIABLE = "ARCADE_TORCH_IMPORT"
@@ -45,7 +45,8 @@ def parse(
         ValueError: an option is unknown, missing or malformed; says so in one line.
         SystemExit: the help was asked for, and is printed.
     """
-    tyro = need("tyro")
+    import tyro
+
     message = StringIO()
     try:
         with redirect_stderr(message):
@@ -64,12 +65,28 @@ def parse(
     raise ValueError(f"{_in_one_line(message.getvalue())} (see {prog} --help)")
 
 
+class Command:
+    """What every command has; ``argv`` are the options that it was called with."""
+
+    argv: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def parse(cls, words: Sequence[str], prog: str) -> Any:
+        """Read the options; a ``ValueError`` says in one line what cannot be read."""
+        return parse(cls, words, prog)
+
+    def resume_hint(self) -> str:
+        """What an interruption left, and how to go on."""
+        return "no file is half written; the same command starts again"
+
+
 def _whole_numbers() -> Any:
     """tyro's rules for types, and one of ours: options that count take 2e7 and 40_000."""
-    constructors = need("tyro.constructors")
+    from tyro import constructors
+
     registry = constructors.ConstructorRegistry()
 
-    @registry.primitive_rule  # type: ignore[untyped-decorator]
+    @registry.primitive_rule
     def whole(info: Any) -> Any:
         if info.type is not int:
             return None
@@ -90,7 +107,9 @@ def _in_one_line(message: str) -> str:
     tyro only prints: a title, then parts between rules, in a frame that depends on the terminal.
     The first part says what is wrong. Its error events are private, and version 1.0 has none.
     """
-    text = need("rich.text").Text.from_ansi(message).plain  # without colours
+    from rich.text import Text
+
+    text = Text.from_ansi(message).plain  # without colours
     parts = [""]
     for framed in text.splitlines()[1:]:  # the first line is the title
         line = framed.strip("│╰╯ ")

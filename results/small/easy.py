@@ -15,8 +15,8 @@ from statistics import mean, pstdev
 import matplotlib.pyplot as plt
 from scipy.stats import ttest_ind
 
-from arcade_torch.tools.analysis.bootstrap import Interval
-from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, gap_and_bias, normalise
+from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.gap_bias.measure import GapBias, game_of, gap_and_bias, normalise
 from arcade_torch.tools.runs import Score
 
 HERE = Path(__file__).parent

@@ -17,7 +17,7 @@ from arcade_torch.agents import (
     PPOLoss,
     PQNLoss,
     Trainer,
-    averaging,
+    learner,
     make_actor,
     preset,
 )
@@ -178,17 +178,17 @@ def test_what_acts_is_a_mean_of_what_is_trained_that_grows_with_the_return(
 )
 def test_a_return_counts_as_a_share_of_what_the_game_can_pay(training_return, span, share):
     """Before: the raw return, so no mean at all at 0 and below, and always the full one above 1."""
-    assert averaging.share_reached(training_return, span) == share
+    assert learner.share_reached(training_return, span) == share
 
 
 @pytest.mark.parametrize("training_return", [0.5, 0.7, 0.9, 1.0])
 def test_the_window_grows_alike_near_the_highest_return_of_all_games(training_return):
     """Navigator, whose returns begin at -1, lost with a window by the bare share, which is longer."""
-    positive = averaging.window_share(training_return, (0.0, 1.0))
+    positive = learner.window_share(training_return, (0.0, 1.0))
     assert positive == training_return**4
-    assert averaging.window_share(training_return, (-1.0, 1.0)) == pytest.approx(positive, abs=0.05)
-    assert averaging.window_share(-0.9, (-1.0, 0.0)) == pytest.approx(0.1**4)
-    assert averaging.window_share(None, (-1.0, 1.0)) == 0
+    assert learner.window_share(training_return, (-1.0, 1.0)) == pytest.approx(positive, abs=0.05)
+    assert learner.window_share(-0.9, (-1.0, 0.0)) == pytest.approx(0.1**4)
+    assert learner.window_share(None, (-1.0, 1.0)) == 0
 
 
 def test_the_mean_goes_by_the_range_of_the_runs_own_game():
@@ -202,7 +202,7 @@ def test_a_mean_of_a_game_without_a_range_is_refused(span, monkeypatch):
         ValueError,
         match=r"average_share goes by .* but MineEasy-v0 has return_range .* or set it to 0",
     ):
-        averaging.check_return_range("MineEasy-v0", span)
+        learner.check_return_range("MineEasy-v0", span)
 
 
 def test_without_a_mean_the_same_weights_act_and_learn():

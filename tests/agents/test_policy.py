@@ -22,7 +22,7 @@ from arcade_torch.agents import (
 )
 from arcade_torch.agents.runs.checkpoint import save_checkpoint
 from arcade_torch.models import make_network
-from arcade_torch.tools.analysis.windows import resolve_agent
+from arcade_torch.tools.measures.windows import resolve_agent
 from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
 
 MANY = 20_000

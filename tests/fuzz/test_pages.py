@@ -14,7 +14,9 @@ from hypothesis import given
 
 from arcade_torch.tools.bench.registry import compare, page, read_results
 from arcade_torch.tools.comparable import find_runs
-from arcade_torch.tools.figures import Part, ScoreOptions, make_figure
+from arcade_torch.tools.figures import Part
+from arcade_torch.tools.figures.catalogue import make_figure
+from arcade_torch.tools.measures.gap_bias import ScoreOptions
 from arcade_torch.tools.reports import report
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study

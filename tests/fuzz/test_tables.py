@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 
 from arcade_torch.agents.runs.files import read_csv, read_json
-from arcade_torch.tools.analysis.gap_bias import gap_and_bias
 from arcade_torch.tools.bench.recall import Recall
 from arcade_torch.tools.figures import logs
 from arcade_torch.tools.figures.logs import mean_series, series
 from arcade_torch.tools.files import read_rows, write_between, write_csv
+from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
 from arcade_torch.tools.options import name_and_value, take_imports
 from arcade_torch.tools.play.scores import (
     COLUMNS,

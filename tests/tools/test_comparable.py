@@ -12,7 +12,8 @@ from arcade_torch.agents.config import TrainConfig, differing_fields
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools import gap_and_bias
 from arcade_torch.tools.comparable import find_runs
-from arcade_torch.tools.figures import CurveOptions, PaperOptions, make_figure
+from arcade_torch.tools.figures import CurveOptions, PaperOptions
+from arcade_torch.tools.figures.catalogue import make_figure
 from arcade_torch.tools.figures.logs import curves
 from arcade_torch.tools.figures.style import drawing
 from arcade_torch.tools.reports import report

@@ -11,7 +11,8 @@ import pytest
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, saliency_figure
 from arcade_torch.tools.comparable import find_runs
-from arcade_torch.tools.figures import FIGURES, logs
+from arcade_torch.tools.figures import logs
+from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.style import drawing, new_figure, svg
 from arcade_torch.tools.names import printable
 from tests.tools.test_runs import write

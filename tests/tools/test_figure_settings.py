@@ -12,7 +12,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from arcade_torch.tools.figures import PaperOptions, make_figure
+from arcade_torch.tools.figures import PaperOptions
+from arcade_torch.tools.figures.catalogue import make_figure
 from arcade_torch.tools.figures.style import drawing
 
 USERS = {

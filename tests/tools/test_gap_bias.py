@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arcade_torch.tools import figures, gap_and_bias
-from arcade_torch.tools.analysis.bootstrap import (
+from arcade_torch.tools import gap_and_bias
+from arcade_torch.tools.figures.style import drawing
+from arcade_torch.tools.measures.bootstrap import (
     mean_over_tasks,
     measured_coverage,
     percentile_interval,
     resampled,
 )
-from arcade_torch.tools.analysis.gap_bias import GapBias, game_of, normalise
-from arcade_torch.tools.figures import ScoreOptions
-from arcade_torch.tools.figures.style import drawing
+from arcade_torch.tools.measures.gap_bias import ScoreOptions, figure
+from arcade_torch.tools.measures.gap_bias.measure import GapBias, game_of, normalise
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import read_scores
 
@@ -187,9 +187,7 @@ def test_the_least_coverage_stands_under_figure_and_table(
     shares = [row.coverage for row in table.rows]
     assert shares[0] > shares[1] + 0.03 and table.coverage == {2: shares[1]}
     with drawing("light"):
-        made = figures.gap_bias.gap_bias(
-            ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10), None
-        )
+        made = figure.gap_bias(ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10), None)
     share = f"{100 * shares[1]:.0f} %"
     assert made.pictures[0].note.endswith(f"measured coverage with 2 seeds {share}")
     assert made.tables[0].caption.endswith(f"measured coverage of the gap's: {share} with 2 seeds")
@@ -355,7 +353,7 @@ def test_scores_of_several_rules_are_not_pooled_and_lost_runs_are_told(tmp_path:
     )
     rows += ["mlp,X,partial,0,finished,default,.1", "mlp,X,partial,1,failed,default,"]
     (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
-    made, table, _ = figures.gap_bias._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
+    made, table, _ = figure._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
     assert table.row("mlp").gap.value == pytest.approx(0.8) and made.notes == [
         "left out, not finished: 1 run"
     ]

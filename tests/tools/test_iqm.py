@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.tools import gap_and_bias
-from arcade_torch.tools.analysis.bootstrap import iqm, resampled
+from arcade_torch.tools.measures.bootstrap import iqm, resampled
 from arcade_torch.tools.runs import Score
 
 

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.tools import gap_and_bias, report, reports
-from arcade_torch.tools.figures import saliency
 from arcade_torch.tools.figures.style import agent_colours, drawing, svg
+from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.runs import Score
 from tests.tools.fabricated import small_study, write_run, write_study

@@ -9,13 +9,15 @@ import pytest
 from arcade_torch.agents import preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, report, reports
-from arcade_torch.tools.analysis.checkpoints import Label
-from arcade_torch.tools.analysis.contamination import Contamination
-from arcade_torch.tools.analysis.recall_density import RecallDensity
 from arcade_torch.tools.comparable import Runs
 from arcade_torch.tools.figures.style import drawing
+from arcade_torch.tools.measures import section
+from arcade_torch.tools.measures.checkpoints import Label
+from arcade_torch.tools.measures.contamination import figure as contamination
+from arcade_torch.tools.measures.contamination.measure import Contamination
+from arcade_torch.tools.measures.recall_density import figure as recall_density
+from arcade_torch.tools.measures.recall_density.measure import RecallDensity
 from arcade_torch.tools.names import AgentKey
-from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import representatives, select_cells
 from arcade_torch.tools.runs import open_run
 from arcade_torch.tools.studies.folder import StudyFolder
@@ -128,21 +130,23 @@ def test_columns_of_the_page_are_those_steps_that_their_headings_name(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     delays, flip = (
-        np.array(panels.NOISE["delays"]),
+        np.array(contamination.NOISE["delays"]),
         np.tile([1.0, 0.5, 0.25, 0.0, 0.0, np.nan], (4, 1, 1)),
     )
     found = Contamination(
         np.array([0.3]), delays, flip, flip, flip * np.nan, np.zeros((4, 2), np.int64), 0.0, 0, "q"
     )
     label = Label(AgentKey("pqn", "lru"), GAMES[0], "full", 0, Path("run"), "lru")
-    monkeypatch.setattr(panels, "measure_run", lambda *words: (label, found))
+    monkeypatch.setattr(section, "measure_run", lambda *words: (label, found))
     dense = RecallDensity(
         np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q"
     )
     with drawing("light"):
-        (row,) = panels.contamination_section({label.task: [label.path]}, ["lru"], None)["rows"]
-        monkeypatch.setattr(panels, "measure_run", lambda *words: (label, dense))
-        (past,) = panels.recall_section({label.task: [label.path]}, ["lru"], None)["rows"]
+        (row,) = contamination.contamination_section({label.task: [label.path]}, ["lru"], None)[
+            "rows"
+        ]
+        monkeypatch.setattr(section, "measure_run", lambda *words: (label, dense))
+        (past,) = recall_density.recall_section({label.task: [label.path]}, ["lru"], None)["rows"]
     assert (row["at_once"], row["one"], row["later"]) == (1, 0.5, 0.1875) and (
         row["seeds"],
         row["points"],
@@ -190,8 +194,8 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     assert ("recall density, mlp on SignpostEasy-v0", 16, 16) in told
     assert (
         "contamination, lru on SignpostEasy-v0",
-        panels.NOISE["starts"],
-        panels.NOISE["starts"],
+        contamination.NOISE["starts"],
+        contamination.NOISE["starts"],
     ) in told
     recall = page[page.index('id="recall"') : page.index('id="contamination"')]
     rows = [row.split("<td>")[1:] for row in recall.split("<tr>")[2:]]

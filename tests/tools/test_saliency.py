@@ -1,4 +1,4 @@
-"""Saliency beside the laws of `tests/tools/analysis/test_laws.py`: maps, chunks, single steps, and
+"""Saliency beside the laws of `tests/tools/measures/test_laws.py`: maps, chunks, single steps, and
 what is refused.
 """
 
@@ -15,8 +15,8 @@ from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.models import memory_names
 from arcade_torch.tools import Policy, saliency
-from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
-from tests.tools.analysis.toys import ACTIONS, F64, SIZE, Net, frames, linear_policy, matrices
+from arcade_torch.tools.measures.saliency.measure import episode_saliency
+from tests.tools.measures.toys import ACTIONS, F64, SIZE, Net, frames, linear_policy, matrices
 
 
 @given(rho=st.floats(0.1, 1.0), steps=st.integers(1, 12), chunk=st.integers(1, 5))

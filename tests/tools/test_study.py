@@ -512,7 +512,7 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
 
     inner = (
         "import time, pathlib, signal, sys\n"
-        "from arcade_torch.tools.studies.engines import watch_parent\n"
+        "from arcade_torch.tools.machine import watch_parent\n"
         "signal.signal(signal.SIGTERM, lambda *_: "
         f"(pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
         "watch_parent(every_s=0.05)\n"

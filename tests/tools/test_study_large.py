@@ -14,8 +14,7 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.studies import folder as study_folder
 from arcade_torch.tools.studies.engines import Job, JobResult
-from arcade_torch.tools.studies.pace import SHARE, Pace
-from arcade_torch.tools.studies.runner import show_progress, study
+from arcade_torch.tools.studies.runner import SHARE, Pace, show_progress, study
 from tests.tools.fabricated import small_study, write_study
 from tests.tools.test_study import Fabricator
 

@@ -13,7 +13,7 @@ import arcade_torch
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import greedy_window, saliency
-from arcade_torch.tools.analysis.windows import play
+from arcade_torch.tools.measures.windows import play
 
 GAME = "MineSweeperEasy"
 

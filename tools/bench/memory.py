@@ -239,7 +239,7 @@ def bench_saliency(
     """
     from arcade_torch.agents import preset
     from arcade_torch.agents.policy import build_network
-    from arcade_torch.tools.analysis.pixel_saliency import saliency
+    from arcade_torch.tools.measures.saliency.measure import saliency
 
     network: Any = build_network(preset("small", memory="lru", device=str(device))).eval()
     seen = torch.randint(0, 256, (frames, 128, 128, 3), dtype=torch.uint8, device=device)

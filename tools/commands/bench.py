@@ -10,8 +10,8 @@ import tyro
 from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import write_atomic, write_json
 from arcade_torch.tools.bench import registry
-from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table, format_value, write_csv
+from arcade_torch.tools.options import Command
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say, warn
 

@@ -13,10 +13,11 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
-from arcade_torch.tools.commands import Command
-from arcade_torch.tools.figures import FIGURES, Options, make_figure
+from arcade_torch.tools.figures import Options
+from arcade_torch.tools.figures.catalogue import FIGURES, make_figure
 from arcade_torch.tools.files import csv_text
 from arcade_torch.tools.machine import keep_freed_memory
+from arcade_torch.tools.options import Command
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say

@@ -9,9 +9,8 @@ import tyro
 
 from arcade_torch.envs_jax import make, registered_ids, resolve_id
 from arcade_torch.tools import players
-from arcade_torch.tools.commands import Command
 from arcade_torch.tools.files import Table, write_between
-from arcade_torch.tools.options import at_least
+from arcade_torch.tools.options import Command, at_least
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 

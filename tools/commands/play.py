@@ -8,8 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from arcade_torch.agents.config import require
-from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import at_least, at_most, name_and_value
+from arcade_torch.tools.options import Command, at_least, at_most, name_and_value
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 

@@ -7,9 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from arcade_torch.tools.commands import Command
 from arcade_torch.tools.figures import Part
-from arcade_torch.tools.options import command_line
+from arcade_torch.tools.options import Command, command_line
 from arcade_torch.tools.studies.engines import Engine, RayOptions
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study

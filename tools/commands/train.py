@@ -10,8 +10,7 @@ import tyro
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_json, write_json
-from arcade_torch.tools.commands import Command
-from arcade_torch.tools.options import at_least, command_line, name_and_value
+from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
 
@@ -80,20 +79,17 @@ class Train(Command):
 
     def run(self) -> int:
         """Train."""
-        from arcade_torch.agents import train
         from arcade_torch.agents.runs.folder import wait_until_free
-        from arcade_torch.tools.machine import keep_freed_memory
+        from arcade_torch.agents.training import train
+        from arcade_torch.tools.machine import keep_freed_memory, watch_parent
         from arcade_torch.tools.progress import Bars, describe_row
-        from arcade_torch.tools.studies.engines import watch_parent
-        from arcade_torch.tools.studies.grid import RunSpec
 
         at_least(self, wait=0)
         watch_parent()
         keep_freed_memory()
         run = self.settings
         film = None
-        spec = RunSpec(run.env, run.observability, run.memory, run.algorithm, run.seed)
-        folder = self.out or Path("runs") / spec.name
+        folder = self.out or _run_folder(run)
         if self.videos != "none":
             from arcade_torch.tools.play.recording import EvaluationVideos
 
@@ -138,7 +134,8 @@ class Evaluate(Command):
 
     def run(self) -> int:
         """Evaluate and print."""
-        from arcade_torch.agents import evaluate, load
+        from arcade_torch.agents.evaluation import evaluate
+        from arcade_torch.agents.policy import load
 
         if self.json is not None and self.json.exists():
             raise FileExistsError(f"{self.json} exists: choose another file")
@@ -154,6 +151,14 @@ class Evaluate(Command):
                 self.json, episodes | {"mean": result.mean, "half_width_95": result.half_width}
             )
         return 0
+
+
+def _run_folder(run: TrainConfig) -> Path:
+    """Where a run goes by default: its name is that of a study."""
+    from arcade_torch.tools.studies.grid import RunSpec
+
+    spec = RunSpec(run.env, run.observability, run.memory, run.algorithm, run.seed)
+    return Path("runs") / spec.name
 
 
 def _read_config(file: Path) -> TrainConfig:

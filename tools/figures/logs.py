@@ -11,7 +11,6 @@ import numpy as np
 from arcade_torch.agents import preset
 from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import (
     CurveOptions,
@@ -23,6 +22,7 @@ from arcade_torch.tools.figures import (
     style,
 )
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
+from arcade_torch.tools.measures.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.names import plain_number
 from arcade_torch.tools.runs import Run
 from arcade_torch.tools.text import printable

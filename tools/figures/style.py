@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import Array, measured_coverage
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
 from arcade_torch.tools.files import write_csv, write_npz
+from arcade_torch.tools.measures.bootstrap import Array, measured_coverage
 from arcade_torch.tools.text import printable
 
 AGENT_COLOURS = {
@@ -55,6 +55,9 @@ POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
+# inches of a picture of a report; small ones for many tasks
+PANEL = (4.9, 3.0)
+SMALL_PANEL = (3.3, 2.3)
 
 STYLES = Path(__file__).resolve().parents[1] / "data"
 """Folder of the style sheets, in matplotlib's format: light.mplstyle, and print.mplstyle for what

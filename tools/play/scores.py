@@ -15,8 +15,8 @@ from arcade_torch.agents.config import require
 from arcade_torch.agents.runs.files import read_csv, read_text
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game
-from arcade_torch.tools.analysis.gap_bias import game_of
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.measures.gap_bias.measure import game_of
 from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.session import QUIT, Attempt, Session
 from arcade_torch.tools.text import csv_cell

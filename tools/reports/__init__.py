@@ -11,13 +11,17 @@ from typing import Any, get_args
 
 from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.analysis.bootstrap import Interval, pooled
-from arcade_torch.tools.analysis.gap_bias import AgentRow, GapBias, gap_and_bias, normalise
 from arcade_torch.tools.comparable import Runs, check_comparable
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.measures.bootstrap import Interval, pooled
+from arcade_torch.tools.measures.contamination import figure as contamination
+from arcade_torch.tools.measures.gap_bias import figure as gap_bias
+from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias, gap_and_bias, normalise
+from arcade_torch.tools.measures.recall_density import figure as recall_density
+from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
@@ -79,7 +83,10 @@ def report(
         "study": study,
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
-        "panels": panels,
+        "twin_names": TWIN_NAMES,
+        "density": recall_density.DENSITY,
+        "bins": recall_density.BINS,
+        "noise": contamination.NOISE,
     }
     with drawing("light"):
         players: Players = {}
@@ -132,11 +139,11 @@ def _parts(
     parts["recall"] = None
     parts["contamination"] = None
     if "saliency" not in skip:
-        parts["strips"] = panels.saliency_strips(cells, progress)
+        parts["strips"] = saliency.saliency_strips(cells, progress)
     if "recall" not in skip:
-        parts["recall"] = panels.recall_section(cells, agents, progress)
+        parts["recall"] = recall_density.recall_section(cells, agents, progress)
     if "contamination" not in skip:
-        parts["contamination"] = panels.contamination_section(cells, agents, progress)
+        parts["contamination"] = contamination.contamination_section(cells, agents, progress)
     return parts
 
 
@@ -232,7 +239,7 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
         "table": table,
         "second": second[0] if second else None,
         "sentences": _score_sentences(table) if table is not None else [],
-        "score_panels": panels.score_panels(table) if table is not None else [],
+        "score_panels": gap_bias.score_panels(table) if table is not None else [],
         "caution": coverage_sentence(table) if table is not None else "",
     }
 

@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,15 +34,11 @@ from arcade_torch.agents.runs.files import (
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
-from arcade_torch.tools.machine import available_cores, keep_freed_memory
+from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores, keep_freed_memory
 from arcade_torch.tools.options import VARIABLE, load_extensions
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
-
-PARENT_VARIABLE = "ARCADE_TORCH_PARENT"
-"""Process id that a worker watches: when that process is gone the worker stops with a
-checkpoint."""
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {
@@ -199,21 +194,6 @@ class Processes:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.sched_setaffinity(process.pid, cores)
         return process
-
-
-def watch_parent(every_s: float = 2.0) -> None:
-    """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing
-    happens.
-    """
-    parent = os.environ.get(PARENT_VARIABLE)
-
-    def look() -> None:
-        while str(os.getppid()) == parent:
-            time.sleep(every_s)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    if parent is not None:
-        threading.Thread(target=look, daemon=True, name="watch-parent").start()
 
 
 def _error(code: int, log: Path) -> str:

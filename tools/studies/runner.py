@@ -7,6 +7,7 @@ import errno
 import re
 import shutil
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,12 +22,13 @@ from arcade_torch.tools.runs import Run
 from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, RayOptions
 from arcade_torch.tools.studies.folder import Row, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
-from arcade_torch.tools.studies.pace import Pace
 
 LOOK_EVERY_S = 0.5
 """The display is drawn this often, or less often where a look at all runs takes long."""
 LEAST_FREE_BYTES = 1 << 20
 """A run that fails with less space than this on the disk failed for want of space."""
+SHARE = 0.02
+"""Share of the time that looking at all runs, and writing their table, may take."""
 
 
 class DiskFullError(RuntimeError):
@@ -48,6 +50,34 @@ class StudyResult:
     def finished(self) -> int:
         """Number of finished runs."""
         return Counter(row["status"] for row in self.rows)["finished"]
+
+
+class Pace:
+    """Does, not too often, what costs more the larger a study is.
+
+    It rests after each piece of work, fifty times as long as that took, and ``least_s`` at least.
+
+    Args:
+        least_s: shortest rest, seconds.
+        clock: gives the time in seconds.
+    """
+
+    def __init__(self, least_s: float = 0.0, clock: Callable[[], float] = time.monotonic) -> None:
+        self._least_s = least_s
+        self._clock = clock
+        self._next_s = clock()
+
+    @property
+    def rest_s(self) -> float:
+        """Seconds until the next piece of work is due; 0 if it is."""
+        return max(0.0, self._next_s - self._clock())
+
+    def work(self, task: Callable[[], object]) -> None:
+        """Do a piece of work, and rest."""
+        start_s = self._clock()
+        task()
+        end_s = self._clock()
+        self._next_s = end_s + max(self._least_s, (end_s - start_s) / SHARE)
 
 
 def study(

@@ -16,12 +16,12 @@ from torch import Tensor
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.models import memory_names
 from arcade_torch.tools import Policy, contamination, recall_density, saliency
-from arcade_torch.tools.analysis.bootstrap import measured_coverage, pooled
-from arcade_torch.tools.analysis.paper import PAPER_RETURNS, paper_table
-from arcade_torch.tools.analysis.recall_density import density_of_windows
-from arcade_torch.tools.analysis.windows import greedy_windows
 from arcade_torch.tools.figures.style import seeds_note
-from tests.tools.analysis.toys import (
+from arcade_torch.tools.measures.bootstrap import measured_coverage, pooled
+from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, paper_table
+from arcade_torch.tools.measures.recall_density.measure import density_of_windows
+from arcade_torch.tools.measures.windows import greedy_windows
+from tests.tools.measures.toys import (
     ACTIONS,
     F64,
     SIZE,
@@ -302,7 +302,7 @@ def test_law_09_no_window_holds_a_start_but_its_own_and_n_is_where_the_ending_ac
 def test_law_10_no_noise_and_the_identity_permutation_reproduce_the_clean_outputs(
     name: str, feedback: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shuffled = "arcade_torch.tools.analysis.contamination.shuffle_order"
+    shuffled = "arcade_torch.tools.measures.contamination.measure.shuffle_order"
     monkeypatch.setattr(shuffled, lambda total, *_: np.arange(total))
     player = Policy(
         *(

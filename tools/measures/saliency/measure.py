@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.agents.config import require
-from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.windows import MAX_STEPS, Twin, Window, greedy_window
+from arcade_torch.tools.measures.policy import Policy, Progress, Target, outputs, policy_of, resolve
+from arcade_torch.tools.measures.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
 Norm = Literal["l2sq", "l2", "l1"]

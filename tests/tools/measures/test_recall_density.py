@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import recall_density, saliency
-from arcade_torch.tools.analysis.recall_density import (
+from arcade_torch.tools.measures.recall_density.measure import (
     binned,
     density_of_windows,
     no_memory,
     point_sampled,
 )
-from arcade_torch.tools.analysis.windows import _end, greedy_windows
-from tests.tools.analysis.toys import Net, ToyEnv, linear_policy, window
+from arcade_torch.tools.measures.windows import _end, greedy_windows
+from tests.tools.measures.toys import Net, ToyEnv, linear_policy, window
 
 RHO = linear_policy(0.8, dtype=torch.float32)
 

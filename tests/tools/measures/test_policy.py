@@ -7,8 +7,8 @@ from torch import Tensor
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy
-from arcade_torch.tools.analysis.policy import outputs, policy_of, read_plain, resolve
-from tests.tools.analysis.toys import Net, linear_policy
+from arcade_torch.tools.measures.policy import outputs, policy_of, read_plain, resolve
+from tests.tools.measures.toys import Net, linear_policy
 
 OUT = torch.tensor([[1.0, 3.0, 2.0]])
 

@@ -25,14 +25,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.agents.config import require
-from arcade_torch.agents.evaluation import held_out_seed
-from arcade_torch.tools.analysis.bootstrap import Array
-from arcade_torch.tools.analysis.policy import Policy, Progress, Target, outputs, policy_of, resolve
-from arcade_torch.tools.analysis.windows import (
+from arcade_torch.tools.measures.bootstrap import Array
+from arcade_torch.tools.measures.policy import Policy, Progress, Target, outputs, policy_of, resolve
+from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
     Twin,
     Window,
     greedy_windows,
+    held_out,
     play,
     resolve_agent,
 )
@@ -347,7 +347,7 @@ def contamination_example(
     policy = policy_of(player)
     output = resolve(player, target)
     n = horizon + LAST * shuffle
-    windows, _ = play(player, env, seed=held_out_seed(seed), keep=n + 1, max_steps=n + 1)
+    windows, _ = play(player, env, seed=held_out(seed), keep=n + 1, max_steps=n + 1)
     w = next((window for window in windows if window.n == n), None)
     if w is None:
         raise ValueError(

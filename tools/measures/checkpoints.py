@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 import arcade_torch
-from arcade_torch.agents import load
+from arcade_torch.agents.policy import load
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
-from arcade_torch.tools.analysis.policy import Progress
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.files import cached_arrays
+from arcade_torch.tools.measures.policy import Progress
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
 from arcade_torch.tools.runs import Run, described
 

@@ -1,21 +1,28 @@
 """Saliency of the last decision of a greedy episode: a row of frames a run, heat over each."""
 
+import math
+from base64 import b64encode
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.analysis.checkpoints import checkpoints_of, measure_runs
-from arcade_torch.tools.analysis.pixel_saliency import episode_saliency
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures import Made, Picture, Progress, SaliencyOptions
-from arcade_torch.tools.figures.style import TWIN_NAMES, new_figure, rows_of
+from arcade_torch.tools.figures import Made, Picture, Progress
+from arcade_torch.tools.figures.style import TWIN_NAMES, new_figure, panels, png, rows_of
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.checkpoints import checkpoints_of, measure_run, measure_runs
+from arcade_torch.tools.measures.saliency import SaliencyOptions
+from arcade_torch.tools.measures.saliency.measure import episode_saliency
+from arcade_torch.tools.measures.section import Cells
 from arcade_torch.tools.options import at_least
 
 SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; scales with the frame
+# of a report: frames of a strip; episodes that are tried until one has as many
+SHOW = 8
+TRIES = 10
 
 # title, frames [T, H, W, 3], maps [T, H, W] up to step n
 Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]
@@ -114,3 +121,33 @@ def plot(
             share = "" if below is None else f": {below[t]:.1f} %"
             axis.set_title(f"$o_{{{name}}}${share}", fontsize="small", parse_math=True)
     return peak
+
+
+def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, Any]]:
+    """Frames under heat of every cell, from its first seed; with the value drawn brightest and the
+    last share (%).
+    """
+    strips = []
+    for done, ((agent, game, twin), paths) in enumerate(cells.items(), start=1):
+        _, episode = measure_run(paths[0], episode_saliency, {"show": SHOW, "tries": TRIES})
+        shares = 100 * episode.shares()
+        count = min(SHOW, len(episode.frames))
+        lines = math.ceil(count / 4)
+        figure, axes = panels(lines, 4, (4.8, 1.4 * lines))
+        for axis in axes.flat[count:]:
+            axis.set_axis_off()
+        peak = plot(episode.frames, episode.maps, axes.flat[:count], below=shares)
+        strips.append(
+            {
+                "agent": agent,
+                "game": game,
+                "twin": twin,
+                "frames": len(shares),
+                "last_share": shares[-1],
+                "peak": peak,
+                "source": b64encode(png(figure)).decode("ascii"),
+            }
+        )
+        if progress is not None:
+            progress("saliency", done, len(cells))
+    return strips

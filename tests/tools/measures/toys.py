@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from arcade_torch.models import make_memory
 from arcade_torch.tools import Policy
-from arcade_torch.tools.analysis.windows import Window
+from arcade_torch.tools.measures.windows import Window
 
 SIZE, FEATURES, ACTIONS = 4, 6, 3
 F64 = torch.float64

@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.envs_jax import ACTION_NAMES
-from arcade_torch.tools.analysis import contamination as measure
-from arcade_torch.tools.analysis.bootstrap import Pooled, pooled
-from arcade_torch.tools.analysis.checkpoints import (
+from arcade_torch.tools.figures import Made, Picture, Progress, style
+from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.bootstrap import Pooled, pooled
+from arcade_torch.tools.measures.checkpoints import (
     Label,
     by_task,
     checkpoints_of,
     measure_run,
     measure_runs,
 )
-from arcade_torch.tools.figures import ContaminationOptions, Made, Picture, Progress, style
-from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.contamination import ContaminationOptions, measure
+from arcade_torch.tools.measures.section import Cells, section
 from arcade_torch.tools.options import at_least
 
 MEASURES = {
@@ -31,6 +32,14 @@ LEAST_SCALE = 0.1  # axes reach at least so far, so that small effects look smal
 CLEAN_BEST = "#354e6a"
 OTHER_BEST = "#a33a2f"
 REST = "#b3b3b3"
+
+NOISE: Mapping[str, Any] = {
+    "sigmas": (0.3,),
+    "delays": (0, 1, 2, 5, 10, 20),
+    "starts": 32,
+    "cap": 96,
+}
+"""Options of `contamination` for a report; a figure for a paper takes whole episodes, and more."""
 
 # of one agent on one task: for each of `MEASURES` values [S, K] over its seeds
 Measures = Mapping[str, Pooled]
@@ -248,3 +257,38 @@ def plot(
         axis.errorbar(x, mean, bars, fmt="none", ecolor=colours[agent], capsize=2, lw=1)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(range(len(delays)), [str(delay) for delay in delays])
+
+
+def contamination_section(
+    cells: Cells, agents: Sequence[str], progress: Progress | None
+) -> dict[str, Any]:
+    """Share of decisions that one noisy frame changes, by delay; a picture a task."""
+    colours = style.agent_colours(agents)
+
+    def draw(by_agent: Mapping[str, Measures], axis: Any) -> None:
+        delays = NOISE["delays"][: reached(by_agent.values())]
+        plot(by_agent, axis, "flip", 0, delays, colours)
+        from_zero(axis)
+        axis.set_xlabel("steps after the noisy frame")
+
+    of_cell = (measure.contamination, NOISE)
+    return section("contamination", cells, of_cell, _section_row, draw, progress)
+
+
+def _section_row(
+    measured: Sequence[tuple[Any, measure.Contamination]],
+) -> tuple[Measures, dict[str, Any]]:
+    """The measures of one cell pooled over its seeds, and its row of the table."""
+    measures = next(iter(pool(by_task(measured)).values()))
+    seeds = [seed for _, seed in measured]
+    later = np.concatenate([seed.flip[:, 0, 1:].ravel() for seed in seeds])
+    flip = measures["flip"].mean[0]
+    row = {
+        "seeds": len(seeds),
+        "points": sum(len(seed.points) for seed in seeds),
+        "at_once": flip[0],
+        "one": flip[1],
+        "later": float(np.ma.filled(np.ma.masked_invalid(later).mean(), np.nan)),
+        "change": measures["change"].mean[0, 1],
+    }
+    return measures, row

@@ -3,19 +3,20 @@ model.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
 
-from arcade_torch.tools.analysis import recall_density as measure
-from arcade_torch.tools.analysis.bootstrap import Array, Pooled, pooled
-from arcade_torch.tools.analysis.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.comparable import listed
 from arcade_torch.tools.errors import need
-from arcade_torch.tools.figures import DensityOptions, Made, Picture, Progress, style
+from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.bootstrap import Array, Pooled, pooled
+from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
+from arcade_torch.tools.measures.recall_density import DensityOptions, measure
+from arcade_torch.tools.measures.section import Cells, section
 from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.options import at_least
 
@@ -24,6 +25,11 @@ MEMORY_FREE = ("mlp", "feedforward")
 THIRDS = ("oldest third", "middle third", "most recent third")
 SHADES = {"full": style.MDP_THIRDS, "partial": style.POMDP_THIRDS}
 POINTS = 101  # of the paper's curve, in the npz file
+
+# of a report: parts of an episode, or as many as the shortest episode of a task has frames
+BINS = 8
+DENSITY: Mapping[str, Any] = {"episodes": 16, "cap": 96}
+"""Options of `recall_density` for a report; a figure for a paper takes whole episodes, and more."""
 
 Densities = Sequence[tuple[Label, measure.RecallDensity]]
 # (agent, game, twin) -> mass in bins, over trajectories, then seeds
@@ -259,3 +265,47 @@ def _arrays(measured: Densities) -> dict[str, Any]:
         arrays[f"shares_{index}"] = density.deltas
         arrays[f"lengths_{index}"] = density.lengths
     return {"labels": np.array(labels), "taus": taus, "points": np.array(points)} | arrays
+
+
+def recall_section(
+    cells: Cells, agents: Sequence[str], progress: Progress | None
+) -> dict[str, Any]:
+    """Recall density of every cell, a picture a task; numbers are kept in the run folders."""
+    colours = style.agent_colours(agents)
+
+    def draw(by_agent: Mapping[str, Sequence[measure.RecallDensity]], axis: Any) -> None:
+        shortest = min(_shortest(densities) for densities in by_agent.values())
+        bins = min(BINS, shortest)
+        series = {}
+        for agent, densities in by_agent.items():
+            mass = pooled([density.mass(bins) for density in densities])
+            series[agent] = (mass, colours[agent])
+        plot(series, axis, bins)
+        axis.set_xlabel("time in the episode (1: the decision)")
+
+    of_cell = (measure.recall_density, DENSITY)
+    return section("recall density", cells, of_cell, _section_row, draw, progress)
+
+
+def _shortest(densities: Sequence[measure.RecallDensity]) -> int:
+    """The number of frames of the shortest trajectory."""
+    return min(int(density.lengths.min()) for density in densities)
+
+
+def _section_row(
+    measured: Sequence[tuple[Any, measure.RecallDensity]],
+) -> tuple[list[measure.RecallDensity], dict[str, Any]]:
+    """The densities of seeds that have a trajectory, and their row of the table."""
+    densities = [density for _, density in measured if density.lengths.size]
+    if not densities:
+        raise ValueError("no episode of three frames")
+    shares = list(chain.from_iterable(density.shares for density in densities))
+    row = {
+        "seeds": len(densities),
+        "episodes": len(shares),
+        "length": np.mean([share.size for share in shares]),
+        "last": np.mean([share[-1] for share in shares]),
+        "first": np.mean([share[0] for share in shares]),
+        "older": np.mean([density.mass(2)[0] for density in densities]),
+    }
+    return densities, row

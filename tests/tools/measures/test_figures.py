@@ -17,26 +17,22 @@ from matplotlib.colors import to_hex
 from arcade_torch.agents import Agent, preset, train
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.analysis import checkpoints
-from arcade_torch.tools.analysis.bootstrap import pooled
-from arcade_torch.tools.analysis.checkpoints import Label
-from arcade_torch.tools.analysis.contamination import Contamination, Example
-from arcade_torch.tools.analysis.gap_bias import gap_and_bias
-from arcade_torch.tools.analysis.paper import PAPER_RETURNS
-from arcade_torch.tools.analysis.recall_density import RecallDensity
-from arcade_torch.tools.figures import (
-    FIGURES,
-    ContaminationOptions,
-    CurveOptions,
-    DensityOptions,
-    PaperOptions,
-    contamination,
-    gap_bias,
-    logs,
-    recall_density,
-)
+from arcade_torch.tools.figures import CurveOptions, PaperOptions, logs
+from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
+from arcade_torch.tools.measures import checkpoints
+from arcade_torch.tools.measures.bootstrap import pooled
+from arcade_torch.tools.measures.checkpoints import Label
+from arcade_torch.tools.measures.contamination import ContaminationOptions
+from arcade_torch.tools.measures.contamination import figure as contamination
+from arcade_torch.tools.measures.contamination.measure import Contamination, Example
+from arcade_torch.tools.measures.gap_bias import figure as gap_bias
+from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
+from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS
+from arcade_torch.tools.measures.recall_density import DensityOptions
+from arcade_torch.tools.measures.recall_density import figure as recall_density
+from arcade_torch.tools.measures.recall_density.measure import RecallDensity
 from arcade_torch.tools.names import AgentKey
 from arcade_torch.tools.runs import Run, Score
 from arcade_torch.tools.studies.grid import RunSpec
@@ -422,7 +418,7 @@ def test_recall_density_of_checkpoints_is_drawn_kept_and_used_again(
         assert kept["shares_1"].sum() == pytest.approx(len(kept["lengths_1"])) and kept[
             "points"
         ].shape == (2, 101)
-    monkeypatch.setattr("arcade_torch.tools.analysis.windows.play", None)
+    monkeypatch.setattr("arcade_torch.tools.measures.windows.play", None)
     assert cli.main(words) == 0
     assert read_csv(tmp_path / "recall-density-16.csv") == rows
     monkeypatch.undo()

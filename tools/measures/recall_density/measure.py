@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.tools.analysis.bootstrap import Array
-from arcade_torch.tools.analysis.pixel_saliency import Norm, Reduce, saliency
-from arcade_torch.tools.analysis.policy import Progress, Target, resolve
-from arcade_torch.tools.analysis.windows import (
+from arcade_torch.tools.measures.bootstrap import Array
+from arcade_torch.tools.measures.policy import Progress, Target, resolve
+from arcade_torch.tools.measures.saliency.measure import Norm, Reduce, saliency
+from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
     MIN_STEPS,
     End,

@@ -20,8 +20,8 @@ import numpy as np
 
 from arcade_torch.agents.config import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
-from arcade_torch.tools.analysis import bootstrap
-from arcade_torch.tools.analysis.bootstrap import Array, Interval, percentile_interval
+from arcade_torch.tools.measures import bootstrap
+from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval
 from arcade_torch.tools.names import find_baselines
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import Source, read_scores

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents import load
 from arcade_torch.agents.config import SEED_LIMIT, require
-from arcade_torch.agents.evaluation import held_out_seed, make_eval_env
-from arcade_torch.tools.analysis.policy import policy_of
+from arcade_torch.tools.measures.policy import policy_of
 
 MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
 # a shorter trajectory says nothing about memory: recall density leaves it out and counts it
@@ -88,7 +86,7 @@ def greedy_window(
     Raises:
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
-    seed = held_out_seed(seed) if env is None else seed
+    seed = held_out(seed) if env is None else seed
     player, env = resolve_agent(agent, env, observability, num_envs=1)
     require(
         tuple(env.batch_size) == (1,),
@@ -130,7 +128,7 @@ def greedy_windows(
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
         drawn = np.random.SeedSequence([seed, group]).generate_state(1)
-        batch_seed = held_out_seed(int(drawn[0]) % SEED_LIMIT)
+        batch_seed = held_out(int(drawn[0]) % SEED_LIMIT)
         windows, lengths = play(agent, env, seed=batch_seed, keep=cap)
         ends = np.array([_end(int(length), end, cap, rng) for length in lengths])
         # these windows begin later than what was kept: play the very same again
@@ -219,6 +217,14 @@ def _window(steps: TensorDictBase, state: Any, ended: bool, seed: int, row: int)
     )
 
 
+def held_out(seed: int) -> int:
+    """The seed of episodes that training never sees, as in an evaluation."""
+    # imported here: who measures windows of their own needs no environment
+    from arcade_torch.agents.evaluation import held_out_seed
+
+    return held_out_seed(seed)
+
+
 def resolve_agent(
     agent: Any, env: Any = None, observability: Twin | None = None, num_envs: int = SIDE_BY_SIDE
 ) -> tuple[Any, Any]:
@@ -232,7 +238,10 @@ def resolve_agent(
     Raises:
         ValueError: there is no environment for it, or more than one.
     """
-    agent = load(agent) if isinstance(agent, str | Path) else agent
+    if isinstance(agent, str | Path):
+        from arcade_torch.agents.policy import load
+
+        agent = load(agent)
     player = (
         agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
     )
@@ -251,6 +260,8 @@ def resolve_agent(
         raise ValueError(
             f"this agent was trained on {twin} twins: name one of them, full or partial"
         )
+    from arcade_torch.agents.evaluation import make_eval_env
+
     device = str(next(agent.network.parameters()).device)
     return player, make_eval_env(
         replace(agent.config, device=device, cuda_graphs=False), num_envs, twin

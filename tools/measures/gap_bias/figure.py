@@ -11,18 +11,8 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.envs_jax.registry import DIFFICULTIES
-from arcade_torch.tools.analysis.bootstrap import Interval, measured_coverage
-from arcade_torch.tools.analysis.gap_bias import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
-from arcade_torch.tools.analysis.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.comparable import Runs, find_runs
-from arcade_torch.tools.figures import (
-    Made,
-    PaperOptions,
-    Picture,
-    Progress,
-    ScoreOptions,
-    SweepOptions,
-)
+from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.figures.style import (
     MARKERS,
     NEUTRAL,
@@ -34,6 +24,10 @@ from arcade_torch.tools.figures.style import (
     whiskers,
 )
 from arcade_torch.tools.files import Table, read_csv
+from arcade_torch.tools.measures.bootstrap import Interval, measured_coverage
+from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
+from arcade_torch.tools.measures.gap_bias.measure import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
+from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.names import agent_names, memory_free
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import read_scores, table_of
@@ -362,3 +356,13 @@ def _cell(interval: Interval) -> str:
     if np.isnan(interval.low):
         return f"{interval.value:+.3f}"
     return f"{interval.value:+.3f}\n{interval.low:+.3f} {interval.high:+.3f}"
+
+
+def score_panels(table: GapBias) -> list[str]:
+    """Pictures of normalised returns on both twins, Gap and Bias."""
+    pictures = []
+    for name in PANELS:
+        figure, axes = panels(1, 1, style.PANEL)
+        plot_bars(table.rows, axes[0, 0], name)
+        pictures.append(style.svg(figure, name))
+    return pictures

@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from arcade_torch.tools.analysis.bootstrap import Interval
-from arcade_torch.tools.analysis.gap_bias import (
+from arcade_torch.tools.files import Table, read_csv
+from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.gap_bias.measure import (
     SIGNED_GAMES,
     AgentRow,
     GapBias,
     game_of,
     gap_and_bias,
 )
-from arcade_torch.tools.files import Table, read_csv
 
-PAPER_RETURNS = Path(__file__).resolve().parent.parent / "data" / "paper_returns.csv"
+PAPER_RETURNS = Path(__file__).resolve().parents[2] / "data" / "paper_returns.csv"
 """Mean and standard deviation of 9 agents on 30 tasks and both twins, raw, rounded to two
 decimals."""
 

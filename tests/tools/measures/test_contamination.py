@@ -11,14 +11,14 @@ from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.evaluation import held_out_seed
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, contamination
-from arcade_torch.tools.analysis.contamination import (
+from arcade_torch.tools.measures.contamination.measure import (
     contamination_example,
     disturbed_frames,
     replayed,
     shuffle_order,
 )
-from arcade_torch.tools.analysis.windows import greedy_window, greedy_windows
-from tests.tools.analysis.toys import Net, ToyEnv, frames, linear_policy, window
+from arcade_torch.tools.measures.windows import greedy_window, greedy_windows
+from tests.tools.measures.toys import Net, ToyEnv, frames, linear_policy, window
 
 ENV = (14, 20, 30)
 
@@ -64,7 +64,7 @@ def test_flip_change_and_divergence_are_those_of_a_slow_replay(
 ) -> None:
     policy, env = linear_policy(0.8, dtype=torch.float32, gain=2e-4), ToyEnv([9, 12])
     monkeypatch.setattr(
-        "arcade_torch.tools.analysis.contamination.disturbed_frames",
+        "arcade_torch.tools.measures.contamination.measure.disturbed_frames",
         lambda frames, places, *rest: 255 - frames[torch.as_tensor(places)].float(),
     )
     found = contamination(

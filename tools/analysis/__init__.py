@@ -1,1 +1,0 @@
-"""What the memory did: measures over runs and agents, arrays out."""

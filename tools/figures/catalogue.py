@@ -1,0 +1,131 @@
+"""The figures by name: what each shows, its options, who makes it."""
+
+from importlib import import_module
+from typing import NamedTuple
+
+from arcade_torch.agents.config import require
+from arcade_torch.tools.figures import (
+    NUMBERS,
+    PICTURES,
+    CurveOptions,
+    Made,
+    Options,
+    PaperOptions,
+    Progress,
+)
+from arcade_torch.tools.measures import CheckpointOptions
+from arcade_torch.tools.measures.contamination import ContaminationOptions
+from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
+from arcade_torch.tools.measures.recall_density import DensityOptions
+from arcade_torch.tools.measures.saliency import SaliencyOptions
+
+
+class Entry(NamedTuple):
+    """A figure."""
+
+    options: type[Options]
+    maker: str  # MODULE.FUNCTION below `arcade_torch.tools`, of (options, progress) -> Made
+    summary: str  # what it shows
+    example: str
+    analysis: bool = False  # whether ``analyze`` has it too
+    several: bool = False  # whether it has several pictures
+
+
+FIGURES = {
+    "returns": Entry(
+        ScoreOptions,
+        "measures.gap_bias.figure.returns",
+        "POMDP return, Gap and Bias of every agent, also without each game",
+        "--runs runs/study --out figures",
+        several=True,
+    ),
+    "gap-bias": Entry(
+        ScoreOptions,
+        "measures.gap_bias.figure.gap_bias",
+        "observability gap and memory bias of every agent, with intervals",
+        "runs/demo --metric train_max_ewm",
+        True,
+    ),
+    "curves": Entry(
+        CurveOptions,
+        "figures.logs.curves",
+        "training curves, one panel a task, one line an agent",
+        "--runs runs/study",
+    ),
+    "saliency": Entry(
+        SaliencyOptions,
+        "measures.saliency.figure.rows",
+        "which pixels of the past the last decision depends on, one row a run",
+        "runs/one --show 10",
+        True,
+    ),
+    "recall-density": Entry(
+        DensityOptions,
+        "measures.recall_density.figure.densities",
+        "how decisions spread over the past of their episodes",
+        "runs/one runs/two --bins 3 16 --out figures",
+        True,
+        True,
+    ),
+    "contamination": Entry(
+        ContaminationOptions,
+        "measures.contamination.figure.by_delay",
+        "what one noisy or shuffled past frame does to later decisions",
+        "runs/one --sigmas 0.1 1.0 --delays 0 1 5 20 --starts 100",
+        True,
+        True,
+    ),
+    "size-sweep": Entry(
+        SweepOptions,
+        "measures.gap_bias.figure.size_sweep",
+        "Gap and Bias by depth and width of the memory",
+        "--runs runs/size-sweep",
+    ),
+    "throughput": Entry(
+        Options,
+        "figures.logs.throughput",
+        "frames per second by number of envs, from the file of bench envs",
+        "--runs runs/bench.csv",
+    ),
+    "human": Entry(
+        PaperOptions,
+        "measures.gap_bias.figure.human",
+        "returns of people beside those of the memory-free agent",
+        "--out figures",
+    ),
+    "hyperparameters": Entry(
+        PaperOptions,
+        "figures.logs.hyperparameters",
+        "table of the settings of runs, or of the paper's preset",
+        "--paper",
+    ),
+}
+
+
+def make_figure(name: str, options: Options, progress: Progress | None = None) -> Made:
+    """Make a figure, and save it with its numbers.
+
+    Args:
+        name: one of `FIGURES`.
+        options: of the type that stands there.
+        progress: called with (what, done, of how many).
+
+    Raises:
+        ValueError: an option is out of range, or there is nothing to draw.
+    """
+    from arcade_torch.tools.figures.style import drawing, save
+
+    confidence = getattr(options, "confidence", 0.95)
+    entry = FIGURES[name]
+    require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
+    if isinstance(options, CheckpointOptions) and not options.runs:
+        raise ValueError("name at least one run folder")
+    if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):
+        raise ValueError(f"this figure has several files: give a folder, not --out {options.out}")
+    module, _, maker = entry.maker.rpartition(".")
+    make = getattr(import_module(f"arcade_torch.tools.{module}"), maker)
+    with drawing(options.style):
+        result: Made = make(options, progress)
+        for picture in result.pictures:
+            result.files += save(options, picture)
+    return result
