@@ -48,7 +48,7 @@ class SequenceChecks:
             ValueError: ``step_count`` does not go up by one, or the trajectory changes, where
                 ``is_init`` is false.
         """
-        if not self.enabled or is_init.shape[-1] < 2 or not _may_wait(is_init):
+        if not self.enabled or not _may_wait(is_init) or is_init.shape[-1] < 2:
             return
         if not _is_host(is_init):
             if is_init.shape in self._shapes:
@@ -78,9 +78,9 @@ class SequenceChecks:
             is_init: bool [*batch].
             state_keys: where the state should stand.
         """
-        if not self.enabled or self._has_warned:
+        if not self.enabled or self._has_warned or not _may_wait(is_init):
             return
-        if any(key in tensordict for key in state_keys) or not _may_wait(is_init):
+        if any(key in tensordict for key in state_keys):
             return
         if not _is_host(is_init):
             self._steps_without_state += 1
