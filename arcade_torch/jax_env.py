@@ -308,8 +308,9 @@ class JaxEnv(EnvBase):
         if seed is None:
             seed = int(torch.randint(2**32, (), device="cpu"))
         wait_for_torch(self.device, self._jax_device)
-        keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-        self._live = jax.jit(self._first)(keys)
+        with jax.default_device(self._jax_device):  # on another GPU than the first one, too
+            keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
+            self._live = jax.jit(self._first)(keys)
 
     def _first(self, keys: jax.Array) -> Episodes:
         """Episodes that begin."""

@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import torch
 
-from arcade_torch import ArcadeCollector, ArcadeEnv, rollout_buffer
+from arcade_torch import ArcadeCollector, ArcadeEnv, from_jax, jax_env, rollout_buffer
 from arcade_torch import env as env_module
 from tests.arcade_torch.stub import LOCKSTEP, MIXED
+from tests.arcade_torch.test_from_jax import Walk
 
 N = 6
 STEPS = 12
@@ -64,16 +65,33 @@ def calls(env: ArcadeEnv, branching: ArcadeEnv) -> dict[str, Callable[[], Any]]:
     }
 
 
+def foreign_calls() -> dict[str, Callable[[], Any]]:
+    """What a user does with an env of another suite."""
+    env = from_jax(Walk(), num_envs=N)
+    state = env.get_state()
+    rows = torch.arange(N).unsqueeze(-1) % 2 == 0
+    return {
+        "foreign reset": env.reset,
+        "foreign step": lambda: env.step(env.rand_action(env.reset())),
+        "foreign masked reset": lambda: env.reset(env.reset().set("_reset", rows)),
+        "foreign rollout": lambda: env.rollout(STEPS, break_when_any_done=False),
+        "foreign set_state": lambda: env.set_state(state),
+        "foreign set_seed": lambda: env.set_seed(7),
+    }
+
+
 def main() -> None:
     """Play, and print."""
     first, second = jax.devices()
     env_module.pick_devices = lambda device: (torch.device("cpu"), second)
+    jax_env.pick_devices = env_module.pick_devices
     rollout_buffer.is_host = lambda device: False
     left = {}
+    games = [foreign_calls()]
     for game in (LOCKSTEP, MIXED):
-        env = ArcadeEnv(game, N)
-        branching = ArcadeEnv(game, N, state_in_td=True)
-        for name, call in calls(env, branching).items():
+        games.append(calls(ArcadeEnv(game, N), ArcadeEnv(game, N, state_in_td=True)))
+    for game_calls in games:
+        for name, call in game_calls.items():
             result = call()
             arrays = left_on(first)
             if arrays:
