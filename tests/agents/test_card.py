@@ -62,6 +62,33 @@ def test_a_gradient_step_asks_for_no_value(algorithm: str, monkeypatch: pytest.M
     assert asked.count == 1  # the check can fail
 
 
+MEMORIES = ["lru", *[pytest.param(name, marks=pytest.mark.slow) for name in ("gru", "gdn")]]
+
+
+@every_algorithm
+@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.filterwarnings("ignore")
+def test_losses_and_acting_are_one_graph_each(algorithm: str, memory: str) -> None:
+    """A break in the graph is a wait, or Python that a CUDA graph would not repeat."""
+    numbers = {"num_envs": 4, "num_steps": 8, "minibatches": 2}
+    options = {"algorithm": algorithm, "memory": memory, algorithm: numbers}
+    trainer = Trainer(preset("smoke", env="SkittlesEasy", **options))
+    data = prepare(trainer.learner, trainer.collector.collect())[:2]
+
+    def loss(data: TensorDict) -> Tensor:
+        losses = trainer.learner.loss(data)
+        return sum(value for key, value in losses.items() if key.startswith("loss"))
+
+    def act(td: TensorDict) -> Tensor:
+        return trainer.network(td)["logits" if algorithm == "ppo" else "action_value"]
+
+    torch._dynamo.reset()
+    options = {"fullgraph": True, "backend": "aot_eager"}
+    torch.testing.assert_close(torch.compile(loss, **options)(data.clone()), loss(data.clone()))
+    step = TensorDict(trainer.collector._obs, [4]).update(trainer.collector._state)
+    torch.testing.assert_close(torch.compile(act, **options)(step.clone()), act(step.clone()))
+
+
 def test_random_actions_are_drawn_where_the_policy_is() -> None:
     """Before: TorchRL moved ``eps`` alone, so every random action was drawn on the CPU."""
     policy = make_policy(make_network("small", "mlp"))
