@@ -17,6 +17,7 @@ VENV := .venv
 OLDEST := .venv-oldest
 NEWEST := .venv-newest
 SUITES := .venv-suites
+AOT := .venv-aot
 OLDEST_TESTS := $(addprefix tests/,arcade_torch/test_dlpack.py arcade_torch/test_env_errors.py arcade_torch/test_env.py \
   models/test_memory_models.py agents/runs/test_checkpoint.py agents/test_runs_of_all_algorithms.py tools/test_cli.py)
 NEWEST_TESTS := $(addprefix tests/,contracts agents/test_identities.py agents/test_torchrl_batches.py \
@@ -33,7 +34,7 @@ PIP  := $(RUN) -m pip install --quiet -c constraints.txt
 # Two test processes share two cores: one thread each is faster than two that fight.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install demo test test-slow test-oldest test-newest test-suites test-triton lint bench gpu parity bench-parity docs clean distclean
+.PHONY: help install demo test test-slow test-oldest test-newest test-suites test-triton lint bench gpu gpu-aot parity bench-parity docs clean distclean
 .DELETE_ON_ERROR:
 
 help:
@@ -50,6 +51,7 @@ help:
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
 	@echo "                (make gpu DEVICE=cpu: a rehearsal of it, five to ten minutes)"
+	@echo "make gpu-aot    compiles the games for an H100 without one: kernels, bytes and an estimate into results/gpu-aot.md; 2 GB in $(AOT)"
 	@echo "make parity     step by step against popgym-arcade 0.0.7, which it installs into $(VENV)"
 	@echo "                (make bench-parity: the ratio of speed to it, game by game)"
 	@echo "make docs       the documentation as a site in build/docs, API reference included"
@@ -141,6 +143,18 @@ bench: install
 gpu:
 	PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" $(GPU_PYTHON) -m tests.gpu.stages $(OUT) --device $(DEVICE) --page $(PAGE) $(ARGS)
 
+# JAX of constraints.txt with its plugin for CUDA, without the libraries of a GPU; ptxas and nvdisasm come with triton.
+$(AOT)/.installed: constraints.txt
+	@$(AOT)/bin/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(AOT)
+	@version=$$(sed -n 's/^jaxlib==//p' constraints.txt) && { \
+	  $(AOT)/bin/python -m pip install --quiet -c constraints.txt jax jaxlib numpy && \
+	  $(AOT)/bin/python -m pip install --quiet --no-deps jax-cuda13-plugin==$$version jax-cuda13-pjrt==$$version triton; \
+	  } || { echo "gpu-aot could not install jax, jax-cuda13-plugin and jax-cuda13-pjrt $$version, and triton into $(AOT)" >&2; exit 2; }
+	@touch $@
+
+gpu-aot: $(AOT)/.installed
+	$(AOT)/bin/python -m tests.gpu.aot results/gpu-aot.md $(ARGS)
+
 parity: $(VENV)/.parity
 	$(ONE_THREAD) PARITY_TABLE=results/parity.md $(RUN) -m pytest -m parity --timeout=3600 tests/parity $(ARGS)
 	SUITES_ARE_THERE=1 $(ONE_THREAD) $(RUN) -m pytest tests/contracts/test_jax_suites.py -k popgym
@@ -157,4 +171,4 @@ clean:
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 distclean: clean
-	rm -rf $(VENV) $(OLDEST) $(NEWEST) $(SUITES)
+	rm -rf $(VENV) $(OLDEST) $(NEWEST) $(SUITES) $(AOT)
