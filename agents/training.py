@@ -511,7 +511,7 @@ def own_random_numbers(device: torch.device, seed: int) -> Iterator[None]:
     of other GPUs stay as they are.
     """
     generators = [torch.default_generator]
-    if device.type == "cuda":
+    if device.type == "cuda" and torch.cuda.is_available():  # else the run refuses it
         torch.cuda.init()
         index = torch.cuda.current_device() if device.index is None else device.index
         generators.append(torch.cuda.default_generators[index])

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps, with_flags
 from arcade_torch.envs_jax.game import NUM_ACTIONS, UNSET, Array, Game
+from arcade_torch.envs_jax.render.screen import WORD
 from arcade_torch.envs_jax.settings import compiled, raw_key
 
 
@@ -194,7 +195,10 @@ class MixedGames(Steps):
         frames = []
         for group, part in zip(self.groups, self._parts(batch), strict=True):
             frames.append(group.render(part))
-        return jnp.concatenate(frames)
+        if 3 * self.game.obs_size % WORD:
+            return _join_bytes(*frames)
+        joined: Array = jax.lax.platform_dependent(*frames, cuda=_join_words, default=_join_bytes)
+        return joined
 
     def _pad(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...]: states of a game are zero in the envs that play
@@ -237,6 +241,24 @@ class MixedGames(Steps):
         for game, batch in zip(self.game.games, batches, strict=True):
             states[game.id] = batch.state
         return shared._replace(state=states)
+
+
+def _join_bytes(*frames: Array) -> Array:
+    """The frames of all games, uint8 [N, S, S, 3], one game behind the other."""
+    return jnp.concatenate(frames)
+
+
+def _join_words(*frames: Array) -> Array:
+    """The same by words of four bytes, as a GPU draws them: joined as bytes, every byte of a word
+    would be drawn by itself, and frames would be copied.
+    """
+    words = []
+    for game_frames in frames:
+        rows = game_frames.shape[1]
+        pixels = game_frames.reshape(len(game_frames), rows, -1, WORD)  # as the words were drawn
+        words.append(jax.lax.bitcast_convert_type(pixels, jnp.uint32))
+    joined = jax.lax.bitcast_convert_type(jnp.concatenate(words), jnp.uint8)
+    return joined.reshape(-1, *frames[0].shape[1:])
 
 
 Batched = BatchedGame[Any] | MixedGames

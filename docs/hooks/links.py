@@ -12,6 +12,8 @@ PAGES = {
     "results/differences.md": "results/differences.md",
     "results/parity.md": "results/parity.md",
     "results/small.md": "results/small.md",
+    "results/gpu-rehearsal.md": "results/gpu-rehearsal.md",
+    "results/gpu-aot.md": "results/gpu-aot.md",
     "results/probe.md": "results/probe.md",
     "results/recipe.md": "results/recipe.md",
     "examples/notebooks": "notebooks.md",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from arcade_torch.envs_jax import BatchedGame, env_keys, make
+from arcade_torch.envs_jax import BatchedGame, MixedGames, env_keys, make
 from arcade_torch.envs_jax.render import Layers, Slot, blank
 
 N = 6
@@ -89,3 +89,15 @@ def test_a_screen_whose_lines_are_no_whole_words_is_drawn_by_bytes(
     frame = Layers(blank(6, 6, (9, 9, 9)), lamp).draw(1)
     assert frame.shape == (6, 6, 3)
     assert frame[1].tolist() == [[9, 9, 9]] * 3 + [[255, 0, 7]] * 2 + [[9, 9, 9]]
+
+
+def test_a_mixture_joins_words_to_the_frames_that_it_joins_of_bytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    games = [make(game) for game in ("CartPoleEasy", "MineSweeperEasy", "TetrisEasy")]
+    by_bytes, by_words = MixedGames(games), MixedGames(games)
+    batch = by_bytes.init(env_keys(3, N), jnp.arange(N) % 2 == 1)
+    frames = np.asarray(by_bytes.render(batch))
+    take_branch(monkeypatch, "cuda")
+    assert np.array_equal(by_words.render(batch), frames)
+    assert len({frame.tobytes() for frame in frames}) == N

@@ -71,7 +71,7 @@ STEPS = {
 """Of the fused step at 128 pixels."""
 CARDS = ("AutoEncode", "CountRecall")  # their decks are shuffled by a sort
 ROWS = Limit(traffic=1.8)  # the states of eight steps count whole, of which few rows are read
-MIXTURE = Limit(130, 500, 1.5, sorts=2)
+MIXTURE = Limit(130, 2000, 1.5, sorts=2)  # ten drawings, of which a thread does one
 
 
 @dataclass(frozen=True)
@@ -465,6 +465,8 @@ every slot issues), and the time to move its bytes (operands and results whole /
   reads (0.2 to 1.7 MB) are taken to come from the L2 cache for nothing.
 - Instructions are counted once, as they stand: a loop counts as one round, and both ways of a branch
   count. XLA unrolls these kernels, so there are few of either.
+- The mixture is drawn by one kernel that holds the drawing of all ten games; a thread does one of
+  them, so its issue time is some ten times less than the table says.
 - Kernels that do not depend on one another may overlap in a graph; in the sum none does.
 - What the host does in between (JAX's call, DLPack, the policy) is not in it.
 - Of fewer than {graph_from} launches (`draw_rows`) XLA makes no graph.
