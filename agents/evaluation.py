@@ -72,10 +72,12 @@ def make_env(
     MDPs.
     """
     twin: Any = observability or config.observability
+    if twin == "mixed":
+        twin = torch.arange(num_envs, device="cpu") >= num_envs // 2
     return arcade_torch.make(
         config.env,
         num_envs=num_envs,
-        observability=torch.arange(num_envs) >= num_envs // 2 if twin == "mixed" else twin,
+        observability=twin,
         obs_size=config.obs_size,
         seed=seed,
         device=config.device,

@@ -96,7 +96,7 @@ class Learner:
         its own.
         """
         for _ in range(self.config.epochs):
-            order = torch.randperm(len(data), generator=self.training.generator)
+            order = torch.randperm(len(data), device="cpu", generator=self.training.generator)
             shuffled = data[order.to(self.training.device, non_blocking=True)]
             yield from shuffled.split(-(-len(data) // self.config.minibatches))
 

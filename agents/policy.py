@@ -54,8 +54,9 @@ def make_policy(
         return TensorDictSequential(network, greedy)
     device = next((p.device for p in network.parameters()), None)
     actions = Categorical(num_actions or _num_outputs(network))
-    exploring = EpsilonGreedy(actions, eps_init=float(epsilon), eps_end=0.0).to(device)
-    return TensorDictSequential(network, greedy, exploring)
+    host = torch.device("cpu")  # made there whatever torch's default device is, and then moved
+    exploring = EpsilonGreedy(actions, eps_init=float(epsilon), eps_end=0.0, device=host)
+    return TensorDictSequential(network, greedy, exploring.to(device))
 
 
 class EpsilonGreedy(EGreedyModule):
@@ -169,7 +170,8 @@ def build_network(config: TrainConfig) -> Network:
         "predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0,
         **config.network_options,
     }
-    with torch.random.fork_rng(devices=[]):
+    # on the CPU, whatever torch's default device is: there the seed says what is drawn
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
         torch.default_generator.manual_seed(config.seed)
         network: Network = make(
             config.network, memory=config.memory, obs_size=config.obs_size, **options

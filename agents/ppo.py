@@ -373,8 +373,8 @@ class PPO(Learner):
         options: Any = {name: getattr(config, name) for name in names}
         if config.advantage_decay:
             options["advantage_norm"] = PopArtValueNorm(
-                beta=config.advantage_decay, epsilon=1e-8
-            ).to(training.device)
+                beta=config.advantage_decay, epsilon=1e-8, device=training.device
+            )
         loss = PPOLoss(make_actor(network), clip_epsilon=config.clip, **options)
         loss.make_value_estimator(
             gamma=config.gamma,

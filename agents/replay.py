@@ -117,8 +117,8 @@ class SequenceReplay:
         """
         held = len(self)
         require(1 <= count <= held, "count", count, f"from 1 to the {held} sequences at hand")
-        drawn_rows = torch.zeros(held, dtype=torch.bool)
-        drawn_rows[torch.randperm(held, generator=generator)[:count]] = True
+        drawn_rows = torch.zeros(held, dtype=torch.bool, device="cpu")
+        drawn_rows[torch.randperm(held, device="cpu", generator=generator)[:count]] = True
         rows_of = drawn_rows.split([len(segment.data) for segment in self._segments])
         parts = [segment.data[rows] for segment, rows in zip(self._segments, rows_of, strict=True)]
         return TensorDict.cat(parts).to(device).unflatten_keys("/")

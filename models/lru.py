@@ -66,10 +66,13 @@ class LRU(Memory):
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., H, 2]."""
-        decay = torch.polar(torch.exp(-torch.exp(self.nu)), torch.exp(self.theta))
+        exact = torch.promote_types(x.dtype, torch.float32)  # complex numbers are no smaller
+        size = torch.exp(-torch.exp(self.nu.to(exact)))
+        decay = torch.polar(size, torch.exp(self.theta.to(exact)))
         scaled = (self.input * torch.exp(self.gamma)[:, None, None]).flatten(0, 1)
-        b = F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2))
-        start = torch.complex(h0[..., 0], h0[..., 1])
+        b = F.linear(x, scaled).unflatten(-1, (self.hidden_size, 2)).to(exact)
+        start = torch.complex(h0[..., 0].to(exact), h0[..., 1].to(exact))
         h = torch.view_as_real(self.scan(decay, torch.view_as_complex(b), is_init, start))
+        h = h.to(x.dtype)
         passed = x * self.skip if self.skip.ndim == 1 else F.linear(x, self.skip)
         return F.linear(h.flatten(-2), self.output.flatten(1)) + passed, h

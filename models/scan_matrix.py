@@ -183,9 +183,10 @@ def _chunked(
     if erase is not None:
         system = (key @ key.mT) * decay * erase
         given = torch.cat([value, key * (fade * erase)], dim=-1)
+        exact = torch.promote_types(given.dtype, torch.float32)  # no solver knows half precision
         solved = torch.linalg.solve_triangular(
-            system.tril(-1), given, upper=False, unitriangular=True
-        )
+            system.tril(-1).to(exact), given.to(exact), upper=False, unitriangular=True
+        ).to(given.dtype)
         value, erased = solved.split([value.shape[-1], key.shape[-1]], dim=-1)
     state = torch.where(start[:, 0, None, None], 0, h0)
     befores = []

@@ -19,6 +19,7 @@ from arcade_torch.models import make_network
 
 from .fake_device import prepare
 from .repeated import Repeated
+from .test_training import assert_same_run
 
 ROOT = Path(__file__).resolve().parents[2]
 every_algorithm = pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
@@ -105,6 +106,7 @@ def test_a_run_has_the_random_numbers_of_its_own_device_alone(
 ) -> None:
     """Before: those of all GPUs were forked and seeded."""
     gpus = [torch.Generator().manual_seed(number) for number in range(3)]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "init", lambda: None)
     monkeypatch.setattr(torch.cuda, "default_generators", gpus)
     host = torch.default_generator.get_state()
@@ -162,3 +164,24 @@ def test_a_replayed_policy_acts_and_explores_as_the_policy_does() -> None:
             assert (one.select(*other.keys(True, True)) == other).all()
             assert other["pixels"] is frames or torch.equal(other["pixels"], frames)
             state, twin = one["next", "memory"], other["next", "memory"]
+
+
+OTHER_DEFAULT = """
+import sys
+import torch, torchrl.collectors, torchrl.objectives
+from arcade_torch.agents import preset, train
+for place, default in (("a", "cpu"), ("b", "meta")):
+    torch.set_default_device(default)
+    for algorithm in ("pqn", "ppo", "dqn"):
+        options = {"env": "CartPoleEasy", "total_frames": 256, "device": "cpu"}
+        train(preset("smoke", algorithm=algorithm, **options), f"{sys.argv[1]}/{place}-{algorithm}")
+"""
+
+
+def test_a_run_on_the_cpu_is_the_same_whatever_torchs_default_device_is(tmp_path: Path) -> None:
+    """Before: orders of minibatches and weights were drawn on the default device, or failed."""
+    command = [sys.executable, "-c", OTHER_DEFAULT, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    for algorithm in ("pqn", "ppo", "dqn"):
+        assert_same_run(tmp_path / f"a-{algorithm}", tmp_path / f"b-{algorithm}")

@@ -386,3 +386,23 @@ def test_a_memory_of_ones_own_on_our_base_needs_only_run():
             return h, h
 
     check_memory(Sum(3, 3))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("name", memory_names())
+def test_a_memory_of_half_precision_is_the_memory_but_for_rounding(name, dtype):
+    """Before: LRU, GDN and TTT failed in torch's words, which has no such complex numbers and no
+    such solver.
+    """
+    memory = make_memory(name, 8, 8)
+    x = torch.randn(2, 6, 8)
+    is_init = torch.rand(2, 6) < 0.2
+    wanted, _ = memory(x, memory.initial_state(2), is_init)
+    half = memory.to(dtype)
+    y, state = half(x.to(dtype), half.initial_state(2), is_init)
+    assert y.dtype == dtype
+    again, _ = half(x.to(dtype), state, torch.zeros_like(is_init))
+    assert again.isfinite().all()
+    assert (y.float() - wanted).norm() < 0.05 * wanted.norm() + 1e-3
+    y.float().square().sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in half.parameters())
