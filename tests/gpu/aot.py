@@ -30,7 +30,6 @@ ARCHITECTURE = "sm_90a"
 
 NUM_ENVS = 4096
 MIXED_ENVS = 4000
-HARD = "MineSweeperHard"
 
 CORES = 132
 ISSUES_A_CLOCK = 4  # instructions of a warp that a core begins in a clock
@@ -179,7 +178,7 @@ def cuda_tool(*names: str) -> str:
 def programs() -> Iterator[Program]:
     """All that is compiled."""
     from arcade_torch.compiled import CompiledGame
-    from arcade_torch.envs_jax import MixedGames, make
+    from arcade_torch.envs_jax import MixedGames, make, registered_ids
 
     for id, limit in STEPS.items():
         game = CompiledGame(make(id))
@@ -188,8 +187,11 @@ def programs() -> Iterator[Program]:
         game = CompiledGame(make(id, obs_size=256))
         larger = replace(limit, mframes=0)  # four times the bytes a frame
         yield Program(f"{id} step", 256, NUM_ENVS, step_of(game, NUM_ENVS), larger)
-    hard = CompiledGame(make(HARD))
-    yield Program(f"{HARD} step", 128, NUM_ENVS, step_of(hard, NUM_ENVS), Limit())
+    for id in registered_ids():
+        if "Medium" in id or "Hard" in id:
+            game = CompiledGame(make(id))
+            limit = Limit(sorts=int(id.startswith(CARDS)))
+            yield Program(f"{id} step", 128, NUM_ENVS, step_of(game, NUM_ENVS), limit)
     rows = NUM_ENVS // 8
     for id in STEPS:
         game = CompiledGame(make(id))
