@@ -487,12 +487,7 @@ class ArcadeEnv(EnvBase):
         ended = choose_rows(mask, stepped.ended, before.ended)
         ends = stepped.ends.where(marked.unsqueeze(-1), before.ends)
         self._go_on(self._batched.unpad(batch), ended, ends)
-        left_alone = following.apply(torch.zeros_like)
-        # an old reward is not earned again
-        kept = (key for key in following.keys(True, True) if key != "reward")
-        left_alone.update(tensordict.select(*kept, strict=False))
-        merged: TensorDictBase = following.where(marked, left_alone)
-        return merged
+        return validation.only_marked(tensordict, following, marked)
 
     def _step_and_maybe_reset(
         self, tensordict: TensorDictBase

@@ -161,7 +161,8 @@ class JaxEnv(EnvBase):
     Observations are the memory that JAX wrote: **never write to them in place**. Env ``i`` has
     random keys of its own, so that it walks the same path whatever N is. ``step_and_maybe_reset``,
     which ``rollout`` and TorchRL's ``Collector`` use, is one compiled call, and gives the bits of
-    ``step`` and ``reset``.
+    ``step`` and ``reset``. Envs that an entry ``_step`` (bool [N]) leaves out stay where they are:
+    their ``"next"`` repeats the root, with the reward 0.
     """
 
     batch_locked = True
@@ -328,10 +329,18 @@ class JaxEnv(EnvBase):
         self._live = self._reset_rows(self._live, rows)
         return self._root()
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
-        self._live, outcome = self._step_alone(self._live, self._argument(action))
-        return self._next(self._live, outcome, action)
+        after, outcome = self._step_alone(self._live, self._argument(action))
+        following: TensorDictBase = self._next(after, outcome, action)
+        if "_step" in tensordict:
+            marked = validation.mask(tensordict, "_step", self.num_envs)
+            validation.check_merge(tensordict, following)
+            rows = jax.device_put(marked.cpu().numpy(), self._jax_device)
+            after = choose_rows(rows, after, self._live)
+            following = validation.only_marked(tensordict, following, marked)
+        self._live = after
+        return following
 
     def _step_and_maybe_reset(
         self, tensordict: TensorDictBase

@@ -167,6 +167,20 @@ def keep_what_was_written(td: TensorDictBase, following: TensorDictBase) -> None
         warn_state_is_dropped(*keys)
 
 
+def only_marked(
+    td: TensorDictBase, following: TensorDictBase, marked: torch.Tensor
+) -> TensorDictBase:
+    """The ``"next"`` of a step that only some envs take, ``marked`` bool [N]: that of the others
+    repeats their root ``td``, with the reward 0.
+    """
+    left_alone = following.apply(torch.zeros_like)
+    # an old reward is not earned again
+    kept = (key for key in following.keys(True, True) if key != "reward")
+    left_alone.update(td.select(*kept, strict=False))
+    merged: TensorDictBase = following.where(marked, left_alone)
+    return merged
+
+
 @functools.cache
 def warn_state_is_dropped(*keys: NestedKey) -> None:
     """Say once that what a policy wrote for the next step does not get there: TorchRL carries what

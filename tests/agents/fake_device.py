@@ -17,9 +17,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
-from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from arcade_torch.agents import preset
 from arcade_torch.agents.learner import Learner, Training
@@ -146,7 +146,7 @@ def table(memories: Sequence[str]) -> list[tuple[Any, ...]]:
 
 def register() -> None:
     """Make the device known to this process."""
-    _setup_privateuseone_for_python_backend(NAME)
+    backend_registration._setup_privateuseone_for_python_backend(NAME)
     module: Any = torch.get_device_module(NAME)
     module.get_amp_supported_dtype = lambda: [torch.bfloat16, torch.float16]
 

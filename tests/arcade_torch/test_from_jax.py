@@ -257,6 +257,22 @@ def test_only_the_envs_that_are_asked_for_begin_anew() -> None:
     assert (again["observation"][rows][:, 1] == 0).all()
 
 
+@all_envs
+def test_envs_that_a_step_leaves_out_stay_where_they_are(name: str) -> None:
+    env, twin = made(name), made(name)
+    root, other = env.reset(), twin.reset()
+    rows = torch.tensor([True, False, True, False, False])
+    action = env.rand_action(root)["action"]
+    step = env.step(root.clone().set("action", action).set("_step", rows.unsqueeze(-1)))["next"]
+    whole = twin.step(other.set("action", action))["next"]
+    assert (step[rows] == whole[rows]).all()
+    assert (step["reward"][~rows] == 0).all() and (step["step_count"][~rows] == 0).all()
+    kept = list(root.exclude("action").keys(True, True))
+    assert (step[~rows].select(*kept) == root[~rows].select(*kept)).all()
+    assert np.asarray(env._live.step_count).tolist() == rows.int().tolist()
+    assert np.array_equal(env._live.key[~rows.numpy()], made(name)._live.key[~rows.numpy()])
+
+
 def test_one_of_our_memories_acts_in_torchrl_s_collector() -> None:
     memory = MemoryModule(make_memory("gru", 2, 3), in_key="observation", out_key="logits")
 
