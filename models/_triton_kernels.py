@@ -63,9 +63,8 @@ def _parts(row, step, exists, F, strides, LANES: tl.constexpr):
     """
     first = ((tl.program_id(0) % tl.cdiv(F, LANES)) * LANES).to(tl.int64)
     part = 2 * first + tl.arange(0, 2 * LANES)
-    if strides[2] == 1:
-        column = part
-    else:
+    column = part
+    if strides[2] != 1:
         column = 2 * (part // 2) * strides[2] + part % 2
     offsets = 2 * (row * strides[0] + step[:, None] * strides[1]) + column[None, :]
     return offsets, exists[:, None] & (part < 2 * F)[None, :]
