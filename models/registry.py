@@ -87,6 +87,17 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     return _FACTORIES[name](input_size, hidden_size, **options)
 
 
+def is_built_in(name: str) -> bool:
+    """Whether a name, such as ``"lru"``, means a memory model of this package, not one of yours.
+
+    Example:
+        >>> is_built_in("lru"), is_built_in("no_such_memory")
+        (True, False)
+    """
+    factory = _FACTORIES.get(ALIASES.get(name, name))
+    return str(getattr(factory, "__module__", "")).startswith("arcade_torch.models.")
+
+
 def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = False) -> None:
     """Make a model of your own available by name, here and on the command line.
 

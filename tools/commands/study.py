@@ -87,6 +87,8 @@ class StudyCommand(Resumable):
     into one folder.
     """
     dry_run: bool = False  # Only print every run with its frames, and the frames of all together.
+    # Check the laws that a memory has to keep before models of yours are trained.
+    check_memory: bool = True
     # Write the HTML report at the end; of shards, the one that finishes the study writes it.
     report: bool = True
 
@@ -113,6 +115,8 @@ class StudyCommand(Resumable):
                 say(f"{run.name}  {frames:,} frames")
             print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
             return 0
+        if self.check_memory:
+            check_memories_of(definition)
         engine = make_engine(self.engine, self.workers, self.ray)
         return self.carry_out(
             definition, self.out or Path("runs") / definition.name, engine, self.shard, self.report
@@ -166,6 +170,17 @@ class Report(Command):
         """Write the page."""
         write_page(self.study, self.out, metric=self.metric, skip=self.skip)
         return 0
+
+
+def check_memories_of(definition: Study) -> None:
+    """Check the laws on every memory model of a study that is none of this package."""
+    from arcade_torch.tools.memory_files import check_memory_of
+
+    checked = set[str]()
+    for run in definition.runs():
+        if run.memory not in checked:
+            checked.add(run.memory)
+            check_memory_of(definition.config(run))
 
 
 def write_page(study: Path, out: Path | None = None, **options: Any) -> None:

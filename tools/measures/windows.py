@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.policy import policy_of
 
 MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
@@ -239,9 +240,7 @@ def resolve_agent(
         ValueError: there is no environment for it, or more than one.
     """
     if isinstance(agent, str | Path):
-        from arcade_torch.agents.policy import load
-
-        agent = load(agent)
+        agent = load_agent(Path(agent))
     player = (
         agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
     )

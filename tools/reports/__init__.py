@@ -11,11 +11,12 @@ from typing import Any, get_args
 
 from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.comparable import Runs, check_comparable
+from arcade_torch.tools.comparable import Runs, check_comparable, import_notes
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.imports import import_again
 from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
 from arcade_torch.tools.measures.gap_bias import figure as gap_bias
@@ -81,6 +82,7 @@ def report(
     check_comparable(runs)
     context: dict[str, Any] = {
         "study": study,
+        "changes": import_notes(runs.runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
         "twin_names": TWIN_NAMES,
@@ -161,7 +163,9 @@ def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Play
     first_runs = {run.game: run for run in reversed(runs.runs)}
     games = dict.fromkeys(run.game for run in runs.runs)
     for done, game in enumerate(games, start=1):
-        config = first_runs[game].config
+        run = first_runs[game]
+        import_again(run.path)  # of a game of the user's
+        config = run.config
         rules = str(config.get("rules", "default"))
         options = dict(config.get("env_options") or {})
         players[game] = references(game, folder.analysis, rules, options)

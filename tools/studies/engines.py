@@ -34,8 +34,8 @@ from arcade_torch.agents.runs.files import (
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
+from arcade_torch.tools.imports import VARIABLE, imports_of, load_extensions
 from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores, keep_freed_memory
-from arcade_torch.tools.options import VARIABLE, load_extensions
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
@@ -76,7 +76,7 @@ class Job(NamedTuple):
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
         config = TrainConfig.from_dict(read_json(self.config))
-        result = train(config, self.folder, resume=True)
+        result = train(config, self.folder, resume=True, imports=imports_of(config))
         if result.status == "interrupted":
             raise KeyboardInterrupt
 
