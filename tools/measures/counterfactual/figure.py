@@ -209,8 +209,8 @@ def plot(
         bars = style.whiskers(values.mean, values.low, values.high)
         axis.errorbar(x, values.mean, bars, fmt="none", ecolor=colours[agent], capsize=2, lw=1)
     axis.axvline(lags - 0.1, color=style.NEUTRAL, lw=0.8, ls=":")
-    every = max(1, -(-lags // 8))
-    ticks = list(range(0, lags, every))
+    spacing = max(1, -(-lags // 8))
+    ticks = list(range(0, lags, spacing))
     axis.set_xticks([*ticks, state], [*map(str, ticks), STATE])
     axis.set_xlim(-0.5, state + 0.5)
     if effect in SHARES:
