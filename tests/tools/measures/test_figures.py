@@ -22,7 +22,7 @@ from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
 from arcade_torch.tools.measures import checkpoints
-from arcade_torch.tools.measures.bootstrap import pooled
+from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task
 from arcade_torch.tools.measures.contamination import ContaminationOptions
 from arcade_torch.tools.measures.contamination import figure as contamination
@@ -579,6 +579,25 @@ def test_the_row_of_a_report_names_the_frame_that_matters_most_and_saturated_pol
     np.testing.assert_allclose(counterfactual.share_by_lag([density], 3), [0.65, 0.3, 0.1])
 
 
+def test_sentences_claim_memory_only_where_an_interval_excludes_zero() -> None:
+    unsure = Interval(0.3, 0.0, 0.6)
+    sure = Interval(0.72, 0.6, 0.8)
+    row = {"game": "Signpost", "twin": "POMDP", "agent": "lru", "memory": sure, "peak": 4}
+    row |= {"memory_differing": Interval(1, 1, 1), "at_peak": sure}
+    rows = [
+        row | {"memory": unsure},
+        row | {"memory": Interval(0.9, np.nan, np.nan)},
+        row | {"twin": "MDP", "at_peak": unsure, "memory": Interval(0.2, 0.1, 0.4)},
+        row,
+    ]
+    assert counterfactual._sentences(rows) == [
+        "Signpost POMDP: another episode's memory changes 72 % of lru's decisions, 100 % where it "
+        "differs; of single frames the one 4 steps back changes most, 72 %.",
+        "Signpost MDP: another episode's memory changes 20 % of lru's decisions, 100 % where it "
+        "differs; the MDP shows all there is to know on the last frame.",
+    ]
+
+
 def test_noise_that_cannot_matter_is_named_and_empty_panels_say_why() -> None:
     label = Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", 0, Path("run"), "lru")
     flip = np.zeros((4, 2, 3))
@@ -602,6 +621,7 @@ def test_noise_that_cannot_matter_is_named_and_empty_panels_say_why() -> None:
     texts = [[text.get_text() for text in axis.texts if text.get_text()] for axis in axes]
     assert texts[0] == ["no decision changes"] and not texts[1]
     assert texts[2] == ["not measured: no episode is so long, or outputs are all alike"]
+    assert contamination._section_row([(label, noise)])[1]["longest"] == 1  # 9 steps: no episode
     late = replace(noise, delays=np.array([1, 2, 9]))  # the ceiling was not measured
     assert not contamination._powerless_notes([(label, late)])
 

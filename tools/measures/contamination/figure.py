@@ -303,7 +303,11 @@ def _why_empty(name: str, means: Sequence[Any]) -> str:
 def contamination_section(
     cells: Cells, agents: Sequence[str], progress: Progress | None
 ) -> dict[str, Any]:
-    """Share of decisions that one noisy frame changes, by delay; a picture a task."""
+    """Share of decisions that one noisy frame changes, by delay; a picture a task.
+
+    ``short`` has the tasks whose episodes are too short for some delay, and the longest that is
+    there.
+    """
     colours = style.agent_colours(agents)
 
     def draw(by_agent: Mapping[str, Measures], axis: Any) -> None:
@@ -313,7 +317,13 @@ def contamination_section(
         axis.set_xlabel("steps after the noisy frame")
 
     of_cell = (measure.contamination, NOISE)
-    return section("contamination", cells, of_cell, _section_row, draw, progress)
+    parts = section("contamination", cells, of_cell, _section_row, draw, progress)
+    short = dict[str, int]()
+    for row in parts["rows"]:
+        task = f"{row['game']} {row['twin']}"
+        short[task] = max(row["longest"], short.get(task, 0))
+    parts["short"] = {task: delay for task, delay in short.items() if delay < NOISE["delays"][-1]}
+    return parts
 
 
 def _section_row(
@@ -333,5 +343,6 @@ def _section_row(
         "later": float(np.ma.filled(np.ma.masked_invalid(later).mean(), np.nan)),
         "change": measures["change"].mean[0, 1],
         "powerless": bool(most < POWERLESS_BELOW),
+        "longest": int(seeds[0].delays[reached([measures]) - 1]),
     }
     return measures, row

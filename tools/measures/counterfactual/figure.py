@@ -257,7 +257,35 @@ def counterfactual_section(
         axis.set_xlabel("steps back from the decision")
 
     of_cell = (measure.counterfactual, EXCHANGES)
-    return section("counterfactual recall", cells, of_cell, summary, draw, progress)
+    parts = section("counterfactual recall", cells, of_cell, summary, draw, progress)
+    parts["sentences"] = _sentences(parts["rows"])
+    return parts
+
+
+def _sentences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Who relies on memory, as far as an interval excludes zero; the strongest first."""
+    sentences = list[str]()
+    for row in sorted(rows, key=lambda row: -row["memory"].value):
+        memory = row["memory"]
+        if not memory.low > 0:
+            continue
+        fact = (
+            f"{row['game']} {row['twin']}: another episode's memory changes "
+            f"{100 * memory.value:.0f} % of {row['agent']}'s decisions"
+        )
+        differing = row["memory_differing"]
+        if differing.value > memory.value:
+            fact += f", {100 * differing.value:.0f} % where it differs"
+        if row["at_peak"].low > 0:
+            steps = "step" if row["peak"] == 1 else "steps"
+            fact += (
+                f"; of single frames the one {row['peak']} {steps} back changes most, "
+                f"{100 * row['at_peak'].value:.0f} %"
+            )
+        if row["twin"] == style.TWIN_NAMES["full"]:
+            fact += "; the MDP shows all there is to know on the last frame"
+        sentences.append(f"{fact}.")
+    return sentences
 
 
 def share_by_lag(densities: Sequence[RecallDensity], lags: int) -> Array:
