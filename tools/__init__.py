@@ -13,6 +13,7 @@ _PUBLIC = {
     "as_policy": "measures.policy",
     "Study": "studies.grid",
     "contamination": "measures.contamination.measure",
+    "counterfactual": "measures.counterfactual.measure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
     "recall_density": "measures.recall_density.measure",
@@ -24,6 +25,7 @@ _PUBLIC = {
 
 if TYPE_CHECKING:
     from arcade_torch.tools.measures.contamination.measure import contamination
+    from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
     from arcade_torch.tools.measures.policy import Policy, as_policy
     from arcade_torch.tools.measures.recall_density.measure import recall_density
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "gap_and_bias", "greedy_window",
-    "recall_density", "report", "saliency", "saliency_figure", "study",
+    "Policy", "Study", "as_policy", "contamination", "counterfactual", "gap_and_bias",
+    "greedy_window", "recall_density", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 

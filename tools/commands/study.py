@@ -162,8 +162,8 @@ class Report(Command):
     # Score of a run that the headline is based on.
     metric: Literal["eval_final", "train_max_ewm"] = "eval_final"
     skip: tuple[Part, ...] = ()
-    """Parts to leave out: strips, densities, what one noisy frame changes, returns of the random
-    policy and oracles.
+    """Parts to leave out: strips, densities, exchanged frames, what one noisy frame changes,
+    returns of the random policy and oracles.
     """
 
     def run(self) -> int:

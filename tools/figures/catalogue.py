@@ -15,6 +15,7 @@ from arcade_torch.tools.figures import (
 )
 from arcade_torch.tools.measures import CheckpointOptions
 from arcade_torch.tools.measures.contamination import ContaminationOptions
+from arcade_torch.tools.measures.counterfactual import CounterfactualOptions
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
 from arcade_torch.tools.measures.recall_density import DensityOptions
 from arcade_torch.tools.measures.saliency import SaliencyOptions
@@ -64,6 +65,14 @@ FIGURES = {
         "measures.recall_density.figure.densities",
         "how decisions spread over the past of their episodes",
         "runs/one runs/two --bins 3 16 --out figures",
+        True,
+        True,
+    ),
+    "counterfactual": Entry(
+        CounterfactualOptions,
+        "measures.counterfactual.figure.by_lag",
+        "which decisions change if a past frame, or the recurrent state, is another episode's",
+        "runs/one runs/control --episodes 64 --donors 4",
         True,
         True,
     ),

@@ -43,6 +43,7 @@ class Window:
     ended: bool
     seed: int  # of the batch of episodes
     row: int = 0  # which episode of that batch
+    first: int = 0  # step of the episode at which the window begins
 
     @property
     def n(self) -> int:
@@ -199,7 +200,8 @@ def play(
     for row, (begin, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
         steps = max(0, min(keep, length - begin))
         whole = bool(ended[row]) and begin + steps == length
-        windows.append(_window(kept[row, :steps], states[row], whole, seed, row))
+        window = _window(kept[row, :steps], states[row], whole, seed, row)
+        windows.append(replace(window, first=begin))
     return windows, lengths.numpy()
 
 

@@ -19,6 +19,7 @@ from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import import_again
 from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
+from arcade_torch.tools.measures.counterfactual import figure as counterfactual
 from arcade_torch.tools.measures.gap_bias import figure as gap_bias
 from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias, gap_and_bias, normalise
 from arcade_torch.tools.measures.recall_density import figure as recall_density
@@ -57,8 +58,8 @@ def report(
         root: folder of the study.
         out: the page; ``report.html`` in the folder by default.
         metric: score of a run that headline and table rest on, ``eval_final`` or ``train_max_ewm``.
-        skip: parts to leave out: saliency strips, recall density, state contamination, returns of
-            random policy and oracles.
+        skip: parts to leave out: saliency strips, recall density, counterfactual recall, state
+            contamination, returns of random policy and oracles.
         progress: called with (what, done, total).
 
     Raises:
@@ -88,7 +89,9 @@ def report(
         "twin_names": TWIN_NAMES,
         "density": recall_density.DENSITY,
         "bins": recall_density.BINS,
+        "exchanges": counterfactual.EXCHANGES,
         "noise": contamination.NOISE,
+        "powerless_below": contamination.POWERLESS_BELOW,
     }
     with drawing("light"):
         players: Players = {}
@@ -139,14 +142,35 @@ def _parts(
     parts["palette"] = list(agent_colours(agents).values())
     parts["strips"] = []
     parts["recall"] = None
+    parts["counterfactual"] = None
     parts["contamination"] = None
     if "saliency" not in skip:
         parts["strips"] = saliency.saliency_strips(cells, progress)
-    if "recall" not in skip:
+    with_recall = "recall" not in skip
+    if with_recall:
         parts["recall"] = recall_density.recall_section(cells, agents, progress)
+    if "counterfactual" not in skip:
+        parts["counterfactual"] = counterfactual.counterfactual_section(
+            cells, agents, progress, with_recall
+        )
+    parts["vanishing"] = _vanishing(parts["strips"], parts["counterfactual"])
     if "contamination" not in skip:
         parts["contamination"] = contamination.contamination_section(cells, agents, progress)
     return parts
+
+
+def _vanishing(
+    strips: Sequence[Mapping[str, Any]], exchanges: Mapping[str, Any] | None
+) -> list[str]:
+    """The agents and tasks that have no gradient to speak of, in an episode or in many."""
+    names = list[str]()
+    for strip in strips:
+        if strip["warning"]:
+            names.append(f"{strip['agent']} on {strip['game']} {TWIN_NAMES[strip['twin']]}")
+    for row in exchanges["rows"] if exchanges is not None else ():
+        if row["saturated"]:
+            names.append(f"{row['agent']} on {row['game']} {row['twin']}")
+    return list(dict.fromkeys(names))
 
 
 def _finals(runs: Runs) -> Finals:
