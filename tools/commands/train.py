@@ -86,8 +86,10 @@ class Train(Command):
         """Train."""
         from arcade_torch.agents.runs.folder import wait_until_free
         from arcade_torch.agents.training import train
+        from arcade_torch.tools.exploring import stopped_exploring
         from arcade_torch.tools.machine import PARENT_VARIABLE, keep_freed_memory, watch_parent
         from arcade_torch.tools.progress import Bars, describe_row
+        from arcade_torch.tools.runs import Run
 
         at_least(self, wait=0)
         watch_parent()
@@ -120,6 +122,8 @@ class Train(Command):
             f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} "
             "episodes"
         )
+        if reason := stopped_exploring(Run(result.run_dir)):
+            say(f"this run {reason}")
         say(f"finished: {result.run_dir}")
         return 0
 

@@ -13,6 +13,7 @@ from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.comparable import Runs, check_comparable, import_notes
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.exploring import stopped_exploring
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
@@ -84,6 +85,7 @@ def report(
     context: dict[str, Any] = {
         "study": study,
         "changes": import_notes(runs.runs),
+        "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
         "twin_names": TWIN_NAMES,
@@ -102,6 +104,12 @@ def report(
     context |= _repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
+
+
+def _stopped(runs: Runs) -> dict[str, str]:
+    """The runs that stopped exploring before they learned, name -> one line on it."""
+    lines = {run.path.name: stopped_exploring(run) for run in runs.runs}
+    return {name: line for name, line in lines.items() if line}
 
 
 def _environment() -> Any:
