@@ -40,6 +40,16 @@ TRUSTED_COVERAGE = 0.85
 
 Players = Mapping[str, Mapping[str, Baseline]]  # game -> player -> what it earned
 
+# how the measures of a report are taken, for its text
+_PROTOCOLS = {
+    "twin_names": TWIN_NAMES,
+    "density": recall_density.DENSITY,
+    "bins": recall_density.BINS,
+    "exchanges": counterfactual.EXCHANGES,
+    "noise": contamination.NOISE,
+    "powerless_below": contamination.POWERLESS_BELOW,
+}
+
 
 def report(
     root: str | Path,
@@ -88,13 +98,8 @@ def report(
         "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
-        "twin_names": TWIN_NAMES,
-        "density": recall_density.DENSITY,
-        "bins": recall_density.BINS,
-        "exchanges": counterfactual.EXCHANGES,
-        "noise": contamination.NOISE,
-        "powerless_below": contamination.POWERLESS_BELOW,
     }
+    context |= _PROTOCOLS
     with drawing("light"):
         players: Players = {}
         if "references" not in skip:
