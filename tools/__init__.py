@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 _PUBLIC = {
     "Policy": "measures.policy",
+    "as_policy": "measures.policy",
     "Study": "studies.grid",
     "contamination": "measures.contamination.measure",
     "counterfactual": "measures.counterfactual.measure",
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from arcade_torch.tools.measures.contamination.measure import contamination
     from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
-    from arcade_torch.tools.measures.policy import Policy
+    from arcade_torch.tools.measures.policy import Policy, as_policy
     from arcade_torch.tools.measures.recall_density.measure import recall_density
     from arcade_torch.tools.measures.saliency.figure import saliency_figure
     from arcade_torch.tools.measures.saliency.measure import saliency
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "contamination", "counterfactual", "gap_and_bias", "greedy_window",
-    "recall_density", "report", "saliency", "saliency_figure", "study",
+    "Policy", "Study", "as_policy", "contamination", "counterfactual", "gap_and_bias",
+    "greedy_window", "recall_density", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 

@@ -1,26 +1,39 @@
 """What the analyses ask of a policy: two functions, and which of its outputs is meant.
 
 Saliency, recall density and contamination work on anything that can be cut in two: ``encode`` looks
-at single frames, ``remember`` is everything behind it. Agents and networks of this package have
-both as methods; wrap any other module in a `Policy`.
+at single frames, ``remember`` is everything behind it. `as_policy` makes both of a TensorDict
+policy, an agent or a network; `Policy` takes two functions of yours.
 
 Example:
-    >>> encoder, head = torch.nn.Linear(12, 4), torch.nn.Linear(4, 5)
-    >>> policy = Policy(
-    ...     encode=lambda frames: encoder(frames.flatten(-3) / 255),
-    ...     remember=lambda features, action, is_init, state: (head(features.cumsum(1)), state),
+    >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+    >>> from torchrl.modules import GRUModule
+    >>> flatten = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(12, 4))
+    >>> policy = as_policy(
+    ...     TensorDictSequential(
+    ...         TensorDictModule(flatten, ["pixels"], ["features"]),
+    ...         GRUModule(4, 4, in_key="features", out_key="remembered"),
+    ...         TensorDictModule(torch.nn.Linear(4, 5), ["remembered"], ["action_value"]),
+    ...     )
     ... )
-    >>> policy.encode(torch.zeros(7, 2, 2, 3)).shape
-    torch.Size([7, 4])
+    >>> features = policy.features(torch.zeros(2, 7, 2, 2, 3), batch_ndim=2)  # each frame once
+    >>> outputs, state = policy.unroll(features)
+    >>> outputs.shape, policy.offers
+    (torch.Size([2, 7, 5]), ('q', 'value'))
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Unpack, get_args
 
 import torch
+from tensordict import unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+
+from arcade_torch.models.actor_critic import ActorCriticNetwork
+from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.tools.measures.keys import Channels, Keys, Names
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
@@ -38,10 +51,11 @@ def read_plain(out: Tensor, output: str) -> Tensor:
 class Policy:
     """A policy in two functions.
 
-    ``encode`` turns frames, float or uint8 0..255 [N, H, W, C], into features [N, E], each frame on
-    its own. ``remember`` is ``(features [B, T, E], last_action int64 [B, T], is_init bool [B, T],
-    state) -> (out [B, T, A], state)``, causal in time; ``initial_state`` gives, for a batch size,
-    the state before the first frame: a TensorDict [B], a tensor [B, ...] or None.
+    ``encode`` turns frames [N, ...], as the env gives them or as floats of the same values, into
+    features [N, E], each frame on its own. ``remember`` is ``(features [B, T, E], last_action int64
+    [B, T], is_init bool [B, T], state) -> (out [B, T, A], state)``, causal in time;
+    ``initial_state`` gives, for a batch size, the state before the first frame: a TensorDict [B], a
+    tensor [B, ...] or None.
     """
 
     encode: Callable[[Tensor], Tensor]
@@ -51,14 +65,29 @@ class Policy:
     read: Callable[[Tensor, str], Tensor] = read_plain
     offers: tuple[str, ...] = TARGETS  # which of `TARGETS` its outputs can be read as
     module: nn.Module | None = None  # put into evaluation mode while an analysis runs
+    keys: Keys = field(default_factory=Keys)  # where an env has the frames, start flags and actions
+    channels: Channels | None = None  # which axis of a frame they are; None: the shorter end
+    # the value of a white pixel; None: 255 for whole numbers, 1 for floats
+    white: float | None = None
+    # (observations, state) -> (greedy actions, state); None: the best output
+    step: Callable[[Any, Any], tuple[Tensor, Any]] | None = None
+    splits: bool = True  # False: the features are the frames, encoding them saves nothing
+    needs_last_action: bool = False  # whether it must be handed over; zeros are no default then
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""
-        return self.read(out, "q" if "q" in self.offers else "logits").argmax(-1)
+        best: Tensor = self.read(out, "q" if "q" in self.offers else "logits").argmax(-1)
+        return best
 
     @torch.no_grad()
     def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
-        """Greedy actions for a batch of observations, as an agent gives them."""
+        """Greedy actions for a batch of observations, as an agent gives them.
+
+        ``obs`` holds ``pixels`` [N, ...], ``last_action`` [N] and ``is_init`` [N, 1].
+        """
+        if self.step is not None:
+            action, state = self.step(obs, state)
+            return action, {}, state
         steps = obs["pixels"].shape[0], 1
         features = self.encode(obs["pixels"]).unsqueeze(1)
         out, state = self.remember(
@@ -68,47 +97,238 @@ class Policy:
 
     @torch.no_grad()
     def features(
-        self, frames: Tensor, chunk: int = 16, dtype: torch.dtype = torch.float32
+        self,
+        frames: Tensor,
+        chunk: int = 16,
+        dtype: torch.dtype = torch.float32,
+        *,
+        batch_ndim: int = 1,
     ) -> Tensor:
-        """Features [T, E] of frames [T, H, W, C] without a graph, ``chunk`` frames at a time."""
-        return torch.cat([self.encode(part.to(dtype)) for part in frames.split(chunk)])
+        """Features [T, E] of frames [T, ...] without a graph, each frame encoded once, ``chunk`` at
+        a time; with ``batch_ndim=2`` [N, T, E] of sequences [N, T, ...].
+        """
+        batch = frames.shape[:batch_ndim]
+        flat = frames.flatten(0, batch_ndim - 1)
+        features = torch.cat([self.encode(part.to(dtype)) for part in flat.split(chunk)])
+        return features.reshape(*batch, -1)
+
+    def unroll(
+        self,
+        features: Tensor,
+        last_action: Tensor | None = None,
+        is_init: Tensor | None = None,
+        state: Any = None,
+        *,
+        target: str = "auto",
+    ) -> tuple[Tensor, Any]:
+        """Run memory and heads over sequences in evaluation mode; gradients flow.
+
+        Args:
+            features: [N, T, E], see `features`.
+            last_action: int64 [N, T], or one-hot [N, T, A], the action that led to each frame;
+                zeros by default.
+            is_init: bool [N, T], whether a frame opens an episode; all false by default.
+            state: recurrent state before step 0, batch [N]; the initial one by default.
+            target: the outputs that are wanted, see `resolve`.
+
+        Returns:
+            (outputs [N, T, A], of the target ``value`` [N, T, 1]; the state after the last step).
+        """
+        batch = features.shape[:2]
+        if last_action is None:
+            last_action = self.no_actions(batch, features.device)
+        if is_init is None:
+            is_init = torch.zeros(batch, dtype=torch.bool, device=features.device)
+        if state is None:
+            state = self.initial_state(batch[0])
+        name = resolve(self, target)
+        with self.evaluating():
+            out, state = self.remember(features, last_action, is_init.bool(), state)
+        return self.read(out, name), state
+
+    def forward_frames(
+        self,
+        frames: Tensor,
+        last_action: Tensor | None = None,
+        is_init: Tensor | None = None,
+        state: Any = None,
+        *,
+        target: str = "auto",
+    ) -> Tensor:
+        """Outputs of the last decision of sequences of frames [N, T, ...], [N, A]: encoder, memory
+        and heads in evaluation mode, with gradients to the frames.
+
+        Everything else is as for `unroll`. The signature is that of a forward function of Captum.
+        """
+        batch = frames.shape[:2]
+        with self.evaluating():
+            features = self.encode(frames.flatten(0, 1)).unflatten(0, batch)
+        outputs, _ = self.unroll(features, last_action, is_init, state, target=target)
+        return outputs[:, -1]
+
+    def no_actions(self, batch: Sequence[int], device: torch.device) -> Tensor:
+        """Last actions where none are handed over: zeros, int64 ``batch``.
+
+        Raises:
+            ValueError: the policy reads last actions, in a form that only its env knows.
+        """
+        if self.needs_last_action:
+            raise ValueError(
+                f"last_action must be handed over, this policy reads {self.keys.last_action!r}: "
+                "the action that led to each frame, as the env gives it"
+            )
+        return torch.zeros(batch, dtype=torch.int64, device=device)
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
-        """Evaluation mode for a while; the mode before comes back."""
+        """Evaluation mode for a while; the modes before come back."""
         module = nn.Identity() if self.module is None else self.module
-        training = module.training
+        modes = {part: part.training for part in module.modules()}
         module.eval()
         try:
             yield
         finally:
-            module.train(training)
+            for part, training in modes.items():
+                part.training = training
 
 
-def policy_of(model: Any) -> Policy:
-    """The two functions of whatever an analysis was given.
+def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
+    """Make of a model what every measure takes: a `Policy`.
+
+    Measures call it with the keywords that they do not know, so these can be handed to them.
 
     Args:
-        model: an agent with an attribute ``network``, a network with ``encode``, ``remember`` and
-            ``initial_state``, a `Policy`, or a pair ``(encode, remember)``.
+        model: a TensorDict policy, such as a ``TensorDictSequential`` with our ``MemoryModule`` or
+            TorchRL's ``LSTMModule`` or ``GRUModule``, or one without memory; an agent, a network
+            with ``encode``, ``remember`` and ``initial_state``, a `Policy`, or a pair ``(encode,
+            remember)``.
+        **names: all optional. ``pixels_key``: the frames; by default the one entry that a policy
+            reads beside the others. ``last_action_key``, ``is_init_key``, ``action_key``: by
+            default the words before ``_key``; an env that lacks the first two need not have them.
+            ``output_key`` and ``output_kind`` ("q", "logits", "probs"): what is looked at; by
+            default what ``QValueModule`` or a distribution reads, or ``action_value``, ``logits``
+            or ``probs``. ``value_key``: ``state_value`` by default. ``state_keys``: of the
+            recurrent state, by default those whose next state is written under "next"; else pairs
+            {key: key of the next state}. ``initial_state``: its start, a TensorDict of batch size
+            []; by default that of the module or its primer. ``channels`` ("first", "last"): by
+            default the shorter of the two ends of a frame. ``white``: the value of a white pixel,
+            by default 255 for whole numbers and 1 for floats.
 
     Raises:
         TypeError: ``model`` has none of these forms.
+        ValueError: a TensorDict policy reads or writes entries that say nothing to a measure.
     """
-    if isinstance(model, Policy):
-        return model
-    if isinstance(model, tuple) and len(model) == 2 and all(callable(part) for part in model):
-        return Policy(model[0], model[1])
     network = getattr(model, "network", model)
-    if all(hasattr(network, name) for name in ("encode", "remember", "initial_state")):
-        module = network if isinstance(network, nn.Module) else None
-        read = getattr(model, "outputs", None) or getattr(network, "select", None) or read_plain
-        offers = getattr(model, "offers", None) or getattr(network, "offers", None) or TARGETS
-        return Policy(
-            network.encode, network.remember, network.initial_state, read, tuple(offers), module
+    if isinstance(model, Policy):
+        policy = model
+    elif isinstance(model, tuple) and len(model) == 2 and all(callable(part) for part in model):
+        policy = Policy(model[0], model[1])
+    elif all(hasattr(network, name) for name in ("encode", "remember", "initial_state")):
+        policy = _of_network(model, network)
+    elif isinstance(model, TensorDictModuleBase):
+        return _of_module(model, names)
+    else:
+        raise TypeError(_no_policy(model))
+    return _renamed(policy, names) if names else policy
+
+
+policy_of = as_policy
+"""The name of before."""
+
+
+def _of_network(model: Any, network: Any) -> Policy:
+    """The policy of an agent, or of a network with the methods of ours."""
+    module = network if isinstance(network, nn.Module) else None
+    read = getattr(model, "outputs", None) or getattr(network, "select", None)
+    offers = getattr(model, "offers", None) or getattr(network, "offers", None)
+    if isinstance(network, MemoryNetwork) and read is None and "action_value" not in network.heads:
+        read, offers = _heads_of(network)
+    return Policy(
+        network.encode,
+        network.remember,
+        network.initial_state,
+        read or read_plain,
+        tuple(offers or TARGETS),
+        module,
+    )
+
+
+def _heads_of(network: MemoryNetwork) -> tuple[Callable[[Tensor, str], Tensor], tuple[str, ...]]:
+    """How the outputs of a network with logits, a value, or both are read, and as what."""
+    targets = {"logits": ("logits", "probs"), "state_value": ("value",)}
+    offers = tuple(name for key in network.heads for name in targets.get(str(key), ()))
+
+    def read(out: Tensor, target: str) -> Tensor:
+        heads = network.by_head(out)
+        if target == "value":
+            return heads["state_value"]
+        return heads["logits"].softmax(-1) if target == "probs" else heads["logits"]
+
+    return read, offers
+
+
+def _of_module(module: TensorDictModuleBase, names: Names) -> Policy:
+    """The policy of a TensorDict module; one that only acts for a network of ours is that network,
+    which can be cut in two.
+    """
+    # imported here: who has two functions needs no TorchRL
+    from arcade_torch.tools.measures.tensordict_policy import TensorDictPolicy
+
+    wrapper = TensorDictPolicy(module, names)
+    if isinstance(wrapper.only_part, MemoryNetwork | ActorCriticNetwork):
+        network = replace(as_policy(wrapper.only_part), module=module)
+        return _renamed(network, names)
+    return Policy(
+        wrapper.encode,
+        wrapper.remember,
+        wrapper.initial_state,
+        wrapper.output.read,
+        wrapper.output.offers,
+        module,
+        wrapper.keys,
+        names.get("channels"),
+        names.get("white"),
+        wrapper.act,
+        wrapper.splits,
+        wrapper.reads_last_action,
+    )
+
+
+def _renamed(policy: Policy, names: Names) -> Policy:
+    """The same policy on an env with other names, and frames of another kind."""
+    fixed = [name for name in names if name not in RENAMES]
+    if fixed:
+        raise ValueError(
+            f"{', '.join(fixed)} say how a TensorDict policy is read; this policy takes "
+            f"{', '.join(RENAMES)}"
         )
-    forms = "an agent, a network with encode and remember, a Policy or a pair (encode, remember)"
-    raise TypeError(f"model must be {forms}, got {type(model).__name__}")
+    changes = dict[str, Any]()
+    keys = policy.keys
+    for name, value in names.items():
+        if value is None:
+            continue
+        if name.endswith("_key"):
+            keys = replace(keys, **{name.removesuffix("_key"): unravel_key(value)})
+        else:
+            changes[name] = value
+    return replace(policy, keys=keys, **changes)
+
+
+RENAMES = ("pixels_key", "action_key", "last_action_key", "is_init_key", "channels", "white")
+"""The keywords of `as_policy` that any policy takes."""
+
+
+def _no_policy(model: Any) -> str:
+    """What is said to somebody whose model is no policy."""
+    forms = (
+        "an agent, a TensorDict policy, a network with encode and remember, a Policy or a pair "
+        "(encode, remember)"
+    )
+    advice = ""
+    if isinstance(model, nn.Module):
+        name = type(model).__name__
+        advice = f': TensorDictModule({name}, ["pixels"], ["action_value"]) makes a policy of it'
+    return f"model must be {forms}, got {type(model).__name__}{advice}"
 
 
 def resolve(model: Any, target: str) -> str:
@@ -120,7 +340,7 @@ def resolve(model: Any, target: str) -> str:
     """
     if target not in get_args(Target):
         raise ValueError(f"target must be one of {', '.join(TARGETS)} or auto, got {target!r}")
-    names = policy_of(model).offers
+    names = as_policy(model).offers
     if target == "auto":
         return next(name for name in ("q", "probs", *names) if name in names)
     if target not in names:
@@ -136,6 +356,6 @@ def outputs(model: Any, target: str = "auto") -> Callable[[Tensor], Tensor]:
 
     ``target`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
     """
-    policy = policy_of(model)
-    name = resolve(model, target)
+    policy = as_policy(model)
+    name = resolve(policy, target)
     return lambda out: policy.read(out, name)

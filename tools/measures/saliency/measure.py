@@ -12,7 +12,7 @@ sum over actions instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Unpack, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.agents.config import require
-from arcade_torch.tools.measures.policy import Policy, Progress, Target, outputs, policy_of, resolve
+from arcade_torch.tools.measures.frames import channel_axis
+from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.policy import (
+    Policy,
+    Progress,
+    Target,
+    as_policy,
+    outputs,
+    resolve,
+)
 from arcade_torch.tools.measures.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
@@ -31,7 +40,8 @@ Norm = Literal["l2sq", "l2", "l1"]
 class Saliency:
     """The gradients that `saliency` gives."""
 
-    # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame
+    # [n + 1, H, W], one map a frame; where the norm is additive, its pixels sum to per_frame; of
+    # frames without channels [n + 1, *frame]
     maps: NDArray[np.float32]
     # [n + 1], of each frame the sum over actions of the norm over all pixels, channels
     per_frame: NDArray[np.float64]
@@ -58,17 +68,16 @@ def saliency(
     target: Target = "auto",
     chunk: int = 8,
     dtype: torch.dtype = torch.float32,
+    **names: Unpack[Names],
 ) -> Saliency:
     """Gradient of the outputs at step n with respect to every frame up to n.
 
     Args:
-        model: an agent, a network with ``encode``, ``remember`` and ``initial_state``, a `Policy`,
-            or a pair ``(encode, remember)``; see `policy_of`.
-        frames: uint8 or float [T, H, W, C], values 0 to 255: what the agent saw, oldest first.
-        last_action: int64 [T], the action that led to each frame; zeros by default.
+        model: a TensorDict policy, an agent, or anything else that `as_policy` takes.
+        frames: [T, H, W, C], [T, C, H, W] or any other shape of frames, oldest first.
+        last_action: [T], or one-hot [T, A], the action that led to each frame; zeros by default.
         is_init: bool [T] or [T, 1], whether a frame opens an episode; all false by default.
-        state: recurrent state before the first frame, batch of one; the model's initial state by
-            default.
+        state: recurrent state before the first frame, batch of one; by default the initial one.
         n: index of the step to explain, negative from the end.
         reduce: ``per_action`` (the paper: norms of single actions, summed) or ``sum`` (norm of the
             gradient of the sum over actions, in which opposite effects cancel).
@@ -78,24 +87,26 @@ def saliency(
             probabilities by default.
         chunk: frames pushed through the encoder at once; bounds memory.
         dtype: of frames and gradients, float32 or float64 (the model's parameters must match).
+        **names: keywords of `as_policy`.
 
     Raises:
         ValueError: a shape does not fit, n is out of range, or an option has an unknown value.
         TypeError: ``model`` has none of the forms above.
     """
-    _check_options(reduce, norm, chunk, resolve(model, target))
+    policy = as_policy(model, **names)
+    _check_options(reduce, norm, chunk, resolve(policy, target))
     steps = _index(n, frames) + 1
+    if last_action is None:
+        last_action = policy.no_actions(frames.shape[:1], frames.device)
     actions = _one_a_frame("last_action", last_action, frames)
-    starts = _one_a_frame("is_init", is_init, frames).bool()
-    policy = policy_of(model)
-    scalars = outputs(model, target)
+    starts = _starts(is_init, frames)
     with policy.evaluating(), torch.enable_grad():
         features = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
         before = policy.initial_state(1) if state is None else state
         out, _ = policy.remember(
             features[None], actions[None, :steps], starts[None, :steps], before
         )
-        values = scalars(out[:, -1])[0]
+        values = outputs(policy, target)(out[:, -1])[0]
         jacobian = _jacobian(values, features, reduce)
         maps, sums = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
     return Saliency(
@@ -103,7 +114,7 @@ def saliency(
         per_frame=sums.double().cpu().numpy(),
         output=values.detach().float().cpu().numpy(),
         n=steps - 1,
-        target=resolve(model, target),
+        target=resolve(policy, target),
     )
 
 
@@ -120,20 +131,26 @@ def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
 
 def _index(n: int, frames: Tensor) -> int:
     """The index of a frame, counted from the first; negative ``n`` count from the end."""
-    require(frames.ndim == 4, "the shape of frames", list(frames.shape), "[T, H, W, C]")
+    require(frames.ndim > 1, "the shape of frames", list(frames.shape), "[T, H, W, C] or the like")
     total = frames.shape[0]
     require(-total <= n < total, "n", n, f"inside a window of {total} frames")
     return n % total
 
 
-def _one_a_frame(name: str, values: Tensor | None, frames: Tensor) -> Tensor:
-    """One value a frame, [T]; zeros by default."""
+def _one_a_frame(name: str, values: Tensor, frames: Tensor) -> Tensor:
+    """One value a frame, [T], or one-hot [T, A]."""
     total = frames.shape[0]
-    if values is None:
-        return torch.zeros(total, dtype=torch.int64, device=frames.device)
-    values = values.reshape(-1)
+    if values.ndim != 2 or values.shape[1] == 1:
+        values = values.reshape(-1)
     require(len(values) == total, f"the length of {name}", len(values), f"that of frames, {total}")
     return values
+
+
+def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
+    """Start flags, bool [T]; all false by default."""
+    if is_init is None:
+        return torch.zeros(frames.shape[0], dtype=torch.bool, device=frames.device)
+    return _one_a_frame("is_init", is_init, frames).bool()
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
@@ -156,7 +173,13 @@ def _frame_norms(
     """Norms of the gradients by the frames, summed over the outputs: of pixels [T, H, W], and of
     whole frames [T].
     """
-    per_pixel = jacobian.new_zeros(frames.shape[:3], dtype=dtype)
+    shape = list(frames.shape)
+    axis = channel_axis(shape[1:], policy.channels)
+    axes = []  # that a pixel's norm is taken over
+    if axis is not None:
+        axes = [1 if axis == 0 else 3]
+        shape.pop(axes[0])
+    per_pixel = jacobian.new_zeros(shape, dtype=dtype)
     per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
     reached = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
     for index in reached.split(chunk):
@@ -166,8 +189,9 @@ def _frame_norms(
             (gradient,) = torch.autograd.grad(
                 features, part, row, retain_graph=True, materialize_grads=True
             )
-            pixels = gradient.abs().sum(-1) if norm == "l1" else gradient.square().sum(-1)
-            total = pixels.sum((1, 2))
+            pixels = gradient.abs() if norm == "l1" else gradient.square()
+            pixels = pixels.sum(axes) if axes else pixels
+            total = pixels.flatten(1).sum(1)
             per_frame[index] += total.sqrt() if norm == "l2" else total
             per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
     return per_pixel, per_frame
