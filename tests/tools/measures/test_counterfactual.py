@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
+from torchrl.modules import LSTMModule, QValueModule
 
 import arcade_torch
 from arcade_torch.agents import Agent, preset
@@ -14,7 +16,7 @@ from arcade_torch.agents.evaluation import make_eval_env
 from arcade_torch.agents.policy import build_network
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.oracles import make_oracle
-from arcade_torch.tools import Policy, counterfactual
+from arcade_torch.tools import Policy, as_policy, counterfactual
 from arcade_torch.tools.measures.counterfactual.measure import (
     Counterfactual,
     counterfactual_of_windows,
@@ -365,6 +367,60 @@ def test_lags_and_the_size_of_a_batch_only_cut(monkeypatch: pytest.MonkeyPatch) 
     single = counterfactual_of_windows(net, windows)
     np.testing.assert_allclose(single.distance, whole.distance, atol=1e-6)
     np.testing.assert_array_equal(single.flip, whole.flip)
+
+
+class Scaled(torch.nn.Module):
+    """Features of small frames."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = torch.nn.Linear(48, 8)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        return torch.tanh(self.linear(frames.float().flatten(-3) / 255 - 0.5))
+
+
+def test_a_policy_of_torchrls_parts_is_measured_as_it_acts() -> None:
+    torch.manual_seed(0)
+    head = torch.nn.Linear(8, 3)
+    network = TensorDictSequential(
+        TensorDictModule(Scaled(), ["pixels"], ["features"]),
+        LSTMModule(input_size=8, hidden_size=8, in_key="features", out_key="remembered"),
+        TensorDictModule(head, ["remembered"], ["action_value"]),
+        QValueModule(action_space="categorical"),
+    )
+    with torch.no_grad():
+        for weight in network.parameters():  # so that frames count, and not what all share
+            weight *= 4 if weight.ndim == 2 else 0
+    found = counterfactual(network, ToyEnv(LENGTHS), episodes=6, donors=5)
+    player = as_policy(network)
+    windows = list(greedy_windows(player, ToyEnv(LENGTHS), episodes=6))
+
+    def act(frames: Tensor) -> int:
+        """The action on the last frame, played step by step."""
+        state = player.initial_state(1)
+        for t, frame in enumerate(frames):
+            obs = {"pixels": frame[None], "last_action": torch.zeros(1, dtype=torch.int64)}
+            action, _, state = player.act(obs | {"is_init": torch.tensor([[t == 0]])}, state)
+        return int(action)
+
+    for index, w in enumerate(windows):
+        clean = act(w.frames)
+        others = [other for place, other in enumerate(windows) if place != index]
+        for lag in range(w.n + 1):
+            changed = 0
+            for donor in others:
+                if donor.n >= w.n - lag:
+                    frames = w.frames.clone()
+                    frames[w.n - lag] = donor.frames[w.n - lag]
+                    changed += act(frames) != clean
+            assert np.nansum(found.flip[index, lag]) == changed
+        changed = 0
+        for donor in others:
+            if donor.n >= w.n:
+                changed += act(torch.cat([donor.frames[: w.n], w.frames[-1:]])) != clean
+        assert np.nansum(found.memory_flip[index]) == changed
+    assert found.profile()[1] > 0 and found.memory_reliance().value > 0
 
 
 def test_bad_input_is_refused() -> None:

@@ -18,7 +18,7 @@ blocks), and a donor's frame amid frames of another episode may be a sight that 
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -28,7 +28,8 @@ from torch import Tensor
 from arcade_torch.agents.config import require
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
-from arcade_torch.tools.measures.policy import Policy, Progress, Target, outputs, policy_of
+from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.policy import Policy, Progress, Target, as_policy, outputs
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
     MIN_STEPS,
@@ -42,7 +43,9 @@ from arcade_torch.tools.measures.windows import (
 Ints = NDArray[np.int64]
 Effect = Literal["flip", "distance", "change"]
 NOBODY = -1  # index of a donor that is missing
-MOST_STEPS = 2**14  # steps of exchanged versions that the memory runs at once; bounds memory use
+# of exchanged versions that the memory runs at once, which bounds memory use: steps, and numbers
+MOST_STEPS = 2**14
+MOST_NUMBERS = 2**25
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,7 @@ def counterfactual(
     cap: int = MAX_STEPS,
     target: Target = "auto",
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> Counterfactual:
     """Exchange frames and recurrent states between greedy episodes of an agent.
 
@@ -149,6 +153,7 @@ def counterfactual(
             gap, in which the best action has e times the probability of the second. Values of
             ``change`` are Q-values, or logarithms of probabilities.
         progress: called with (decisions done, episodes).
+        **names: keywords of `as_policy`.
 
     Returns:
         Arrays.
@@ -169,6 +174,7 @@ def counterfactual(
         seed=seed,
         target=target,
         progress=tell,
+        **names,
     )
 
 
@@ -183,9 +189,10 @@ def counterfactual_of_windows(
     seed: int = 0,
     target: Target = "auto",
     progress: Callable[[int], None] | None = None,
+    **names: Unpack[Names],
 ) -> Counterfactual:
-    """The same over windows of experience of your own, each of an episode of its own; the last
-    frame of each is the decision's.
+    """The same over windows of experience of your own, each of another episode; the last frame of
+    each is the decision's, and ``model`` anything that `as_policy` takes.
 
     ``progress`` is called with the number of decisions done. Everything else is as for
     `counterfactual`.
@@ -193,7 +200,8 @@ def counterfactual_of_windows(
     require(donors >= 1, "donors", donors, "at least 1")
     require(block >= 1, "block", block, "at least 1")
     require(most_lags >= 1, "most_lags", most_lags, "at least 1")
-    exchange = Exchange(model, output_of_actions(model, target), donors, block, most_lags)
+    policy = as_policy(model, **names)
+    exchange = Exchange(policy, output_of_actions(policy, target), donors, block, most_lags)
     with exchange.policy.evaluating():
         exchange.read(windows)
         rng = np.random.default_rng([seed, 2])
@@ -210,7 +218,7 @@ class Track:
 
     features: Tensor  # [T, E]
     frame_ids: Ints  # [T], equal for equal frames
-    last_action: Tensor  # int64 [T]
+    last_action: Tensor  # int64 [T], or one-hot [T, A]
     is_init: Tensor  # bool [T]
     state: Any  # recurrent state before the first frame, batch of one
     first: int  # step of the episode at which it begins
@@ -263,9 +271,10 @@ class Effects(NamedTuple):
 class Exchange:
     """Exchanges frames and states between episodes, and gathers how decisions change."""
 
-    def __init__(self, model: Any, target: str, donors: int, block: int, most_lags: int) -> None:
-        self.model = model
-        self.policy = policy_of(model)
+    def __init__(
+        self, policy: Policy, target: str, donors: int, block: int, most_lags: int
+    ) -> None:
+        self.policy = policy
         self.target = target
         self.donors = donors
         self.block = block
@@ -295,7 +304,8 @@ class Exchange:
     def _exchange_frames(self, track: Track, order: Ints) -> Effects:
         """Exchange the frames at every lag."""
         lags = min(track.length, self.most_lags)
-        at_once = max(1, MOST_STEPS // (self.donors * track.length))
+        steps = min(MOST_STEPS, MOST_NUMBERS // track.features.shape[1])
+        at_once = max(1, steps // (self.donors * track.length))
         parts = list[Effects]()
         for begin in range(0, lags, at_once):
             some = range(begin, min(lags, begin + at_once))
@@ -367,7 +377,7 @@ class Exchange:
         state = track.state
         if state is not None:
             state = state.expand(count, *state.shape[1:]).clone()
-        actions = track.last_action.expand(count, -1)
+        actions = track.last_action.expand(count, *track.last_action.shape)
         starts = track.is_init.expand(count, -1)
         out, _ = self.policy.remember(versions, actions, starts, state)
         return out[:, -1]
@@ -380,11 +390,11 @@ class Exchange:
     def _read(self, clean: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Values of actions and their distribution, double [V, A], of outputs [V, R]."""
         if self.target == "q":
-            read = outputs(self.model, "q")
+            read = outputs(self.policy, "q")
             values = read(raw).double().cpu()
             best = read(clean).double().cpu().topk(2).values
             return values, (values / (best[0] - best[1])).softmax(-1)
-        logits = outputs(self.model, "logits")(raw).double().cpu()
+        logits = outputs(self.policy, "logits")(raw).double().cpu()
         return logits.log_softmax(-1), logits.softmax(-1)
 
     def _compare(
