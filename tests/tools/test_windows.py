@@ -104,6 +104,6 @@ def test_replaying_a_window_gives_the_values_that_were_acted_on(env: Any, agent:
 
 def test_a_batch_of_several_is_refused() -> None:
     with pytest.raises(
-        ValueError, match=r"the batch size of env must be \[1\], for one episode; got \[2\]"
+        ValueError, match=r"the batch size of env must be \[\] or \[1\], for one episode; got \[2\]"
     ):
         greedy_window(Scripted([0]), arcade_torch.make(GAME, num_envs=2))

@@ -126,10 +126,12 @@ def measure_run(
 
 
 def _arguments(measure: Callable[..., Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a measure behind agent and env: from options, or their defaults."""
+    """The arguments of a measure behind agent and env: from options, or their defaults; our agents
+    need no names of entries.
+    """
     arguments = {}
     for name, parameter in signature(measure).parameters.items():
-        if name not in ("agent", "env"):
+        if name not in ("agent", "env", "names"):
             arguments[name] = options.get(name, parameter.default)
     return arguments
 

@@ -37,6 +37,7 @@ from arcade_torch.tools.measures.keys import Channels, Keys, Names
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
+DIFFERENT = 0.1  # of the outputs: more than the rounding of grey levels in a policy
 TARGETS = ("q", "logits", "probs", "value")  # outputs that can be asked for by name
 
 
@@ -178,6 +179,26 @@ class Policy:
                 "the action that led to each frame, as the env gives it"
             )
         return torch.zeros(batch, dtype=torch.int64, device=device)
+
+    @torch.no_grad()
+    def check_floats(self, frames: Tensor, last_action: Tensor) -> None:
+        """Refuse a TensorDict policy that takes floats for other frames than whole numbers of the
+        same values: gradients and noise need floats.
+
+        ``frames`` [T, ...] and ``last_action`` [T] are those that it saw.
+        """
+        if self.step is None or frames.is_floating_point():
+            return
+        target = self.offers[0]
+        first = frames[None, :1]
+        actions = last_action[None, :1]
+        exact = self.forward_frames(first, actions, target=target).double()
+        floats = self.forward_frames(first.float(), actions, target=target).double()
+        if float((exact - floats).norm()) > DIFFERENT * float(exact.norm()):
+            raise ValueError(
+                f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got other "
+                "outputs: convert frames of any type alike (frames.float() / 255)"
+            )
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:

@@ -3,9 +3,10 @@ before it.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Unpack, get_args
 
 import numpy as np
 import torch
@@ -15,12 +16,15 @@ from torch import Tensor
 
 from arcade_torch.agents.config import SEED_LIMIT, require
 from arcade_torch.tools.imports import load_agent
-from arcade_torch.tools.measures.policy import policy_of
+from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.keys import Keys, Names
+from arcade_torch.tools.measures.policy import Policy, as_policy
 
 MAX_STEPS = 512  # longest window; what is cut, and where, stands with the functions
 # a shorter trajectory says nothing about memory: recall density leaves it out and counts it
 MIN_STEPS = 3
 SIDE_BY_SIDE = 16  # episodes played at once where the caller brings no environments
+ENDLESS = 100_000  # steps after which an episode is taken for one that never ends
 
 End = Literal["last", "random"]
 Twin = Literal["full", "partial"]
@@ -32,8 +36,9 @@ class Window:
     at.
     """
 
-    frames: Tensor  # uint8 [T, S, S, 3]
-    last_action: Tensor  # int64 [T], the action that led to each frame
+    frames: Tensor  # [T, *frame], of our games uint8 [T, S, S, 3]
+    # the action that led to each frame, as the env has it: int64 [T], or one-hot [T, A]
+    last_action: Tensor
     # bool [T], true at index 0 at most, and only if the window begins with the episode
     is_init: Tensor
     action: Tensor  # int64 [T], the action chosen on each frame
@@ -72,15 +77,17 @@ def greedy_window(
     seed: int = 0,
     observability: Twin | None = None,
     max_steps: int = MAX_STEPS,
+    **names: Unpack[Names],
 ) -> Window:
     """Play one greedy episode and return what the agent saw.
 
     Args:
         agent: as for `resolve_agent`.
-        env: ``ArcadeEnv`` with one environment; by default one of the agent's own game.
+        env: any env of TorchRL, of batch size [] or [1]; by default one of the agent's own game.
         seed: of the episode; without ``env`` that of a held-out environment.
         observability: another twin than the one trained on (without ``env``).
         max_steps: the episode is cut after this many steps.
+        **names: keywords of `as_policy`.
 
     Returns:
         The window. The frame after the ending action is never part of it.
@@ -89,12 +96,12 @@ def greedy_window(
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
     seed = held_out(seed) if env is None else seed
-    player, env = resolve_agent(agent, env, observability, num_envs=1)
+    player, env = resolve_agent(agent, env, observability, num_envs=1, **names)
     require(
-        tuple(env.batch_size) == (1,),
+        tuple(env.batch_size) in ((), (1,)),
         "the batch size of env",
         list(env.batch_size),
-        "[1], for one episode",
+        "[] or [1], for one episode",
     )
     require(max_steps >= 1, "max_steps", max_steps, "at least 1")
     (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps)
@@ -110,8 +117,8 @@ def greedy_windows(
     Args:
         agent: has ``act(obs, state) -> (action, extras, state)`` and ``initial_state(batch_size)``,
             and acts greedily.
-        env: ``ArcadeEnv`` of any batch size N. Batch b plays with a seed made of ``seed`` and b, so
-            another N plays other episodes.
+        env: any env of TorchRL, of batch size [] or [N]. Batch b plays with a seed made of ``seed``
+            and b, so another N plays other episodes.
         episodes: number of windows.
         seed: of the episodes and of the random ends; of held-out environments, as in an evaluation.
         end: ``last``: the window ends with the frame on which the ending action was chosen;
@@ -126,7 +133,7 @@ def greedy_windows(
     require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
     require(episodes >= 1, "episodes", episodes, "at least 1")
     require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
-    size = int(env.batch_size[0])
+    size = EpisodeBatch(env, _keys(agent)).size
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
         drawn = np.random.SeedSequence([seed, group]).generate_state(1)
@@ -167,32 +174,35 @@ def play(
     kept; episodes are cut after ``max_steps``, never by default. Returns a window of each episode,
     and all lengths int64 [N].
     """
-    size = int(env.batch_size[0])
+    episodes = EpisodeBatch(env, _keys(agent))
+    size = episodes.size
     starts = torch.as_tensor([0] * size if first is None else first)
     lengths = torch.zeros(size, dtype=torch.int64)
     ended = torch.zeros(size, dtype=torch.bool)
-    env.set_seed(seed)
-    obs = env.reset()
+    obs = episodes.reset(seed)
     state = agent.initial_state(size)
     kept: TensorDictBase | None = None
     states: list[Any] = [None] * size
     playing = torch.ones(size, dtype=torch.bool)
     t = 0
     while playing.any() and (max_steps is None or t < max_steps):
+        if t == ENDLESS:
+            raise ValueError(f"an episode must end, got {t} steps without: give env a time limit")
         for row in (playing & (starts == t)).nonzero().flatten().tolist():
             states[row] = None if state is None else state[row : row + 1].clone()
-        action, _, state = agent.act(obs, state)
+        with _evaluating(agent):
+            action, _, state = agent.act(obs, state)
         rows = (playing & (starts <= t) & (t < starts + keep)).nonzero().flatten()
         seen = obs.select("pixels", "last_action", "is_init").set("action", action)
-        step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        seen.set("reward", step.get(("next", "reward")))
+        obs, reward, done = episodes.step(action)
+        seen.set("reward", reward)
         if kept is None:  # untouched memory is never really taken
             kept = seen.apply(
                 lambda x: x.new_empty(size, keep, *x.shape[1:]), batch_size=[size, keep]
             )
         kept[rows, t - starts[rows]] = seen[rows]
         lengths += playing
-        ended |= playing & step.get(("next", "done")).reshape(-1).cpu()
+        ended |= playing & done.cpu()
         playing &= ~ended
         t += 1
     assert kept is not None
@@ -205,11 +215,21 @@ def play(
     return windows, lengths.numpy()
 
 
+def _keys(agent: Any) -> Keys:
+    """Where an env has what this agent reads."""
+    return agent.keys if isinstance(agent, Policy) else Keys()
+
+
+def _evaluating(agent: Any) -> AbstractContextManager[None]:
+    """Evaluation mode of a policy; an agent of ours is in it already."""
+    return agent.evaluating() if isinstance(agent, Policy) else nullcontext()
+
+
 def _window(steps: TensorDictBase, state: Any, ended: bool, seed: int, row: int) -> Window:
     """A window from what was kept of the steps of one episode, [T]."""
     return Window(
         frames=steps["pixels"],
-        last_action=steps["last_action"].reshape(-1),
+        last_action=steps["last_action"],
         is_init=steps["is_init"].reshape(-1),
         action=steps["action"].reshape(-1),
         reward=steps["reward"].reshape(-1),
@@ -229,23 +249,26 @@ def held_out(seed: int) -> int:
 
 
 def resolve_agent(
-    agent: Any, env: Any = None, observability: Twin | None = None, num_envs: int = SIDE_BY_SIDE
+    agent: Any,
+    env: Any = None,
+    observability: Twin | None = None,
+    num_envs: int = SIDE_BY_SIDE,
+    **names: Unpack[Names],
 ) -> tuple[Any, Any]:
     """Something that acts, and environments for it: by default of its own game, on the twin that is
     named.
 
     ``agent`` is an agent, the path of its run folder or checkpoint, or with ``env`` given anything
-    that acts as an agent does or that `policy_of` takes. Without ``env`` there are ``num_envs``, on
-    the device of the agent's network.
+    that acts as an agent does or that `as_policy`, which gets ``names``, takes. Without ``env``
+    there are ``num_envs``, on the device of the agent's network.
 
     Raises:
         ValueError: there is no environment for it, or more than one.
     """
     if isinstance(agent, str | Path):
         agent = load_agent(Path(agent))
-    player = (
-        agent if hasattr(agent, "act") and hasattr(agent, "initial_state") else policy_of(agent)
-    )
+    acts = hasattr(agent, "act") and hasattr(agent, "initial_state")
+    player = agent if acts and not names else as_policy(agent, **names)
     if env is not None:
         if observability is not None:
             raise ValueError(

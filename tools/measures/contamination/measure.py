@@ -17,7 +17,7 @@ deviation 1 to pixels in 0..255, which is sigma = 1/255 here.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -26,7 +26,17 @@ from torch import Tensor
 
 from arcade_torch.agents.config import require
 from arcade_torch.tools.measures.bootstrap import Array
-from arcade_torch.tools.measures.policy import Policy, Progress, Target, outputs, policy_of, resolve
+from arcade_torch.tools.measures.envs import one_hot
+from arcade_torch.tools.measures.frames import pictures, white_of
+from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.policy import (
+    Policy,
+    Progress,
+    Target,
+    as_policy,
+    outputs,
+    resolve,
+)
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
     Twin,
@@ -45,7 +55,6 @@ POINTS_AN_EPISODE = 4
 # a shuffle permutes the frames behind the first of these, up to the last
 FIRST = 1
 LAST = 10
-WHITE = 255.0  # pixel value that stands for 1
 
 
 @dataclass(frozen=True)
@@ -89,6 +98,7 @@ def contamination(
     cap: int = MAX_STEPS,
     target: Target = "auto",
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> Contamination:
     """Noise on one past observation, for a grid of strengths and delays.
 
@@ -107,6 +117,7 @@ def contamination(
             MDPs only.
         seed: of episodes, start points and noise.
         progress: called with (start points done, starts).
+        **names: keywords of `as_policy`; ``white`` is what 1 means for ``sigmas``.
 
     Raises:
         ValueError: an option is out of range, or no episode was long enough.
@@ -114,7 +125,7 @@ def contamination(
     require(min(sigmas, default=-1) >= 0, "sigmas", list(sigmas), "numbers of at least 0")
     require(min(delays, default=-1) >= 0, "delays", list(delays), "whole numbers of at least 0")
     require(starts >= 1, "starts", starts, "at least 1")
-    player, env = resolve_agent(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
     steps = np.unique(np.array(delays, np.int64))
     probe = Probe(
@@ -159,7 +170,8 @@ class Noise:
         count = min(self.points_an_episode, most, window.n)
         places = np.sort(rng.choice(window.n, count, replace=False))
         seed = int(rng.integers(2**62))
-        frames = disturbed_frames(window.frames, places, self.sigmas, self.clip, seed)
+        white = white_of(window.frames, policy.white)
+        frames = disturbed_frames(window.frames, places, self.sigmas, self.clip, seed, white)
         noisy = policy.features(frames)
         features = clean.repeat(len(noisy), 1, 1)
         features[torch.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
@@ -204,7 +216,7 @@ class Probe:
         seed: int,
     ) -> None:
         self.model = model
-        self.policy = policy_of(model)
+        self.policy = as_policy(model)
         self.target = target
         self.disturbance = disturbance
         self.delays = delays
@@ -231,6 +243,7 @@ class Probe:
 
     def _disturb(self, number: int, window: Window) -> None:
         """Disturb a trajectory, replay its versions, and compare their decisions."""
+        self.policy.check_floats(window.frames, window.last_action)
         clean = self.policy.features(window.frames)
         most = self.starts - len(self.points)
         versions = self.disturbance.versions(self.policy, window, clean, most, self.rng)
@@ -312,7 +325,7 @@ class Example:
     of it.
     """
 
-    # [R, T, H, W, 3], noise cut to the range of pixels; the decision is taken on the last
+    # [R, T, H, W, 3], pictures, noise cut to their range; the decision is taken on the last
     frames: NDArray[np.uint8]
     order: Ints  # [R, T], the step of the trajectory at which each frame was seen
     hits: Ints  # [R], index of the noisy frame, -1 in rows without one
@@ -335,6 +348,7 @@ def contamination_example(
     seed: int = 0,
     observability: Twin | None = None,
     target: Target = "auto",
+    **names: Unpack[Names],
 ) -> Example:
     """The paper's picture: the beginning of one episode, undisturbed and disturbed, and the
     decision at its end.
@@ -345,8 +359,8 @@ def contamination_example(
     ``horizon`` is below 2, or no episode was long enough.
     """
     require(horizon >= 2, "horizon", horizon, "at least 2")
-    player, env = resolve_agent(agent, env, observability)
-    policy = policy_of(player)
+    player, env = resolve_agent(agent, env, observability, **names)
+    policy = as_policy(player)
     output = resolve(player, target)
     n = horizon + LAST * shuffle
     windows, _ = play(player, env, seed=held_out(seed), keep=n + 1, max_steps=n + 1)
@@ -360,29 +374,34 @@ def contamination_example(
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
     versions = w.frames[torch.as_tensor(order)].float()
+    white = white_of(w.frames, policy.white)
     if not shuffle:
         versions[range(1, len(order)), hits] = disturbed_frames(
-            w.frames, hits, np.array([sigma]), clip, seed
+            w.frames, hits, np.array([sigma]), clip, seed, white
         )
     with policy.evaluating():
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
         values = outputs(player, output)(raw).double().cpu().numpy()
     values = values if output == "probs" else values - values.mean(1, keepdims=True)
-    pictures = versions.clamp(0, WHITE).round().byte().cpu().numpy()
-    return Example(pictures, order, np.array([-1, *hits]), values, output, sigma)
+    drawn = pictures(versions.flatten(0, 1), policy.channels, white)
+    drawn = drawn.reshape(*order.shape, *drawn.shape[1:])
+    return Example(drawn, order, np.array([-1, *hits]), values, output, sigma)
 
 
-def disturbed_frames(frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int) -> Tensor:
+def disturbed_frames(
+    frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int, white: float = 255.0
+) -> Tensor:
     """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame
-    share its draw.
+    share its draw, and 1 stands for ``white``.
     """
     generator = torch.Generator().manual_seed(seed)
     chosen = frames[torch.as_tensor(places)].to(torch.float32)
     noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
-    scale = torch.as_tensor(WHITE * sigmas, dtype=torch.float32, device=chosen.device)
-    noisy = (chosen[:, None] + scale[:, None, None, None] * noise[:, None]).flatten(0, 1)
-    return noisy.clamp(0.0, WHITE) if clip else noisy
+    scale = torch.as_tensor(white * sigmas, dtype=torch.float32, device=chosen.device)
+    scale = scale.reshape(-1, *[1] * (frames.ndim - 1))
+    noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
+    return noisy.clamp(0.0, white) if clip else noisy
 
 
 def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -> Ints:
@@ -408,7 +427,7 @@ def replayed(
     state: Any = policy.initial_state(1) if window.state is None else window.state
     if state is not None:
         state = state.expand(count, *state.shape[1:]).clone()
-    actions = window.last_action.expand(count, -1)
+    actions = window.last_action.expand(count, *window.last_action.shape)
     starts = window.is_init.bool().expand(count, -1)
     if not feedback:
         return policy.remember(features, actions, starts, state)[0]
@@ -417,8 +436,9 @@ def replayed(
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
     parts = [out]
     for t in range(begin, features.shape[1]):
-        out, state = policy.remember(
-            features[:, t : t + 1], policy.greedy(out[:, -1:]), starts[:, t : t + 1], state
-        )
+        action = policy.greedy(out[:, -1:])
+        if actions.ndim == 3:
+            action = one_hot(action, actions.shape[-1]).to(actions)
+        out, state = policy.remember(features[:, t : t + 1], action, starts[:, t : t + 1], state)
         parts.append(out)
     return torch.cat(parts, 1)

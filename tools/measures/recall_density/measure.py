@@ -12,13 +12,14 @@ actions instead of their sum.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arcade_torch.tools.measures.bootstrap import Array
-from arcade_torch.tools.measures.policy import Progress, Target, resolve
+from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.policy import Progress, Target, as_policy, resolve
 from arcade_torch.tools.measures.saliency.measure import Norm, Reduce, saliency
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
@@ -87,14 +88,15 @@ def recall_density(
     reduce: Reduce = "per_action",
     target: Target = "auto",
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> RecallDensity:
     """Recall density of an agent over whole greedy episodes.
 
     Args:
-        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, any `Policy`
-            or network.
-        env: ``ArcadeEnv`` whose episodes are played side by side; by default 16 of the agent's own
-            game.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, a TensorDict
+            policy or anything else that `as_policy` takes.
+        env: any env of TorchRL, whose episodes are played side by side; by default 16 of the
+            agent's own game.
         episodes: number of trajectories.
         seed: of the episodes; training never sees them.
         observability: another twin than the one trained on (without ``env``).
@@ -104,6 +106,7 @@ def recall_density(
         norm: over all pixels and channels, as for `saliency`, and so are ``reduce`` and ``target``;
             ``l1`` is the paper's.
         progress: called with (trajectories done, episodes).
+        **names: keywords of `as_policy`.
 
     Returns:
         Arrays.
@@ -111,7 +114,7 @@ def recall_density(
     Raises:
         ValueError: an option is out of range, or this agent does not offer ``target``.
     """
-    player, env = resolve_agent(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability, **names)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     tell = None if progress is None else lambda count: progress(count, episodes)
     return density_of_windows(
@@ -127,12 +130,14 @@ def density_of_windows(
     reduce: Reduce = "per_action",
     target: Target = "auto",
     progress: Callable[[int], None] | None = None,
+    **names: Unpack[Names],
 ) -> RecallDensity:
     """Recall density over windows of experience of your own; the last frame of each is explained.
 
     A start flag inside a window leaves exactly nothing on the frames before it; ``progress`` is
     called with the number of windows done. Everything else is as for `recall_density`.
     """
+    policy = as_policy(model, **names)
     shares = [np.zeros(0)]
     ended = list[bool]()
     dropped = 0
@@ -142,7 +147,7 @@ def density_of_windows(
             dropped += 1
         else:
             gradients = saliency(
-                model,
+                policy,
                 window.frames,
                 window.last_action,
                 window.is_init,
@@ -164,7 +169,7 @@ def density_of_windows(
         ended=np.array(ended, dtype=np.bool_),
         dropped=dropped,
         silent=silent,
-        target=resolve(model, target),
+        target=resolve(policy, target),
     )
 
 

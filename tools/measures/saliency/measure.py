@@ -96,10 +96,9 @@ def saliency(
     policy = as_policy(model, **names)
     _check_options(reduce, norm, chunk, resolve(policy, target))
     steps = _index(n, frames) + 1
-    if last_action is None:
-        last_action = policy.no_actions(frames.shape[:1], frames.device)
-    actions = _one_a_frame("last_action", last_action, frames)
+    actions = _last_actions(policy, last_action, frames)
     starts = _starts(is_init, frames)
+    policy.check_floats(frames, actions)
     with policy.evaluating(), torch.enable_grad():
         features = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
         before = policy.initial_state(1) if state is None else state
@@ -144,6 +143,13 @@ def _one_a_frame(name: str, values: Tensor, frames: Tensor) -> Tensor:
         values = values.reshape(-1)
     require(len(values) == total, f"the length of {name}", len(values), f"that of frames, {total}")
     return values
+
+
+def _last_actions(policy: Policy, last_action: Tensor | None, frames: Tensor) -> Tensor:
+    """Last actions [T], or one-hot [T, A]; zeros where none are given."""
+    if last_action is None:
+        return policy.no_actions(frames.shape[:1], frames.device)
+    return _one_a_frame("last_action", last_action, frames)
 
 
 def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
@@ -201,12 +207,13 @@ def _frame_norms(
 class EpisodeSaliency(Saliency):
     """Saliency of the last decision of an episode, with what was seen and done."""
 
-    frames: NDArray[np.uint8]  # [n + 1, H, W, 3]
+    frames: NDArray[Any]  # [n + 1, *frame], of our games uint8 [n + 1, H, W, 3]
     action: NDArray[np.int64]  # [n + 1], chosen on each frame
 
 
 def episode_saliency(
     agent: Any,
+    env: Any = None,
     *,
     seed: int = 0,
     max_steps: int = MAX_STEPS,
@@ -217,9 +224,10 @@ def episode_saliency(
     norm: Norm = "l2sq",
     target: Target = "auto",
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> EpisodeSaliency:
-    """Saliency of the last decision of a greedy episode in the agent's own game, cut after
-    ``max_steps``.
+    """Saliency of the last decision of a greedy episode, in ``env`` or in the agent's own game, cut
+    after ``max_steps``.
 
     At most ``tries`` episodes are played, from ``seed`` on, until one has the ``show`` frames that
     are wanted; else the longest counts. All else is as for `greedy_window` and `saliency`;
@@ -228,7 +236,12 @@ def episode_saliency(
     windows: list[Window] = []
     for episode_seed in range(seed, seed + tries):
         window = greedy_window(
-            agent, seed=episode_seed, observability=observability, max_steps=max_steps
+            agent,
+            env,
+            seed=episode_seed,
+            observability=observability,
+            max_steps=max_steps,
+            **names,
         )
         windows.append(window)
         if window.n + 1 >= show:
@@ -243,6 +256,7 @@ def episode_saliency(
         reduce=reduce,
         norm=norm,
         target=target,
+        **names,
     )
     if progress is not None:
         progress(1, 1)

@@ -1,0 +1,112 @@
+"""Any env of TorchRL as the measures play it: a batch of episodes, under one set of names."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from arcade_torch.agents.config import require
+from arcade_torch.models.memory import Key
+from arcade_torch.tools.measures.keys import Keys
+
+
+class EpisodeBatch:
+    """Plays an env with any names, with or without a batch size, with categorical or one-hot
+    actions.
+
+    Args:
+        env: of TorchRL, batch size [] or [N].
+        keys: where it has frames, the last action and start flags, and reads actions. If it has no
+            last action, that is the action before, zeros at first; if it has no start flags, they
+            follow from ``done``.
+
+    Attributes:
+        size: N.
+
+    Raises:
+        ValueError: it has more than one batch dimension.
+    """
+
+    def __init__(self, env: Any, keys: Keys) -> None:
+        shape = list(env.batch_size)
+        require(len(shape) < 2, "the batch size of env", shape, "[] or [N]")
+        self.env = env
+        self.keys = keys
+        self.is_batch = bool(shape)
+        self.size = int(shape[0]) if shape else 1
+        spec = _action_spec(env, keys.action)
+        self._one_hot = spec if _is_one_hot(spec) else None
+        self._action_shape = None if spec is None else spec.shape
+        self._root: Any = None
+
+    def reset(self, seed: int) -> TensorDictBase:
+        """Begin the episodes of a seed: observations [N] with ``pixels``, ``last_action``,
+        ``is_init`` and all that the env gives.
+        """
+        self.env.set_seed(seed)
+        self._root = self.env.reset()
+        nothing = torch.zeros(self.size, dtype=torch.int64)
+        before = torch.zeros_like(self._encode(nothing))  # no action, one-hot: all zeros
+        begins = torch.ones(self.size, 1, dtype=torch.bool)
+        return self._observe(before, begins)
+
+    def step(self, action: Tensor) -> tuple[TensorDictBase, Tensor, Tensor]:
+        """Take actions int64 [N].
+
+        Returns:
+            (the next observations [N], reward float [N, 1], done bool [N]).
+        """
+        encoded = self._encode(action)
+        given = encoded if self.is_batch else encoded[0]
+        if self._action_shape is not None:
+            given = given.reshape(self._action_shape)
+        self._root.set(self.keys.action, given)
+        step, self._root = self.env.step_and_maybe_reset(self._root)
+        reward = self._batch(step.get(("next", "reward")))
+        done = self._batch(step.get(("next", "done"))).reshape(-1, 1)
+        return self._observe(encoded, done), reward.reshape(-1, 1), done.reshape(-1)
+
+    def _observe(self, last_action: Tensor, is_init: Tensor) -> TensorDictBase:
+        """What the env gives, with defaults for what it lacks, under the names of the measures."""
+        keys = self.keys
+        obs = self._root.copy() if self.is_batch else self._root.unsqueeze(0)
+        pixels = obs.get(keys.pixels, None)
+        if pixels is None:
+            raise ValueError(
+                f"the env must have the frames under {keys.pixels!r}, got "
+                f"{sorted(obs.keys(True, True), key=str)}: name pixels_key"
+            )
+        last_action = obs.get(keys.last_action, last_action)
+        is_init = obs.get(keys.is_init, is_init)
+        obs.set("pixels", pixels)
+        obs.set("last_action", last_action.to(pixels.device))
+        obs.set("is_init", is_init.reshape(-1, 1).to(pixels.device))
+        return obs
+
+    def _encode(self, action: Tensor) -> Tensor:
+        """Actions int64 [N], one-hot [N, A] where the env reads them so."""
+        if self._one_hot is None:
+            return action
+        return one_hot(action, self._one_hot.shape[-1]).to(self._one_hot.dtype)
+
+    def _batch(self, value: Tensor) -> Tensor:
+        return value if self.is_batch else value.unsqueeze(0)
+
+
+def one_hot(action: Tensor, count: int) -> Tensor:
+    """Actions int64 [...] as one-hot int64 [..., count]."""
+    return torch.nn.functional.one_hot(action, count)
+
+
+def _action_spec(env: Any, key: Key) -> Any:
+    """The spec of an env's action; None for an env without specs."""
+    specs = getattr(env, "full_action_spec", None)
+    return None if specs is None else specs.get(key, None)
+
+
+def _is_one_hot(spec: Any) -> bool:
+    # imported here: who measures windows of their own needs no TorchRL
+    from torchrl.data import OneHot
+
+    return isinstance(spec, OneHot)
