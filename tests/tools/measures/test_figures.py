@@ -661,7 +661,7 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
-    monkeypatch.setattr(checkpoints, "load", lambda path: agent)
+    monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
     for value in (1.0, 2.0, 1.0):
         torch.nn.init.constant_(agent.network.weight, value)
