@@ -19,6 +19,15 @@ NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 ENDS = ("terminated", "truncated")  # the flags of an end
+MEMORY_KINDS = {
+    "recall": "what was seen once",
+    "counting": "how often something was seen",
+    "mapping": "where things lie that are covered again",
+    "tracking": "where something is that moves unseen",
+    "velocity": "where something is of which only the velocity is seen",
+    "none": "nothing: a player without memory can earn the most",
+}
+"""What a POMDP twin can ask of a memory."""
 # such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
 UNSET: Any = None
 
@@ -136,9 +145,12 @@ class Game(abc.ABC, Generic[State]):
         num_actions: Always 5: up, down, left, right, fire.
         oracles: The scripted players there are, ``"state"``, ``"frames"`` or both: called with the
             game, each gives a player, see :mod:`arcade_torch.envs_jax.oracles`.
+        memory_kind: What the POMDP twin asks of a memory, a key of ``MEMORY_KINDS``; empty where
+            nobody has said.
     """
 
     num_actions: ClassVar[int] = NUM_ACTIONS
+    memory_kind: ClassVar[str] = ""
     oracles: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}
     id: str
     obs_size: int

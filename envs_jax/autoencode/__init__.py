@@ -37,6 +37,7 @@ class AutoEncode(LevelGame[AutoEncodeState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "recall"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

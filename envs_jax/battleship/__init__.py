@@ -31,6 +31,7 @@ class BattleShip(LevelGame[BattleShipState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "none"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:

@@ -39,6 +39,7 @@ class Breakout(LevelGame[BreakoutState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "tracking"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

@@ -36,6 +36,7 @@ class CartPole(LevelGame[CartPoleState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "velocity"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

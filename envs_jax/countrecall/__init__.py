@@ -39,6 +39,7 @@ class CountRecall(LevelGame[CountRecallState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "counting"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

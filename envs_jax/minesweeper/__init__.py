@@ -36,6 +36,7 @@ class MineSweeper(LevelGame[MineSweeperState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

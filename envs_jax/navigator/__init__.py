@@ -32,6 +32,7 @@ class Navigator(LevelGame[NavigatorState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:

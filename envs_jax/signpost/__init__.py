@@ -29,6 +29,7 @@ class Signpost(LevelGame[SignpostState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "recall"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:

@@ -34,6 +34,7 @@ class Skittles(LevelGame[SkittlesState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "tracking"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(

@@ -40,6 +40,7 @@ class Tetris(LevelGame[TetrisState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
