@@ -8,10 +8,12 @@ from typing import Any
 from torch import nn
 
 from arcade_torch.models.attention import Attention
+from arcade_torch.models.frame_stack import FrameStack
 from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
 from arcade_torch.models.linear_transformer import LinearTransformer
 from arcade_torch.models.lru import LRU
+from arcade_torch.models.lstm import LSTM
 from arcade_torch.models.mingru import MinGRU
 from arcade_torch.models.stateless import Stateless
 from arcade_torch.models.ttt import TTTLinear
@@ -29,6 +31,8 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "attention": Attention,
     "gdn": GatedDeltaNet,
     "ttt": TTTLinear,
+    "lstm": LSTM,
+    "frame_stack": FrameStack,
 }
 
 ALIASES = {"fart": "linear_transformer"}

@@ -33,6 +33,8 @@ AGENT_COLOURS = {
     "gdn": "#56b4e9",
     "ttt": "#5e3c10",
     "tttl": "#5e3c10",
+    "lstm": "#117733",
+    "frame_stack": "#882255",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
