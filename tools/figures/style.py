@@ -55,8 +55,9 @@ POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
-# inches of a picture of a report; small ones for many tasks
-PANEL = (4.9, 3.0)
+# inches of a picture of a report, narrow enough for its letters on a telephone; small ones for many
+# tasks
+PANEL = (3.9, 2.55)
 SMALL_PANEL = (3.3, 2.3)
 
 STYLES = Path(__file__).resolve().parents[1] / "data"

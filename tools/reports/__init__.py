@@ -84,18 +84,18 @@ def report(
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
     check_comparable(runs)
     about = _subject(study, runs, subject)
-    context = _constants() | {
-        "study": study,
-        "changes": import_notes(runs.runs),
-        "rows": rows,
-        "subject": subject_section(folder, runs, about, metric) if about else None,
-    }
+    context = _constants() | {"study": study, "changes": import_notes(runs.runs), "rows": rows}
     with drawing("light"):
         players: Players = {}
         if "references" not in skip:
             players = _players(folder, runs, progress)
         context |= _parts(study, runs, about, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
+    context["subject"] = None
+    if about:
+        table = context["table"]
+        rival = "" if table is None else str(table.baselines[about])
+        context["subject"] = subject_section(folder, runs, about, metric, rival)
     context |= _repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
@@ -168,10 +168,16 @@ def _parts(
     if "saliency" not in skip:
         parts["strips"] = saliency.saliency_strips(cells, progress)
     if "recall" not in skip:
-        parts["recall"] = recall_density.recall_section(cells, agents, progress)
+        parts["recall"] = _unless_empty(recall_density.recall_section(cells, agents, progress))
     if "contamination" not in skip:
-        parts["contamination"] = contamination.contamination_section(cells, agents, progress)
+        section = contamination.contamination_section(cells, agents, progress)
+        parts["contamination"] = _unless_empty(section)
     return parts
+
+
+def _unless_empty(section: dict[str, Any]) -> dict[str, Any] | None:
+    """A section, or None if it has nothing to show or to say."""
+    return section if section["pictures"] or section["notes"] else None
 
 
 def _finals(runs: Runs) -> Finals:

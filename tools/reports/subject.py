@@ -20,21 +20,27 @@ MEANS = {"full": "mean of the MDPs", "partial": "mean of the POMDPs", "": "mean 
 """Rows over all games, by twin."""
 
 
-def subject_section(folder: StudyFolder, runs: Runs, subject: str, metric: str) -> dict[str, Any]:
+def subject_section(
+    folder: StudyFolder, runs: Runs, subject: str, metric: str, rival: str
+) -> dict[str, Any]:
     """Sentences and tables on one agent against each of the others; the differences are written as
-    CSV too.
+    CSV too. The sentences on Gap and Bias compare it with ``rival`` already.
     """
     table = pairs(runs.scores(metric), subject)
     write_csv(folder.analysis / f"differences_{metric}.csv", pair_rows(table, subject))
     others = list(dict.fromkeys(pair.other for pair in table))
     rows: dict[tuple[str, str], dict[str, Any]] = {}
+    has_one_game = len({pair.game for pair in table if pair.game}) == 1
     for pair in table:
+        if has_one_game and not pair.game and pair.twin:
+            continue  # the mean of one
         name = f"{pair.game} {TWIN_NAMES[pair.twin]}" if pair.game else MEANS[pair.twin]
         row = {"name": name, "is_mean": not pair.game, "mine": pair.subject_return, "pairs": {}}
         rows.setdefault((pair.game, pair.twin), row)["pairs"][pair.other] = pair
     sentences = list[str]()
     for other in others:
-        sentences.append(subject_sentence(table, subject, other))
+        if other != rival:
+            sentences.append(subject_sentence(table, subject, other))
     cost_rows, trouble = costs(runs)
     return {
         "name": subject,
@@ -67,6 +73,8 @@ def _verdict(pair: Pair, tasks: int, subject: str) -> str:
     difference = pair.difference
     if not difference.exists:
         return f"{fact}, with a single seed, which says nothing about others"
+    if difference.low == difference.high == 0:
+        return f"{fact}, with no difference in any seed"
     ends = f"{difference.value:+.2f} [{difference.low:+.2f}, {difference.high:+.2f}]"
     if not difference.excludes_zero:
         return f"{fact}: {ends} contains zero, so {pair.seeds} seeds do not settle it"
