@@ -52,6 +52,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "study.StudyCommand",
         "run a grid of trainings from one TOML file, resumable run by run",
     ),
+    "compare": (
+        "compare.Compare",
+        "a memory model of yours against others: a small study of some minutes, and its report",
+    ),
     "report": ("study.Report", "write the HTML page of a study"),
     **{
         f"analyze {name}": ("figure.Figure", entry.summary)
