@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueModule
 
 from arcade_torch.agents.config import TrainConfig, require
+from arcade_torch.agents.forward import evaluating, last_outputs
 from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.checkpoint import find_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
@@ -25,6 +26,7 @@ from arcade_torch.models.actor_critic import (
     make_actor_critic,
 )
 from arcade_torch.models.encoders import Encoder
+from arcade_torch.models.flat_state import flatten_state
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network
 
@@ -159,6 +161,59 @@ class Agent(TensorDictModuleBase):
         if isinstance(self.network, ActorCriticNetwork):
             return self.network.select(out, quantity)
         return out.amax(-1, keepdim=True) if quantity == "value" else out
+
+    def forward_frames(
+        self,
+        frames: Tensor,
+        last_action: Tensor | None = None,
+        is_init: Tensor | None = None,
+        state: TensorDictBase | Tensor | None = None,
+        *,
+        target: str = "auto",
+    ) -> Tensor:
+        """Outputs of the last decision of sequences of frames, in evaluation mode, with gradients
+        to the frames: a forward function for Captum.
+
+        Args:
+            frames: uint8 or float 0..255, [N, T, S, S, 3].
+            last_action: int64 [N, T], the action that led to each frame; zeros by default.
+            is_init: bool [N, T], whether a frame opens an episode; all false by default.
+            state: recurrent state before the first frame, TensorDict [N], or float [N, F] of
+                :meth:`flat_state`; the initial one by default.
+            target: one of :attr:`offers`; "auto": Q-values or, for a policy, probabilities.
+
+        Returns:
+            float [N, A], of the target "value" [N, 1].
+        """
+        if target == "auto":
+            target = "q" if "q" in self.offers else "probs"
+        with evaluating(self):
+            out = last_outputs(self.network, frames, last_action, is_init, state)
+        return self.outputs(out, target)
+
+    def forward_step(
+        self,
+        frame: Tensor,
+        state: TensorDictBase | Tensor,
+        last_action: Tensor | None = None,
+        is_init: Tensor | None = None,
+        *,
+        target: str = "auto",
+    ) -> Tensor:
+        """Outputs of one decision from a frame [N, S, S, 3] and the recurrent state before it,
+        [N, A].
+
+        With the state as one tensor (:meth:`flat_state`) a library can attribute the decision to
+        frame and state alike. All else is as for :meth:`forward_frames`, [N] in place of [N, T].
+        """
+        actions = None if last_action is None else last_action.reshape(-1, 1)
+        flags = None if is_init is None else is_init.reshape(-1, 1)
+        return self.forward_frames(frame.unsqueeze(1), actions, flags, state, target=target)
+
+    @staticmethod
+    def flat_state(state: TensorDictBase) -> Tensor:
+        """A recurrent state [N] as one tensor, float32 [N, F]; a complex number is two of them."""
+        return flatten_state(state)
 
 
 def build_network(config: TrainConfig) -> Network:

@@ -16,9 +16,10 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from arcade_torch.models.flat_state import flatten_state, unflatten_state
 from arcade_torch.models.registry import make_memory
 
 try:
@@ -73,35 +74,15 @@ class FlatMemory(nn.Module):
         y, state = self.memory(x, self.unflatten(flat), first)
         return y, self.flatten(state)
 
-    def flatten(self, state: TensorDict) -> Tensor:
+    def flatten(self, state: TensorDictBase) -> Tensor:
         """A state [B] as float [B, F]."""
-        rows = len(state)
-        parts = [torch.ones(rows, 1, device=state.device)]
-        for _, leaf in _leaves(state):
-            numbers = torch.view_as_real(leaf) if leaf.is_complex() else leaf
-            parts.append(numbers.reshape(rows, -1).to(parts[0].dtype))
-        device = parts[-1].device
-        return torch.cat([part.to(device) for part in parts], dim=1)
+        numbers = flatten_state(state)
+        return torch.cat([numbers.new_ones(len(state), 1), numbers], dim=1)
 
-    def unflatten(self, flat: Tensor) -> TensorDict:
+    def unflatten(self, flat: Tensor) -> TensorDictBase:
         """The inverse of :meth:`flatten`."""
-        state: TensorDict = self.memory.initial_state(len(flat))  # type: ignore[operator]
-        place = 1
-        for key, leaf in _leaves(state):
-            size = leaf[0].numel() * (2 if leaf.is_complex() else 1)
-            numbers = flat[:, place : place + size]
-            place += size
-            if leaf.is_complex():
-                pairs = numbers.reshape(*leaf.shape, 2).to(leaf.real.dtype).contiguous()
-                state.set(key, torch.view_as_complex(pairs))
-            else:
-                state.set(key, numbers.reshape(leaf.shape).to(leaf.dtype))
-        return state
-
-
-def _leaves(state: TensorDict) -> list[tuple[Any, Tensor]]:
-    """The tensors of a state by key, in an order that does not depend on how it was made."""
-    return sorted(state.items(True, True), key=lambda item: str(item[0]))
+        example = self.memory.initial_state(len(flat))  # type: ignore[operator]
+        return unflatten_state(flat[:, 1:], example)
 
 
 class MemoryPolicy(RecurrentActorCriticPolicy):

@@ -13,10 +13,15 @@ _PUBLIC = {
     "as_policy": "measures.policy",
     "Study": "studies.grid",
     "contamination": "measures.contamination.measure",
+    "contamination_example": "measures.contamination.measure",
+    "contamination_example_figure": "measures.contamination.figure",
+    "contamination_figure": "measures.contamination.figure",
     "counterfactual": "measures.counterfactual.measure",
+    "counterfactual_figure": "measures.counterfactual.figure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
     "recall_density": "measures.recall_density.measure",
+    "recall_density_figure": "measures.recall_density.figure",
     "report": "reports",
     "saliency": "measures.saliency.measure",
     "saliency_figure": "measures.saliency.figure",
@@ -24,10 +29,19 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
-    from arcade_torch.tools.measures.contamination.measure import contamination
+    from arcade_torch.tools.measures.contamination.figure import (
+        contamination_example_figure,
+        contamination_figure,
+    )
+    from arcade_torch.tools.measures.contamination.measure import (
+        contamination,
+        contamination_example,
+    )
+    from arcade_torch.tools.measures.counterfactual.figure import counterfactual_figure
     from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
     from arcade_torch.tools.measures.policy import Policy, as_policy
+    from arcade_torch.tools.measures.recall_density.figure import recall_density_figure
     from arcade_torch.tools.measures.recall_density.measure import recall_density
     from arcade_torch.tools.measures.saliency.figure import saliency_figure
     from arcade_torch.tools.measures.saliency.measure import saliency
@@ -37,8 +51,10 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "counterfactual", "gap_and_bias",
-    "greedy_window", "recall_density", "report", "saliency", "saliency_figure", "study",
+    "Policy", "Study", "as_policy", "contamination", "contamination_example",
+    "contamination_example_figure", "contamination_figure", "counterfactual",
+    "counterfactual_figure", "gap_and_bias", "greedy_window", "recall_density",
+    "recall_density_figure", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 

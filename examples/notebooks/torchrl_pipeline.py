@@ -23,7 +23,7 @@ from torchrl.objectives.value import GAE
 
 import arcade_torch
 from arcade_torch.models import MemoryModule, SmallEncoder, make_memory
-from arcade_torch.tools import Policy, recall_density
+from arcade_torch.tools import recall_density
 
 FRAMES = 40_000  # of training
 torch.manual_seed(0)
@@ -98,22 +98,12 @@ print(
 # %% [markdown]
 # PPO samples its actions, so the returns here include exploration.
 #
-# The analyses ask for two functions: `encode` looks at single frames, `remember` is everything
-# behind it. `read` says what the outputs mean; here they are logits, and recall density
-# differentiates the probabilities.
+# The analyses take the policy as it is. Its outputs are logits, and recall density differentiates
+# the probabilities.
 
 # %%
-lens = Policy(
-    encode=encoder,
-    remember=lambda features, last_action, is_init, state: (
-        head((out := memory(features, state, is_init))[0]),
-        out[1],
-    ),
-    initial_state=memory.initial_state,
-    offers=("logits", "probs"),
-)
 density = recall_density(
-    lens, arcade_torch.make("SignpostEasy", num_envs=16, observability="partial"), episodes=64
+    policy, arcade_torch.make("SignpostEasy", num_envs=16, observability="partial"), episodes=64
 )
 figure, axes = plt.subplots(1, 2, figsize=(8, 2.8), layout="constrained")
 axes[0].plot([1280 * (i + 1) for i in range(len(returns))], returns)

@@ -31,6 +31,7 @@ from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from arcade_torch.agents.forward import evaluating, state_of
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.tools.measures.keys import Channels, Keys, Names
@@ -129,7 +130,8 @@ class Policy:
             last_action: int64 [N, T], or one-hot [N, T, A], the action that led to each frame;
                 zeros by default.
             is_init: bool [N, T], whether a frame opens an episode; all false by default.
-            state: recurrent state before step 0, batch [N]; the initial one by default.
+            state: recurrent state before step 0, batch [N], or as one tensor of floats [N, F]
+                (`flatten_state`); the initial one by default.
             target: the outputs that are wanted, see `resolve`.
 
         Returns:
@@ -140,8 +142,7 @@ class Policy:
             last_action = self.no_actions(batch, features.device)
         if is_init is None:
             is_init = torch.zeros(batch, dtype=torch.bool, device=features.device)
-        if state is None:
-            state = self.initial_state(batch[0])
+        state = state_of(state, self.initial_state, batch[0])
         name = resolve(self, target)
         with self.evaluating():
             out, state = self.remember(features, last_action, is_init.bool(), state)
@@ -180,6 +181,22 @@ class Policy:
             )
         return torch.zeros(batch, dtype=torch.int64, device=device)
 
+    def forward_step(
+        self,
+        frame: Tensor,
+        state: Any,
+        last_action: Tensor | None = None,
+        is_init: Tensor | None = None,
+        *,
+        target: str = "auto",
+    ) -> Tensor:
+        """Outputs of one decision, [N, A], from a frame [N, ...] and the recurrent state before it;
+        as one tensor (`flatten_state`) the state can be attributed to as well.
+        """
+        actions = None if last_action is None else last_action.unsqueeze(1)
+        flags = None if is_init is None else is_init.reshape(-1, 1)
+        return self.forward_frames(frame.unsqueeze(1), actions, flags, state, target=target)
+
     @torch.no_grad()
     def check_floats(self, frames: Tensor, last_action: Tensor) -> None:
         """Refuse a TensorDict policy that takes floats for other frames than whole numbers of the
@@ -203,14 +220,8 @@ class Policy:
     @contextmanager
     def evaluating(self) -> Iterator[None]:
         """Evaluation mode for a while; the modes before come back."""
-        module = nn.Identity() if self.module is None else self.module
-        modes = {part: part.training for part in module.modules()}
-        module.eval()
-        try:
+        with evaluating(nn.Identity() if self.module is None else self.module):
             yield
-        finally:
-            for part, training in modes.items():
-                part.training = training
 
 
 def as_policy(model: Any, **names: Unpack[Names]) -> Policy:

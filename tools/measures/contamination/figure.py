@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.bootstrap import Pooled, pooled
@@ -136,56 +137,96 @@ def _picture(
 
 
 def _example(label: Label, example: measure.Example) -> tuple[Any, str, list[dict[str, Any]]]:
-    """Rows: an episode as it was, and disturbed; columns: some of its frames, and bars of the
-    outputs on its last.
-    """
-    n = example.frames.shape[1] - 1
-    shuffle = example.hits[1] < 0
-    names = ["clean"]
-    for hit in example.hits[1:]:
-        names.append("shuffled" if shuffle else f"noise on frame {hit}")
-    columns = 6 if shuffle else 3
-    size = (1.6 * (columns + 1.7), 1.7 * len(names) + 0.8)
-    widths = [1.0] * columns + [1.7]
-    figure, axes = style.panels(len(names), columns + 1, size, sharey="col", width_ratios=widths)
+    """The figure of an example, what stands below it, and its numbers."""
     agent, game, twin = label.task
+    title = f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}"
+    figure = contamination_example_figure(example, title=title, figure=style.new_figure())
+    names = _row_names(example)
     numbers = list[dict[str, Any]]()
-    for row, (*pictures, bars) in enumerate(axes):
-        hit = example.hits[row]
-        if shuffle:
-            early = range(measure.FIRST + 1, measure.FIRST + 4)
-            late = range(n - 2, n + 1)
-            steps = [*early, *late]
-        else:
-            steps = [0, max(hit, example.hits[1]), n]
-        for axis, t in zip(pictures, steps, strict=True):
-            axis.imshow(example.frames[row, t], interpolation="nearest")
-            axis.set(xticks=[], yticks=[], frame_on=False)
-            axis.set_title(f"$o_{{{example.order[row, t]}}}$", parse_math=True)
-        pictures[0].set_ylabel(names[row], fontsize="small")
-        _plot_outputs(example, row, bars)
+    for row, hit in enumerate(example.hits):
         numbers += style.rows_of(
             agent=agent,
             game=game,
             observability=twin,
             row=names[row],
             hit=None if hit < 0 else hit,
-            action=ACTION_NAMES,
+            action=_action_names(example),
             value=example.values[row],
         )
-    outputs = "probabilities" if example.target == "probs" else f"centred {example.target}"
-    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
-    title = f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}"
-    figure.suptitle(title, x=0.01, ha="left")
+    shuffle = example.hits[1] < 0
     noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {example.sigma:g}"
     note = f"n = 1 episode, {noise}; blue: best action when clean, red: best if another"
     return figure, note, numbers
 
 
-def _plot_outputs(example: measure.Example, row: int, axis: Any) -> None:
+def contamination_example_figure(
+    example: measure.Example,
+    *,
+    title: str = "",
+    actions: Sequence[str] | None = None,
+    figure: Any = None,
+) -> Any:
+    """Draw what `contamination_example` gave: rows are an episode as it was, and disturbed; columns
+    some of its frames, and bars of the outputs on its last, blue the best action when clean, red
+    the best if it is another.
+
+    Args:
+        example: of `contamination_example`.
+        title: stands above it.
+        actions: names of the actions; by default those of our games, or numbers.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
+
+    Returns:
+        A matplotlib figure.
+    """
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    n = example.frames.shape[1] - 1
+    shuffle = example.hits[1] < 0
+    names = _row_names(example)
+    columns = 6 if shuffle else 3
+    figure.set_size_inches(1.6 * (columns + 1.7), 1.7 * len(names) + 0.8)
+    figure.set_layout_engine("constrained")
+    widths = [1.0] * columns + [1.7]
+    axes = figure.subplots(
+        len(names), columns + 1, squeeze=False, sharey="col", width_ratios=widths
+    )
+    for row, (*pictures, bars) in enumerate(axes):
+        if shuffle:
+            early = range(measure.FIRST + 1, measure.FIRST + 4)
+            late = range(n - 2, n + 1)
+            steps = [*early, *late]
+        else:
+            steps = [0, max(example.hits[row], example.hits[1]), n]
+        for axis, t in zip(pictures, steps, strict=True):
+            axis.imshow(example.frames[row, t], interpolation="nearest")
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            axis.set_title(f"$o_{{{example.order[row, t]}}}$", parse_math=True)
+        pictures[0].set_ylabel(names[row], fontsize="small")
+        _plot_outputs(example, row, bars, _action_names(example) if actions is None else actions)
+    outputs = "probabilities" if example.target == "probs" else f"centred {example.target}"
+    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
+    figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def _row_names(example: measure.Example) -> list[str]:
+    """How the rows of an example are called."""
+    shuffle = example.hits[1] < 0
+    noisy = ["shuffled" if shuffle else f"noise on frame {hit}" for hit in example.hits[1:]]
+    return ["clean", *noisy]
+
+
+def _action_names(example: measure.Example) -> list[str]:
+    """The names of our games' actions where there are as many, or else numbers."""
+    count = example.values.shape[1]
+    names = list(ACTION_NAMES)
+    return names if count == len(names) else [str(action) for action in range(count)]
+
+
+def _plot_outputs(example: measure.Example, row: int, axis: Any, actions: Sequence[str]) -> None:
     """Draw the outputs of a row as bars, that of the best action in colour."""
     best = example.values.argmax(1)
-    axis.bar(ACTION_NAMES, example.values[row], color=REST)
+    axis.bar(actions, example.values[row], color=REST)
     axis.patches[best[row]].set_facecolor(OTHER_BEST)
     axis.patches[best[0]].set_facecolor(CLEAN_BEST)
     axis.axhline(0.0, color=style.NEUTRAL, lw=0.8)
@@ -241,6 +282,45 @@ def _figure(
         top.set_title("" if options.shuffle else f"noise sigma = {sigma:g}")
         bottom.set_xlabel(f"steps from the {start}")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
+    return figure
+
+
+def contamination_figure(
+    changes: Mapping[str, measure.Contamination | Sequence[measure.Contamination]],
+    *,
+    name: str = "flip",
+    figure: Any = None,
+) -> Any:
+    """Draw what noise changes by delay, a line a name, a panel a strength; dashed is an agent
+    without memory.
+
+    Args:
+        changes: by name what `contamination` gave, or that of several seeds, which get bars; all
+            with the same strengths and delays.
+        name: which of `MEASURES`.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
+
+    Returns:
+        A matplotlib figure.
+    """
+    seeds = dict[tuple[str, str, str], list[measure.Contamination]]()
+    for agent, given in changes.items():
+        seeds[agent, "", ""] = [given] if isinstance(given, measure.Contamination) else list(given)
+    agents = {task[0]: measures for task, measures in pool(seeds).items()}
+    first = next(iter(seeds.values()))[0]
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    figure.set_size_inches(max(5.4, 3.2 * len(first.sigmas)), 3.2)
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(1, len(first.sigmas), squeeze=False, sharey="row")[0]
+    delays = first.delays[: reached(agents.values())].tolist()
+    for column, axis in enumerate(axes):
+        plot(agents, axis, name, column, delays)
+        sigma = first.sigmas[column]
+        axis.set_title("shuffled" if np.isnan(sigma) else f"noise sigma = {sigma:g}")
+        axis.set_xlabel("steps to the decision")
+    axes[0].set_ylabel(MEASURES[name])
+    from_zero(axes[0])
+    axes[0].legend(fontsize="small")
     return figure
 
 

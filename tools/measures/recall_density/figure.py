@@ -249,6 +249,43 @@ def plot(
     axis.set(xlim=(0, 1), ylim=(0, 1.05))
 
 
+def recall_density_figure(
+    densities: Mapping[str, measure.RecallDensity | Sequence[measure.RecallDensity]],
+    *,
+    bins: int = BINS,
+    figure: Any = None,
+) -> Any:
+    """Draw recall densities over the time of their trajectories, a line a name, with the reference
+    lines of uniform memory and of none.
+
+    Args:
+        densities: by name what `recall_density` gave, or that of several seeds, which get a band.
+        bins: equal parts of a trajectory.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
+
+    Returns:
+        A matplotlib figure.
+    """
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    figure.set_size_inches(5.4, 3.2)
+    figure.set_layout_engine("constrained")
+    axis = figure.subplots()
+    colours = style.agent_colours(list(densities))
+    series = {}
+    lengths = list[int]()
+    for name, seeds in densities.items():
+        seeds = [seeds] if isinstance(seeds, measure.RecallDensity) else seeds
+        mass = pooled([density.mass(bins) for density in seeds])
+        series[style.legend_name(name)] = (mass, colours[name])
+        for density in seeds:
+            lengths += density.lengths.tolist()
+    plot(series, axis, bins, lengths)
+    axis.set_xlabel("time in the trajectory (1: the decision)")
+    axis.set_ylabel(f"share of the gradient in 1/{bins}")
+    axis.legend(fontsize="small")
+    return figure
+
+
 def _range(counts: Sequence[int]) -> str:
     return str(min(counts)) if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
 

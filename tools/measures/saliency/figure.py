@@ -14,6 +14,7 @@ from arcade_torch.tools.figures import Made, Picture, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, new_figure, panels, png, rows_of
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.checkpoints import checkpoints_of, measure_run, measure_runs
+from arcade_torch.tools.measures.frames import pictures
 from arcade_torch.tools.measures.saliency import SaliencyOptions
 from arcade_torch.tools.measures.saliency.measure import EpisodeSaliency, episode_saliency
 from arcade_torch.tools.measures.section import Cells
@@ -33,8 +34,8 @@ VANISHING = 1e-10
 128 pixels move by 1 (of 255), then, to first order, no output moves by more than 0.003.
 """
 
-# title, frames [T, H, W, 3], maps [T, H, W] up to step n
-Row = tuple[str, NDArray[np.uint8], NDArray[np.float32]]
+# title, frames [T, *frame] of any kind, maps [T, H, W] up to step n
+Row = tuple[str, Any, NDArray[np.float32]]
 
 
 def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
@@ -79,13 +80,16 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
     return Made([picture], notes, [table])
 
 
-def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -> Any:
+def saliency_figure(
+    rows: Sequence[Row], *, show: int = 8, white: float | None = None, figure: Any = None
+) -> Any:
     """Draw frames with their saliency maps, a row a trajectory; each has a scale of its own, whose
     top it names.
 
     Args:
-        rows: one ``(title, frames, maps)`` each, see `Row`.
+        rows: one ``(title, frames, maps)`` each, see `Row`; frames as `saliency` takes them.
         show: how many of the last frames are drawn.
+        white: the value of a white pixel, 255 for whole numbers and 1 for floats by default.
         figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default, which
             notebooks show.
 
@@ -99,7 +103,8 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -
     figure.set_layout_engine("constrained")
     parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
-        peak = plot(frames, maps, part.subplots(1, columns, squeeze=False)[0])
+        axes = part.subplots(1, columns, squeeze=False)[0]
+        peak = plot(frames, maps, axes, white=white)
         part.suptitle(
             f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False
         )
@@ -107,11 +112,12 @@ def saliency_figure(rows: Sequence[Row], *, show: int = 8, figure: Any = None) -
 
 
 def plot(
-    frames: NDArray[np.uint8],
+    frames: Any,
     maps: NDArray[np.floating],
     axes: Sequence[Any],
     sigma_px: float | None = None,
     below: NDArray[np.float64] | None = None,
+    white: float | None = None,
 ) -> float:
     """Draw the last frames of a trajectory, heat over each, on one scale; returns the value that is
     brightest.
@@ -119,6 +125,9 @@ def plot(
     The heat is the square root of the smoothed map: that makes a frame visible that has a hundredth
     of the brightest.
     """
+    has_channels_last = np.ndim(frames) == 4 and frames.shape[1:3] == maps.shape[1:3]
+    frames = pictures(frames, "last" if has_channels_last else "first", white)
+    maps = np.reshape(maps, frames.shape[:3])
     sigma = SIGMA_PX * frames.shape[1] / 128 if sigma_px is None else sigma_px
     blur = need("scipy.ndimage").gaussian_filter
     soft = np.asarray(maps)
