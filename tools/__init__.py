@@ -17,6 +17,7 @@ _PUBLIC = {
     "contamination_example_figure": "measures.contamination.figure",
     "contamination_figure": "measures.contamination.figure",
     "counterfactual": "measures.counterfactual.measure",
+    "counterfactual_figure": "measures.counterfactual.figure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
     "recall_density": "measures.recall_density.measure",
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
         contamination,
         contamination_example,
     )
+    from arcade_torch.tools.measures.counterfactual.figure import counterfactual_figure
     from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
     from arcade_torch.tools.measures.policy import Policy, as_policy
@@ -50,9 +52,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Policy", "Study", "as_policy", "contamination", "contamination_example",
-    "contamination_example_figure", "contamination_figure", "counterfactual", "gap_and_bias",
-    "greedy_window", "recall_density", "recall_density_figure", "report", "saliency",
-    "saliency_figure", "study",
+    "contamination_example_figure", "contamination_figure", "counterfactual",
+    "counterfactual_figure", "gap_and_bias", "greedy_window", "recall_density",
+    "recall_density_figure", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from arcade_torch.tools.measures.counterfactual.measure import (
     counterfactual_of_windows,
 )
 from arcade_torch.tools.measures.windows import Window, greedy_windows
+from tests.tools.measures.test_any_env import LENGTH, NAMES, Foreign, policy_of
 from tests.tools.measures.toys import Net, ToyEnv, linear_policy, window
 
 LENGTHS = (5, 6, 6, 7, 8, 8)
@@ -421,6 +422,18 @@ def test_a_policy_of_torchrls_parts_is_measured_as_it_acts() -> None:
                 changed += act(torch.cat([donor.frames[: w.n], w.frames[-1:]])) != clean
         assert np.nansum(found.memory_flip[index]) == changed
     assert found.profile()[1] > 0 and found.memory_reliance().value > 0
+
+
+@pytest.mark.parametrize("kind", ["uint8, HWC", "floats, CHW"])
+@pytest.mark.parametrize("memory", [False, True])
+def test_other_envs_have_other_names_and_one_hot_actions(kind: str, memory: bool) -> None:
+    policy = policy_of(kind, True, memory)
+    found = counterfactual(policy, Foreign(kind, (4,), True), episodes=4, **NAMES)
+    assert found.clean_error < 1e-5 and found.lengths.tolist() == [LENGTH] * 4
+    later = found.by_lag("distance")[:, 1:]
+    assert found.profile("distance")[0] > 0 and (later.min() > 0) == memory
+    # without a memory the action before, which stays as it was, is all that is left of the past
+    assert memory or (later.max() == 0 and not found.by_state("distance").any())
 
 
 def test_bad_input_is_refused() -> None:

@@ -563,6 +563,10 @@ def test_profiles_pool_seeds_of_different_lengths_and_a_single_one_over_its_epis
     assert of_state.get_xdata().tolist() == [3.5]
     assert of_state.get_ydata().tolist() == pytest.approx([0.6])
     assert axis.get_xticklabels()[-1].get_text() == "state"
+    figure = counterfactual.counterfactual_figure({"lru": seeds, "one": seeds[0]})
+    everybody, differ = [axis.lines[0].get_ydata().tolist() for axis in figure.axes]
+    assert everybody == pytest.approx([0.15, 0.2, 0.3])
+    assert differ == pytest.approx([0.3, 0.4, 0.6])
 
 
 def test_the_row_of_a_report_names_the_frame_that_matters_most_and_saturated_policies() -> None:

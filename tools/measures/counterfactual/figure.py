@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.bootstrap import Array, Interval, Pooled, pooled
@@ -217,6 +218,42 @@ def plot(
         axis.set_ylim(-0.03, 1.05)
     else:
         axis.set_ylim(bottom=0)
+
+
+def counterfactual_figure(
+    effects: Mapping[str, measure.Counterfactual | Sequence[measure.Counterfactual]],
+    *,
+    effect: measure.Effect = "flip",
+    figure: Any = None,
+) -> Any:
+    """Draw one effect by lag and of the state, a line a name, over all donors and over those that
+    differ.
+
+    Args:
+        effects: by name what `counterfactual` gave, or that of several seeds; bars are over seeds,
+            or over the episodes of a single one.
+        effect: ``flip``, ``distance`` or ``change``.
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
+
+    Returns:
+        A matplotlib figure.
+    """
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    figure.set_size_inches(8.0, 3.2)
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(1, len(DONORS), sharey=True)
+    colours = style.agent_colours(list(effects))
+    for axis, (differing, title) in zip(axes, DONORS.items(), strict=True):
+        profiles = dict[str, Profiles]()
+        for name, given in effects.items():
+            seeds = [given] if isinstance(given, measure.Counterfactual) else given
+            profiles[name] = profiles_of(seeds, differing)
+        plot(profiles, axis, effect, colours)
+        axis.set_title(title)
+        axis.set_xlabel("steps back from the decision")
+    axes[0].set_ylabel(EFFECTS[effect])
+    axes[0].legend(fontsize="small")
+    return figure
 
 
 class OfCell(NamedTuple):

@@ -162,7 +162,7 @@ def counterfactual(
         ValueError: an option is out of range, this agent does not offer ``target``, or no two
             episodes have a step in common.
     """
-    player, env = resolve_agent(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability, **names)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     tell = None if progress is None else lambda count: progress(count, episodes)
     return counterfactual_of_windows(
@@ -174,7 +174,6 @@ def counterfactual(
         seed=seed,
         target=target,
         progress=tell,
-        **names,
     )
 
 
@@ -226,6 +225,7 @@ class Track:
     @classmethod
     def of(cls, policy: Policy, window: Window) -> "Track":
         """Encode a window."""
+        policy.check_floats(window.frames, window.last_action)
         return cls(
             features=policy.features(window.frames),
             frame_ids=_frame_ids(window.frames),
