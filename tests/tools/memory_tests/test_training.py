@@ -1,12 +1,13 @@
 """The tests of memory separate what theory separates; results are kept, drawn and written down."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
-from arcade_torch.models import MemoryBlock
+from arcade_torch.models import MemoryBlock, make_memory
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.memory_tests import TESTS, table
 from arcade_torch.tools.bench.memory_tests.batch import MemoryTest
@@ -56,6 +57,14 @@ def test_a_gru_tracks_parity_beyond_what_it_learned_and_a_mingru_does_not() -> N
     setting = Setting(hidden_size=32, steps=400)
     assert train("gru", TESTS["parity"], 0, setting).accuracy[64][0] > 0.95
     assert train("mingru", TESTS["parity"], 0, setting).accuracy[64][0] < 0.55
+
+
+def test_a_delta_rule_tracks_parity_if_its_factors_may_be_negative_and_not_otherwise() -> None:
+    """arXiv 2411.12537: 1 - beta has to reach below zero; beta goes to 2 by default."""
+    setting = Setting(hidden_size=32, steps=400)
+    positive = partial(make_memory, "gdn", beta_range=1.0)
+    assert train("gdn", TESTS["parity"], 0, setting).accuracy[64][0] > 0.9
+    assert train(positive, TESTS["parity"], 0, setting).accuracy[64][0] < 0.55
 
 
 def test_equal_seeds_give_equal_results_and_training_ends_when_it_is_solved() -> None:

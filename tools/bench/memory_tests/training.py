@@ -1,6 +1,7 @@
 """Training of one memory model in one test, and its share of right answers at each size."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ MOST_STEPS = SEEDS_OF_LOOKS
 MOST_SEED = 2**32
 SEEDS_A_SIZE = 2**9
 ROWS_AT_ONCE = 128
+
+Memory = str | Callable[..., nn.Module]
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Trained(NamedTuple):
 class Reader(nn.Module):
     """Inputs to logits: memory block of one cell, linear."""
 
-    def __init__(self, memory: str, hidden_size: int, test: MemoryTest) -> None:
+    def __init__(self, memory: Memory, hidden_size: int, test: MemoryTest) -> None:
         super().__init__()
         self.block = MemoryBlock(test.inputs, hidden_size, memory, layers=1)
         self.head = nn.Linear(hidden_size, test.answers)
@@ -74,11 +77,11 @@ class Reader(nn.Module):
         return self.head(y[batch.mask])  # type: ignore[no-any-return]
 
 
-def train(memory: str, test: MemoryTest, seed: int, setting: Setting = Setting()) -> Trained:
+def train(memory: Memory, test: MemoryTest, seed: int, setting: Setting = Setting()) -> Trained:
     """Train one model until it is right or its steps are spent, then ask it at every size.
 
     Args:
-        memory: name of a memory model.
+        memory: name of a memory model, or a factory ``(input_size, hidden_size) -> nn.Module``.
         test: what it learns.
         seed: of weights and data, from 0 up; equal seeds give equal results on one machine.
         setting: the same for all.
