@@ -46,6 +46,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "list.List",
         "games, memory models, what scripted players earn, and pictures of the games",
     ),
+    "new memory": ("new.NewMemory", "a file with a memory model to change, that works as it is"),
     "train": ("train.Train", "train one agent into a run folder"),
     "evaluate": ("train.Evaluate", "greedy returns of a trained agent"),
     "study": (

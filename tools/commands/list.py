@@ -81,7 +81,12 @@ class List(Command):
         if self.steps and len(ids) != 1:
             raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
         ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
-        picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
+        with Bars(first_line_s=0.0) as bars:
+
+            def show(id: str, done: int) -> None:
+                bars.update("sheet", done, len(ids), id)
+
+            picture = strip(ids[0], self.steps) if self.steps else sheet(ids, progress=show)
         say(write_png(self.out or Path("games.png"), picture).resolve())
 
     def _envs(self) -> None:
