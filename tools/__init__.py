@@ -12,6 +12,7 @@ _PUBLIC = {
     "Policy": "measures.policy",
     "as_policy": "measures.policy",
     "Study": "studies.grid",
+    "beliefs": "measures.beliefs.measure",
     "contamination": "measures.contamination.measure",
     "counterfactual": "measures.counterfactual.measure",
     "gap_and_bias": "measures.gap_bias.measure",
@@ -24,6 +25,7 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.measures.beliefs.measure import beliefs
     from arcade_torch.tools.measures.contamination.measure import contamination
     from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
@@ -37,8 +39,9 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "counterfactual", "gap_and_bias",
-    "greedy_window", "recall_density", "report", "saliency", "saliency_figure", "study",
+    "Policy", "Study", "as_policy", "beliefs", "contamination", "counterfactual",
+    "gap_and_bias", "greedy_window", "recall_density", "report", "saliency", "saliency_figure",
+    "study",
 ]  # fmt: skip
 
 
