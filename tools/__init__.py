@@ -12,6 +12,7 @@ _PUBLIC = {
     "Policy": "measures.policy",
     "as_policy": "measures.policy",
     "Study": "studies.grid",
+    "beliefs": "measures.beliefs.measure",
     "contamination": "measures.contamination.measure",
     "contamination_example": "measures.contamination.measure",
     "contamination_example_figure": "measures.contamination.figure",
@@ -29,6 +30,7 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.measures.beliefs.measure import beliefs
     from arcade_torch.tools.measures.contamination.figure import (
         contamination_example_figure,
         contamination_figure,
@@ -51,7 +53,7 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "contamination_example",
+    "Policy", "Study", "as_policy", "beliefs", "contamination", "contamination_example",
     "contamination_example_figure", "contamination_figure", "counterfactual",
     "counterfactual_figure", "gap_and_bias", "greedy_window", "recall_density",
     "recall_density_figure", "report", "saliency", "saliency_figure", "study",

@@ -49,3 +49,7 @@ class BattleShip(LevelGame[BattleShipState]):
     ) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
+
+    def facts(self, state: BattleShipState) -> dict[str, Array]:
+        """Which cells hold a ship and which are shot at, bool [side, side] each, indexed [x, y]."""
+        return {"ship": state.board == 1, "shot": state.guesses == 1}

@@ -47,3 +47,7 @@ class Signpost(LevelGame[SignpostState]):
     ) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level)
+
+    def facts(self, state: SignpostState) -> dict[str, Array]:
+        """The sign, the action that opens the gate."""
+        return {"sign": state.sign}
