@@ -113,7 +113,7 @@ class RunFolder:
         if self._config.exists():
             self._check_same(config)  # another process may have come first
             record = read_json(self._config)
-            if record.get("imports", []) == self.imports:
+            if not self.imports or record.get("imports") == self.imports:
                 return
             record["imports"] = self.imports  # the run goes on with these
         else:

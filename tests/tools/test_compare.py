@@ -109,6 +109,8 @@ def test_a_folder_with_another_comparison_is_refused(
         (["--memory", "nobody"], "unknown memory 'nobody'"),
         (["--memory", "yours", "--against", "yours"], "memories names something twice"),
         (["--memory", "yours", "--minutes", "0"], "--minutes must be at least 1"),
+        (["--memory", "yours", "--seeds", "0"], "--seeds must be at least 1"),
+        (["--memory", "yours", "--frames", "0"], "--frames must be at least 1"),
         (["--memory", "yours", "--games", "NoGame"], "unknown env id 'NoGame'"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.agents import TrainConfig, train
 from arcade_torch.models import memory_names, registry
 from arcade_torch.tools import cli, imports
 from arcade_torch.tools.options import VARIABLE
@@ -206,6 +207,10 @@ def test_a_run_that_goes_on_with_another_text_remembers_that(folder: Path) -> No
     finally:
         (folder / "eval.json").unlink()
     before = json.loads((folder / "run/config.json").read_text())["imports"]
+    (folder / "run/eval.json").unlink()
+    config = TrainConfig.from_dict(json.loads((folder / "run/config.json").read_text())["config"])
+    train(config, folder / "run", resume=True)  # from Python, which says nothing of imports
+    assert json.loads((folder / "run/config.json").read_text())["imports"] == before
     (folder / "yours.py").write_text(SOURCE + "# another\n")
     (folder / "run/eval.json").unlink()
     with pytest.MonkeyPatch.context() as patch:

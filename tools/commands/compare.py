@@ -50,6 +50,9 @@ class Compare(Resumable):
         """Train, and write the report; exit code 1 if a run failed."""
         at_least(self, minutes=1, workers=0)
         at_most(self, minutes=A_WEEK)
+        for name in ("seeds", "frames"):
+            if getattr(self, name) is not None:
+                at_least(self, **{name: 1})
         engine = make_engine("auto", self.workers)
         memory = self.memory or _only_memory()
         out = self.out or Path("runs") / f"compare-{memory}"
