@@ -250,6 +250,7 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
         TypeError: ``model`` has none of these forms.
         ValueError: a TensorDict policy reads or writes entries that say nothing to a measure.
     """
+    model = getattr(model, "_orig_mod", model)  # of torch.compile
     network = getattr(model, "network", model)
     if isinstance(model, Policy):
         policy = model
@@ -311,18 +312,18 @@ def _of_module(module: TensorDictModuleBase, names: Names) -> Policy:
         network = replace(as_policy(wrapper.only_part), module=module)
         return _renamed(network, names)
     return Policy(
-        wrapper.encode,
-        wrapper.remember,
-        wrapper.initial_state,
-        wrapper.output.read,
-        wrapper.output.offers,
-        module,
-        wrapper.keys,
-        names.get("channels"),
-        names.get("white"),
-        wrapper.act,
-        wrapper.splits,
-        wrapper.reads_last_action,
+        encode=wrapper.encode,
+        remember=wrapper.remember,
+        initial_state=wrapper.initial_state,
+        read=wrapper.output.read,
+        offers=wrapper.output.offers,
+        module=module,
+        keys=wrapper.keys,
+        channels=names.get("channels"),
+        white=names.get("white"),
+        step=wrapper.act,
+        splits=wrapper.splits,
+        needs_last_action=wrapper.reads_last_action,
     )
 
 

@@ -102,7 +102,7 @@ class Flat(nn.Module):
         )
 
     def forward(self, frames: Tensor) -> Tensor:
-        return torch.tanh(self.linear((frames.float() / self.scale).flatten(-self.axes)))
+        return torch.tanh(3 * self.linear((frames.float() / self.scale - 0.5).flatten(-self.axes)))
 
 
 class Beside(nn.Module):
@@ -122,7 +122,7 @@ def policy_of(kind: str = "uint8, HWC", one_hot: bool = False, memory: bool = Tr
         parts.append(TensorDictModule(Beside(), ["features", "before"], ["features"]))
     if memory:
         parts.append(GRUModule(width, width, in_key="features", out_key="features"))
-    head = nn.Linear(width, ACTIONS)
+    head = nn.Linear(width, ACTIONS, bias=False)
     nn.init.normal_(head.weight)
     parts.append(TensorDictModule(head, ["features"], ["action_value"]))
     space = "one_hot" if one_hot else "categorical"
@@ -206,10 +206,25 @@ def test_without_memory_the_past_has_no_gradient_and_noise_on_it_changes_nothing
 
 def test_a_last_action_that_an_env_does_not_have_is_the_action_before() -> None:
     windows, _ = play(as_policy(policy_of(), **NAMES), Foreign(batch=(2,)), seed=1, keep=LENGTH)
+    assert any(len(window.action.unique()) > 1 and window.action.any() for window in windows)
     for window in windows:
         assert torch.equal(window.last_action[1:], window.action[:-1])
         assert window.last_action[0] == 0
         assert window.is_init.tolist() == [True] + [False] * (LENGTH - 1)
+
+
+def test_a_policy_plays_in_evaluation_mode_and_goes_back_to_training() -> None:
+    policy = policy_of()
+    torch.manual_seed(0)
+    dropped = TensorDictModule(nn.Dropout(0.9), ["features"], ["features"])
+    policy = TensorDictSequential(policy[0], dropped, *[policy[i] for i in range(1, len(policy))])
+    wrapped = as_policy(policy.train(), **NAMES)
+    (window,), _ = play(wrapped, Foreign(), seed=3, keep=LENGTH)
+    with wrapped.evaluating():
+        features = wrapped.features(window.frames)
+    outputs, _ = wrapped.unroll(features[None], None, window.is_init[None], window.state)
+    assert torch.equal(outputs[0].argmax(-1), window.action)
+    assert dropped.training and policy.training
 
 
 def test_gymnasiums_cartpole_alone_and_in_a_serial_env() -> None:

@@ -7,16 +7,25 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.modules import (
+    ActorValueOperator,
     EGreedyModule,
     GRUModule,
     LSTMModule,
     ProbabilisticActor,
+    QValueActor,
     QValueModule,
     ValueOperator,
+    set_recurrent_mode,
 )
 
 from arcade_torch.agents import Agent, make_policy, preset
@@ -339,6 +348,86 @@ def test_a_state_that_is_written_elsewhere_is_named_in_pairs() -> None:
         hidden = cell.module(parts[0].module(frame[None]), hidden)
     torch.testing.assert_close(outputs[:, -1], parts[2].module(hidden))
     torch.testing.assert_close(state["h"], hidden)
+
+
+def operators() -> dict[str, Callable[[TensorDictModuleBase, nn.Module], TensorDictModuleBase]]:
+    """TorchRL's ways to put a body and a head together."""
+    categorical = torch.distributions.Categorical
+
+    def logits(head: nn.Module) -> TensorDictModule:
+        return TensorDictModule(head, ["remembered"], ["logits"])
+
+    def actor(head: nn.Module) -> ProbabilisticActor:
+        return ProbabilisticActor(logits(head), in_keys=["logits"], distribution_class=categorical)
+
+    def critic() -> ValueOperator:
+        return ValueOperator(nn.Linear(WIDTH, 1), in_keys=["remembered"])
+
+    def values(head: nn.Module) -> QValueActor:
+        return QValueActor(head, in_keys=["remembered"], action_space="categorical")
+
+    return {
+        "QValueActor": lambda body, head: TensorDictSequential(body, values(head)),
+        "one-hot": lambda body, head: TensorDictSequential(
+            body, QValueActor(head, in_keys=["remembered"], action_space="one_hot")
+        ),
+        "ActorValueOperator": lambda body, head: ActorValueOperator(body, actor(head), critic()),
+        "its policy": lambda body, head: ActorValueOperator(
+            body, actor(head), critic()
+        ).get_policy_operator(),
+        "one sequence": lambda body, head: ProbabilisticTensorDictSequential(
+            body,
+            logits(head),
+            ProbabilisticTensorDictModule(["logits"], ["action"], distribution_class=categorical),
+        ),
+        "other names": lambda body, head: ProbabilisticTensorDictSequential(
+            body,
+            TensorDictModule(head, ["remembered"], ["scores"]),
+            ProbabilisticTensorDictModule(
+                {"logits": "scores"}, ["action"], distribution_class=categorical
+            ),
+        ),
+        "shares": lambda body, head: ProbabilisticTensorDictSequential(
+            body,
+            TensorDictModule(nn.Sequential(head, nn.Softmax(-1)), ["remembered"], ["probs"]),
+            ProbabilisticTensorDictModule(["probs"], ["action"], distribution_class=categorical),
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", operators())
+def test_torchrls_operators_are_read_alike(name: str) -> None:
+    torch.manual_seed(0)
+    body = TensorDictSequential(
+        TensorDictModule(Encoder(), ["pixels"], ["features"]), MEMORIES["GRUModule"]()
+    )
+    head = nn.Linear(WIDTH, ACTIONS)
+    nn.init.normal_(head.weight)
+    policy = as_policy(operators()[name](body, head))
+    pixels = frames(6)[None]
+    starts = torch.tensor([[True, False, False, True, False, False]])
+    actions, _ = act(policy, pixels, starts, policy.initial_state(1))
+    steps = TensorDict({"pixels": pixels, "is_init": starts[..., None]}, [1, 6])
+    with torch.no_grad(), set_recurrent_mode(True):
+        logits = head(body(steps)["remembered"])
+    target = "q" if "Q" in name or name == "one-hot" else "probs"
+    wanted = logits if target == "q" else logits.softmax(-1)
+    outputs, _ = policy.unroll(policy.features(pixels, batch_ndim=2), None, starts)
+    assert policy.splits and policy.offers[0] in (target, "logits")
+    torch.testing.assert_close(outputs, wanted, rtol=1e-5, atol=1e-6)
+    assert torch.equal(actions, logits.argmax(-1))
+    if target == "probs":
+        again, _ = policy.unroll(
+            policy.features(pixels, batch_ndim=2), None, starts, target="logits"
+        )
+        torch.testing.assert_close(again.softmax(-1), wanted, rtol=1e-5, atol=1e-6)
+
+
+def test_a_compiled_policy_is_the_policy() -> None:
+    network = module("GRUModule")
+    compiled = torch.compile(network, backend="eager")
+    plain, other = (saliency(model, frames(3)) for model in (network, compiled))
+    np.testing.assert_array_equal(plain.maps, other.maps)
 
 
 WRONG: dict[str, tuple[Any, dict[str, Any], type[Exception], str]] = {
