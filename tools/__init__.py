@@ -17,6 +17,7 @@ _PUBLIC = {
     "counterfactual": "measures.counterfactual.measure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
+    "patching": "measures.beliefs.patching",
     "recall_density": "measures.recall_density.measure",
     "report": "reports",
     "saliency": "measures.saliency.measure",
@@ -26,6 +27,7 @@ _PUBLIC = {
 
 if TYPE_CHECKING:
     from arcade_torch.tools.measures.beliefs.measure import beliefs
+    from arcade_torch.tools.measures.beliefs.patching import patching
     from arcade_torch.tools.measures.contamination.measure import contamination
     from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
@@ -40,8 +42,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Policy", "Study", "as_policy", "beliefs", "contamination", "counterfactual",
-    "gap_and_bias", "greedy_window", "recall_density", "report", "saliency", "saliency_figure",
-    "study",
+    "gap_and_bias", "greedy_window", "patching", "recall_density", "report", "saliency",
+    "saliency_figure", "study",
 ]  # fmt: skip
 
 
