@@ -10,6 +10,7 @@ import numpy as np
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.beliefs import BeliefsOptions, measure
+from arcade_torch.tools.measures.beliefs.patching import OUTCOMES, Patches, patching
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.options import at_least
@@ -38,7 +39,9 @@ def by_fact(options: BeliefsOptions, progress: Progress | None) -> Made:
     at_least(options, episodes=measure.MIN_EPISODES, max_steps=1, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.beliefs, vars(options), progress)
-    result = Made([], notes, [_table(measured, options.confidence)])
+    patched = measure_runs(paths, patching, vars(options), progress)
+    tables = [_table(measured, options.confidence), _patched_table(patched, options.confidence)]
+    result = Made([], notes, tables)
     result.notes += _notes(measured)
     for (game, twin), agents in style.agents_by_task(by_task(measured)).items():
         result.pictures.append(_picture(game, twin, agents, options))
@@ -74,6 +77,21 @@ def _table(measured: Sequence[tuple[Label, measure.Beliefs]], confidence: float)
         f"with {100 * confidence:g} % intervals over them"
     )
     return Table("hidden facts that can be read", head, rows, caption, left=2)
+
+
+def _patched_table(patched: Sequence[tuple[Label, Patches]], confidence: float) -> Table:
+    """Whose decision follows an exchanged state, one row a run."""
+    rows = list[tuple[Any, ...]]()
+    for label, patches in patched:
+        cells = [interval_text(patches.share(outcome, confidence)) for outcome in OUTCOMES]
+        rows.append((label, int(patches.differs.sum()), *cells))
+    caption = (
+        "decisions on the own frame with the recurrent state of another episode at the same step, "
+        "where that episode decides otherwise: shares that follow it, stay as they were, or are a "
+        f"third, with {100 * confidence:g} % intervals over episodes"
+    )
+    head = ("run", "exchanges", *OUTCOMES)
+    return Table("whose decision an exchanged state brings", head, rows, caption)
 
 
 def interval_text(interval: Interval) -> str:
@@ -190,14 +208,17 @@ def plot_steps(
     scores: Mapping[str, OfAgent], fact: str, axis: Any, colours: Mapping[str, str]
 ) -> None:
     """Draw the score of one fact over the steps: full lines of states, broken ones of frames."""
-    for agent, of_agent in scores.items():
+    for place, (agent, of_agent) in enumerate(scores.items()):
+        marker = style.MARKERS[place % len(style.MARKERS)]
         for source in measure.SOURCES:
             if (fact, source) not in of_agent:
                 continue
             of_fact = of_agent[fact, source]
-            steps = np.arange(len(of_fact.by_step))
+            # beside one another, so that equal lines are all seen
+            steps = np.arange(len(of_fact.by_step)) + 0.1 * (place - (len(scores) - 1) / 2)
             dashes = "-" if source == "state" else "--"
-            axis.plot(steps, of_fact.by_step, color=colours[agent], ls=dashes, marker=".", ms=4)
+            look = {"color": colours[agent], "marker": marker, "ms": 4, "lw": 1.2}
+            axis.plot(steps, of_fact.by_step, ls=dashes, **look)
             if source == "state":
                 ends = (of_fact.low, of_fact.high)
                 axis.fill_between(steps, *ends, color=colours[agent], alpha=0.15, lw=0)
