@@ -6,18 +6,25 @@ import numpy as np
 import pytest
 
 from arcade_torch.tools import cli
-from arcade_torch.tools.play.recording import GAP, PAPER, scene, strip
+from arcade_torch.tools.play.captions import HEIGHT, PAPER, caption
+from arcade_torch.tools.play.recording import GAP, scene, strip
 
 
 def test_a_strip_is_made_of_scenes_with_a_gap_between_them() -> None:
     drawn = strip("SignpostEasy", [0, 1], obs_size=128)
-    assert drawn.shape == (2 * 128 + GAP, 2 * 128 + GAP, 3)
-    assert (drawn[128:-128] == PAPER).all() and (drawn[:, 128:-128] == PAPER).all()
+    top = drawn[:HEIGHT]
+    middle = drawn[HEIGHT + 128 + GAP : -128]
+    assert drawn.shape == (2 * (HEIGHT + 128) + GAP, 2 * 128 + GAP, 3)
+    assert np.array_equal(top, caption(["MDP"], 2 * 128 + GAP, 1))
+    assert np.array_equal(middle, caption(["POMDP"], 2 * 128 + GAP, 1))
+    rows = np.concatenate([drawn[HEIGHT : HEIGHT + 128], drawn[-128:]])
+    assert (drawn[HEIGHT + 128 : HEIGHT + 128 + GAP] == PAPER).all()
+    assert (rows[:, 128:-128] == PAPER).all()
     for column, steps in enumerate((0, 1)):
         full, partial = scene("SignpostEasy", 128, steps)
         x = column * (128 + GAP)
-        assert np.array_equal(drawn[:128, x : x + 128], full)
-        assert np.array_equal(drawn[-128:, x : x + 128], partial)
+        assert np.array_equal(rows[:128, x : x + 128], full)
+        assert np.array_equal(rows[128:, x : x + 128], partial)
 
 
 @pytest.mark.parametrize("steps", [[], [-1], [2, 2], [3, 1]])

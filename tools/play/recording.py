@@ -167,7 +167,9 @@ def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]
 
 
 def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Frame:
-    """Some moments of one episode side by side, the MDP twin above the POMDP twin."""
+    """Some moments of one episode side by side, the MDP twin above the POMDP twin, each row under
+    its name.
+    """
     rises = bool(steps) and steps[0] >= 0 and all(a < b for a, b in pairwise(steps))
     require(rises, "steps", list(steps), "whole numbers that rise from 0 or more")
     moments = list(_moments(id, obs_size, seed, steps[-1]))
@@ -176,11 +178,12 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
             f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay "
             "below"
         )
-    columns = []
-    for step in steps:
-        full, partial = moments[step]
-        columns.append(np.vstack([_padded(full, obs_size), _padded(partial, obs_size)]))
-    return np.hstack(columns)[:-GAP, :-GAP]
+    rows = list[Frame]()
+    for twin, name in enumerate(TWINS.values()):
+        frames = [_padded(moments[step][twin], obs_size) for step in steps]
+        row = np.hstack(frames)[:, :-GAP]
+        rows += [caption([name], row.shape[1], max(1, obs_size // 128)), row]
+    return np.vstack(rows)[:-GAP]
 
 
 def sheet(
