@@ -49,6 +49,9 @@ def laws(name: str, namespace: dict[str, Any]) -> None:
         np.testing.assert_allclose(namespace["shares"]["no memory, POMDP"], [0, 0, 0, 0, 1])
     if name == "recall_density":
         np.testing.assert_allclose(namespace["found"]["no memory, POMDP"].mass(5), [0, 0, 0, 0, 1])
+    if name == "counterfactual":
+        effect = namespace["effects"]["no memory, POMDP"]
+        assert effect.memory_reliance().value == 0 == np.nanmax(effect.profile()[1:])
     if name == "own_memory":
         shares = namespace["shares"]
         assert shares[0] > 0 and shares[-1] > 0 and (shares[1:-1] == 0).all()
@@ -77,6 +80,10 @@ def test_the_long_form_shows_what_it_says(name: str) -> None:
     if name == "recall_density":
         past = {name: 1 - density.mass(5)[-1] for name, density in namespace["found"].items()}
         assert 0.8 > past["LRU, POMDP"] > 2 * past["LRU, MDP"] > 0
+    if name == "counterfactual":
+        profile = namespace["effects"]["LRU, POMDP"].profile(differing=True)
+        assert profile[-1] > 0.9 and np.nanmax(profile[:-1], initial=0) < 0.1
+        assert namespace["effects"]["LRU, MDP"].memory_reliance().value < 0.1
     if name == "own_memory":
         assert namespace["result"].evaluation.mean > 0.9
     if name == "contamination":

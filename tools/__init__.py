@@ -12,12 +12,16 @@ _PUBLIC = {
     "Policy": "measures.policy",
     "as_policy": "measures.policy",
     "Study": "studies.grid",
+    "beliefs": "measures.beliefs.measure",
     "contamination": "measures.contamination.measure",
     "contamination_example": "measures.contamination.measure",
     "contamination_example_figure": "measures.contamination.figure",
     "contamination_figure": "measures.contamination.figure",
+    "counterfactual": "measures.counterfactual.measure",
+    "counterfactual_figure": "measures.counterfactual.figure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
+    "patching": "measures.beliefs.patching",
     "recall_density": "measures.recall_density.measure",
     "recall_density_figure": "measures.recall_density.figure",
     "report": "reports",
@@ -27,6 +31,8 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.measures.beliefs.measure import beliefs
+    from arcade_torch.tools.measures.beliefs.patching import patching
     from arcade_torch.tools.measures.contamination.figure import (
         contamination_example_figure,
         contamination_figure,
@@ -35,6 +41,8 @@ if TYPE_CHECKING:
         contamination,
         contamination_example,
     )
+    from arcade_torch.tools.measures.counterfactual.figure import counterfactual_figure
+    from arcade_torch.tools.measures.counterfactual.measure import counterfactual
     from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
     from arcade_torch.tools.measures.policy import Policy, as_policy
     from arcade_torch.tools.measures.recall_density.figure import recall_density_figure
@@ -47,9 +55,10 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "contamination_example",
-    "contamination_example_figure", "contamination_figure", "gap_and_bias", "greedy_window",
-    "recall_density", "recall_density_figure", "report", "saliency", "saliency_figure", "study",
+    "Policy", "Study", "as_policy", "beliefs", "contamination", "contamination_example",
+    "contamination_example_figure", "contamination_figure", "counterfactual",
+    "counterfactual_figure", "gap_and_bias", "greedy_window", "patching", "recall_density",
+    "recall_density_figure", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 
 

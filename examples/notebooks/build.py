@@ -21,7 +21,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 FOLDER = Path(__file__).resolve().parent
-NAMES = ("saliency", "recall_density", "contamination", "own_memory", "torchrl_pipeline")
+NAMES = (
+    "saliency",
+    "recall_density",
+    "counterfactual",
+    "contamination",
+    "own_memory",
+    "torchrl_pipeline",
+)
 DPI = 72
 KERNEL = {"display_name": "Python 3", "language": "python", "name": "python3"}
 

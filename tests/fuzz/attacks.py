@@ -34,7 +34,8 @@ COMMANDS = {
     "curves": "figure curves study --out out/figures",
     "hyperparameters": "figure hyperparameters study --out out/table.csv",
     "list": "list sheet CartPoleEasy --steps 0 --out out/sheet.png",
-    "report": "report study --skip saliency recall contamination references --out out/report.html",
+    "report": "report study --out out/report.html "
+    "--skip saliency recall counterfactual contamination references",
     "study": "study study.toml --out out/study --engine inline --no-report",
     "dry-run": "study study.toml --dry-run",
     "compare": "bench compare bench.json bench.json",

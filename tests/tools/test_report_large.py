@@ -72,7 +72,8 @@ def test_many_runs_become_small_multiples_and_tables(
 ) -> None:
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
-    page = report(folder.root, skip=("saliency", "recall", "contamination")).read_text()
+    skip = ("saliency", "recall", "counterfactual", "contamination")
+    page = report(folder.root, skip=skip).read_text()
     assert len(page) < 400_000
     count = check(page).count
     assert count["svg"] == 2 * len(GAMES) + 4  # no training curves, which would double it
@@ -197,7 +198,8 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
         contamination.NOISE["starts"],
         contamination.NOISE["starts"],
     ) in told
-    recall = page[page.index('id="recall"') : page.index('id="contamination"')]
+    assert ("counterfactual recall, lru on SignpostEasy-v0", 16, 16) in told
+    recall = page[page.index('id="recall"') : page.index('id="counterfactual"')]
     rows = [row.split("<td>")[1:] for row in recall.split("<tr>")[2:]]
     assert rows[1][3].startswith("100.0 %") and rows[1][4].startswith(
         "0.0 %"
@@ -206,6 +208,9 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     noise = page[page.index('id="contamination"') : page.index('id="repeat"')]
     free = [row.split("<td>")[1:] for row in noise.split("<tr>")[2:]][1]
     assert free[3].startswith("0.0 %") and free[4].startswith("0.0 %")
+    exchanges = page[page.index('id="counterfactual"') : page.index('id="contamination"')]
+    free = [row.split("<td>")[1:] for row in exchanges.split("<tr>")[2:]][1]
+    assert free[2].startswith("0.00")  # no memory: no reliance on it
     told.clear()
     report(trained, skip=("saliency", "references"), progress=lambda *step: told.append(step))
     assert told == []  # kept in the run folders
@@ -228,7 +233,9 @@ def test_each_analysis_can_be_skipped_from_the_command_line(
     assert (
         'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
     )
-    assert cli.main([*ask, "contamination"]) == cli.EXIT_OK
+    assert 'id="counterfactual"' in page
+    assert cli.main([*ask, "contamination", "counterfactual"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
     assert 'id="contamination"' not in page and 'id="recall"' in page
+    assert 'id="counterfactual"' not in page
     assert not (tmp_path / "analysis").exists() and read_csv(trained / "results.csv")

@@ -11,7 +11,7 @@ from arcade_torch.tools.files import Table
 
 Progress = Callable[[str, int, int], None]
 # of a report; what may be left out
-Part = Literal["saliency", "recall", "contamination", "references"]
+Part = Literal["saliency", "recall", "counterfactual", "contamination", "references"]
 PICTURES = (".pdf", ".png", ".svg")
 NUMBERS = (".csv",)
 

@@ -13,8 +13,10 @@ from arcade_torch.tools.figures import (
     PaperOptions,
     Progress,
 )
-from arcade_torch.tools.measures import CheckpointOptions
+from arcade_torch.tools.measures import EpisodeOptions
+from arcade_torch.tools.measures.beliefs import BeliefsOptions
 from arcade_torch.tools.measures.contamination import ContaminationOptions
+from arcade_torch.tools.measures.counterfactual import CounterfactualOptions
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
 from arcade_torch.tools.measures.recall_density import DensityOptions
 from arcade_torch.tools.measures.saliency import SaliencyOptions
@@ -64,6 +66,22 @@ FIGURES = {
         "measures.recall_density.figure.densities",
         "how decisions spread over the past of their episodes",
         "runs/one runs/two --bins 3 16 --out figures",
+        True,
+        True,
+    ),
+    "counterfactual": Entry(
+        CounterfactualOptions,
+        "measures.counterfactual.figure.by_lag",
+        "which decisions change if a past frame, or the recurrent state, is another episode's",
+        "runs/one runs/control --episodes 64 --donors 4",
+        True,
+        True,
+    ),
+    "beliefs": Entry(
+        BeliefsOptions,
+        "measures.beliefs.figure.by_fact",
+        "which hidden facts can be read off the recurrent state, and which off a frame",
+        "runs/one runs/control --episodes 64",
         True,
         True,
     ),
@@ -118,7 +136,7 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
     confidence = getattr(options, "confidence", 0.95)
     entry = FIGURES[name]
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
-    if isinstance(options, CheckpointOptions) and not options.runs:
+    if isinstance(options, EpisodeOptions) and not options.runs:
         raise ValueError("name at least one run folder")
     if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):
         raise ValueError(f"this figure has several files: give a folder, not --out {options.out}")

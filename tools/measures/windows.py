@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.envs import EpisodeBatch
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
@@ -47,6 +48,7 @@ class Window:
     ended: bool
     seed: int  # of the batch of episodes
     row: int = 0  # which episode of that batch
+    first: int = 0  # step of the episode at which the window begins
 
     @property
     def n(self) -> int:
@@ -208,7 +210,8 @@ def play(
     for row, (begin, length) in enumerate(zip(starts.tolist(), lengths.tolist(), strict=True)):
         steps = max(0, min(keep, length - begin))
         whole = bool(ended[row]) and begin + steps == length
-        windows.append(_window(kept[row, :steps], states[row], whole, seed, row))
+        window = _window(kept[row, :steps], states[row], whole, seed, row)
+        windows.append(replace(window, first=begin))
     return windows, lengths.numpy()
 
 
@@ -263,9 +266,7 @@ def resolve_agent(
         ValueError: there is no environment for it, or more than one.
     """
     if isinstance(agent, str | Path):
-        from arcade_torch.agents.policy import load
-
-        agent = load(agent)
+        agent = load_agent(Path(agent))
     acts = hasattr(agent, "act") and hasattr(agent, "initial_state")
     player = agent if acts and not names else as_policy(agent, **names)
     if env is not None:

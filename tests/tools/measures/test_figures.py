@@ -5,7 +5,7 @@ cannot be compared.
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,23 @@ from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
 from arcade_torch.tools.measures import checkpoints
-from arcade_torch.tools.measures.bootstrap import pooled
-from arcade_torch.tools.measures.checkpoints import Label
+from arcade_torch.tools.measures.beliefs import figure as beliefs
+from arcade_torch.tools.measures.beliefs.measure import Beliefs
+from arcade_torch.tools.measures.bootstrap import Interval, pooled
+from arcade_torch.tools.measures.checkpoints import Label, by_task
 from arcade_torch.tools.measures.contamination import ContaminationOptions
 from arcade_torch.tools.measures.contamination import figure as contamination
 from arcade_torch.tools.measures.contamination.measure import Contamination, Example
+from arcade_torch.tools.measures.counterfactual import figure as counterfactual
+from arcade_torch.tools.measures.counterfactual.measure import Counterfactual
 from arcade_torch.tools.measures.gap_bias import figure as gap_bias
 from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
 from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS
 from arcade_torch.tools.measures.recall_density import DensityOptions
 from arcade_torch.tools.measures.recall_density import figure as recall_density
 from arcade_torch.tools.measures.recall_density.measure import RecallDensity
+from arcade_torch.tools.measures.saliency import figure as saliency_figures
+from arcade_torch.tools.measures.saliency.measure import EpisodeSaliency
 from arcade_torch.tools.names import AgentKey
 from arcade_torch.tools.runs import Run, Score
 from arcade_torch.tools.studies.grid import RunSpec
@@ -498,6 +504,222 @@ def test_the_bars_of_an_example_say_where_the_best_action_changed() -> None:
     assert "sigma = 0.3" in note and [row["value"] for row in rows] == values.ravel().tolist()
 
 
+def test_counterfactual_recall_of_checkpoints_is_drawn_with_its_numbers(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(run) for run in sorted(trained.iterdir())]
+    words = ["analyze", "counterfactual", *runs, "--episodes", "6", "--lags", "5"]
+    words += ["--donors", "2", "--max-frames", "8", "--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "reliance on memory and observation" in text and "gru on" in text
+    name = tmp_path / "counterfactual-MineSweeperEasy-v0-full"
+    assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
+    rows = read_csv(name.with_suffix(".csv"))
+    assert [row["lag"] for row in rows[:6]] == ["0", "1", "2", "3", "4", "state"]
+    assert {row["donors"] for row in rows} == {"all donors", "donors that differ"}
+    first = rows[0]
+    assert float(first["flip_low"]) <= float(first["flip"]) <= float(first["flip_high"])
+    assert float(first["distance"]) > 0 and first["seeds"] == "2"
+    assert "--episodes must be at least 2" in refused(capsys, *words, "--episodes", "1")
+    assert "--lags must be at least 1" in refused(capsys, *words, "--lags", "0")
+
+
+def test_beliefs_of_checkpoints_are_drawn_with_their_numbers(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(run) for run in sorted(trained.iterdir())]
+    words = ["analyze", "beliefs", *runs, "--episodes", "16", "--max-steps", "5"]
+    words += ["--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "hidden facts that can be read" in text and "gru on" in text
+    assert "whose decision an exchanged state brings" in text
+    name = tmp_path / "beliefs-MineSweeperEasy-v0-full"
+    assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
+    rows = read_csv(name.with_suffix(".csv"))
+    assert [row["step"] for row in rows[:6]] == ["all", "0", "1", "2", "3", "4"]
+    assert {(row["fact"], row["source"]) for row in rows} == {
+        (fact, source) for fact in ("mine", "swept") for source in ("state", "frame")
+    }
+    assert rows[0]["seeds"] == "2"
+    assert float(rows[0]["low"]) <= float(rows[0]["score"]) <= float(rows[0]["high"])
+    assert "--episodes must be at least 8" in refused(capsys, *words, "--episodes", "7")
+    assert "--max-steps must be at least 1" in refused(capsys, *words, "--max-steps", "0")
+
+
+def probes(state: float | None, frame: float, fact: str = "sign") -> Beliefs:
+    """Two episodes of two steps in which a guess is always wrong, and probes with such scores."""
+    guess = np.ones((1, 2, 2))
+    return Beliefs(
+        names=np.array([fact]),
+        is_class=np.array([True]),
+        cells=np.array([1]),
+        guess_loss=guess,
+        state_loss=guess * (np.nan if state is None else 1 - state),
+        frame_loss=guess * (1 - frame),
+        constant=np.array(["sky"]),
+        state_width=0 if state is None else 3,
+        frame_width=4,
+        episodes=8,
+    )
+
+
+def test_probes_pool_seeds_and_an_agent_without_memory_has_no_bar_of_a_state() -> None:
+    scores = {
+        "lru": beliefs.scores_of([probes(0.9, 0.2), probes(0.7, 0.4)]),
+        "mlp": beliefs.scores_of([probes(None, 0.3)]),
+    }
+    overall = scores["lru"]["sign", "state"].overall
+    assert overall.value == pytest.approx(0.8) and 0.7 <= overall.low < 0.8 < overall.high
+    np.testing.assert_allclose(scores["lru"]["sign", "frame"].by_step, [0.3, 0.3])
+    assert list(scores["mlp"]) == [("sign", "frame")]
+    with drawing("light"):
+        axis = panels(1, 1, (4, 3))[1][0, 0]
+        beliefs.plot_bars(scores, axis, {"lru": "#0072b2", "mlp": "#000000"})
+        heights = [bar.get_height() for bar in axis.patches]
+        axis = panels(1, 1, (4, 3))[1][0, 0]
+        beliefs.plot_steps(scores, "sign", axis, {"lru": "#0072b2", "mlp": "#000000"})
+    np.testing.assert_allclose(heights, [0.8, 0.3, 0.3])
+    assert [line.get_linestyle() for line in axis.lines[:3]] == ["-", "--", "--"]
+
+
+def test_probes_say_who_has_no_memory_and_what_did_not_vary() -> None:
+    label = Label(AgentKey("pqn", "mlp"), "SignpostEasy-v0", "partial", 0, Path("run"), "mlp")
+    no_state, left_out = beliefs._notes([(label, probes(None, 0.3))])
+    assert "mlp on SignpostEasy-v0 (partial), seed 0 has no recurrent state" in no_state
+    assert left_out.endswith("sky did not vary, and can be read off nothing")
+
+
+def exchanges(flip: Sequence[float], state: float, **other: Any) -> Counterfactual:
+    """One decision with two donors, of which the second alone differs, and changes nothing else."""
+    lags = np.stack([np.zeros(len(flip)), np.array(flip)], -1)[None]
+    states = np.array([[0.0, state]])
+    differs = np.zeros_like(lags)
+    differs[..., 1] = 1
+    values: dict[str, Any] = {
+        "certainty": np.array([0.5]),
+        "lengths": np.array([len(flip)]),
+        "target": "probs",
+    }
+    return Counterfactual(
+        *(lags, lags, lags, differs),
+        *(states, states, states, differs[:, 0]),
+        dropped=0,
+        alone=0,
+        clean_error=0.0,
+        **(values | other),
+    )
+
+
+def test_profiles_pool_seeds_of_different_lengths_and_a_single_one_over_its_episodes() -> None:
+    seeds = [exchanges([0.2, 0.4, 0.6], 0.8), exchanges([0.4, 0.4], 0.4)]
+    flip = counterfactual.profiles_of(seeds, False)["flip"]
+    assert flip.over == "seeds"
+    np.testing.assert_allclose(flip.values.mean, [0.15, 0.2, 0.3, 0.3])
+    assert np.isnan(flip.values.low[2]) and flip.values.low[3] < 0.3 < flip.values.high[3]
+    differing = counterfactual.profiles_of(seeds[:1], True)["flip"]
+    assert differing.over == "episodes"
+    np.testing.assert_allclose(differing.values.mean, [0.2, 0.4, 0.6, 0.8])
+    with drawing("light"):
+        axis = panels(1, 1, (4, 3))[1][0, 0]
+        profiles = {"lru": counterfactual.profiles_of(seeds, True)}
+        counterfactual.plot(profiles, axis, "flip", {"lru": "#0072b2"})
+        by_lag, of_state = axis.lines[:2]
+    assert by_lag.get_ydata().tolist() == pytest.approx([0.3, 0.4, 0.6])
+    assert by_lag.get_xdata().tolist() == [0, 1, 2]
+    assert of_state.get_xdata().tolist() == [3.5]
+    assert of_state.get_ydata().tolist() == pytest.approx([0.6])
+    assert axis.get_xticklabels()[-1].get_text() == "state"
+    figure = counterfactual.counterfactual_figure({"lru": seeds, "one": seeds[0]})
+    everybody, differ = [axis.lines[0].get_ydata().tolist() for axis in figure.axes]
+    assert everybody == pytest.approx([0.15, 0.2, 0.3])
+    assert differ == pytest.approx([0.3, 0.4, 0.6])
+
+
+def test_the_row_of_a_report_names_the_frame_that_matters_most_and_saturated_policies() -> None:
+    row = counterfactual._section_row([exchanges([0.9, 0.0, 1.0], 1.0)])
+    assert (row["observation"].value, row["memory"].value) == (0.45, 0.5)
+    assert (row["peak"], row["at_peak"].value, row["at_peak_differing"].value) == (2, 0.5, 1)
+    assert not row["saturated"]
+    for target, saturated in (("probs", True), ("q", False)):
+        seed = exchanges([0.9, 0.0], 1.0, certainty=np.array([0.9999]), target=target)
+        assert counterfactual._section_row([seed])["saturated"] == saturated
+    density = RecallDensity(
+        np.array([0.1, 0.2, 0.7, 0.4, 0.6]), np.array([3, 2]), np.array([True, True]), 0, 0, "q"
+    )
+    np.testing.assert_allclose(counterfactual.share_by_lag([density], 3), [0.65, 0.3, 0.1])
+
+
+def test_sentences_claim_memory_only_where_an_interval_excludes_zero() -> None:
+    unsure = Interval(0.3, 0.0, 0.6)
+    sure = Interval(0.72, 0.6, 0.8)
+    row = {"game": "Signpost", "twin": "POMDP", "agent": "lru", "memory": sure, "peak": 4}
+    row |= {"memory_differing": Interval(1, 1, 1), "at_peak": sure}
+    rows = [
+        row | {"memory": unsure},
+        row | {"memory": Interval(0.9, np.nan, np.nan)},
+        row | {"twin": "MDP", "at_peak": unsure, "memory": Interval(0.2, 0.1, 0.4)},
+        row,
+    ]
+    assert counterfactual._sentences(rows) == [
+        "Signpost POMDP: another episode's memory changes 72 % of lru's decisions, 100 % where it "
+        "differs; of single frames the one 4 steps back changes most, 72 %.",
+        "Signpost MDP: another episode's memory changes 20 % of lru's decisions, 100 % where it "
+        "differs; the MDP shows all there is to know on the last frame.",
+    ]
+
+
+def test_noise_that_cannot_matter_is_named_and_empty_panels_say_why() -> None:
+    label = Label(AgentKey("pqn", "lru"), "CartPoleEasy-v0", "full", 0, Path("run"), "lru")
+    flip = np.zeros((4, 2, 3))
+    flip[:, 1, 0] = 1  # the stronger noise, on the frame that decides
+    flip[:, :, 2] = np.nan
+    noise = Contamination(
+        np.array([0.1, 1.0]), np.array([0, 1, 9]), flip, flip, np.nan * flip,
+        np.zeros((4, 2), np.int64), 0.0, 0, "q",
+    )  # fmt: skip
+    (note,) = contamination._powerless_notes([(label, noise)])
+    assert "sigma 0.1 cannot matter" in note and "sigma 1 " not in note
+    assert [contamination._section_row([(label, seed)])[1]["powerless"]
+            for seed in (noise, replace(noise, flip=flip[:, ::-1]))] == [True, False]  # fmt: skip
+    measures = contamination.pool(by_task([(label, noise)]))
+    (of_agent,) = measures.values()
+    with drawing("light"):
+        axes = panels(1, 3, (9, 3))[1][0]
+        contamination.plot({"lru": of_agent}, axes[0], "flip", 0, [0, 1])
+        contamination.plot({"lru": of_agent}, axes[1], "flip", 1, [0, 1])
+        contamination.plot({"lru": of_agent}, axes[2], "kl", 0, [0, 1])
+    texts = [[text.get_text() for text in axis.texts if text.get_text()] for axis in axes]
+    assert texts[0] == ["no decision changes"] and not texts[1]
+    assert texts[2] == ["not measured: no episode is so long, or outputs are all alike"]
+    assert contamination._section_row([(label, noise)])[1]["longest"] == 1  # 9 steps: no episode
+    late = replace(noise, delays=np.array([1, 2, 9]))  # the ceiling was not measured
+    assert not contamination._powerless_notes([(label, late)])
+
+
+@pytest.mark.parametrize(
+    ("output", "gradient", "norm", "words"),
+    [
+        ([0.999, 0.001], 1e-3, "l2sq", "saturated, its best action has 0.99900"),
+        ([0.6, 0.4], 1e-12, "l2sq", "all squared gradients sum to 2e-12"),
+        ([0.999, 0.001], 1e-12, "l2sq", "0.99900, and all squared"),
+        ([0.6, 0.4], 1e-12, "l1", ""),
+        ([0.6, 0.4], 1e-3, "l2sq", ""),
+    ],
+)
+def test_saliency_says_where_gradients_vanish(
+    output: list[float], gradient: float, norm: str, words: str
+) -> None:
+    episode = EpisodeSaliency(
+        np.ones((2, 4, 4), np.float32), np.array([gradient, gradient]), np.array(output, np.float32),
+        1, "probs", np.zeros((2, 4, 4, 3), np.uint8), np.zeros(2, np.int64),
+    )  # fmt: skip
+    warning = saliency_figures.no_gradient(episode, norm)
+    assert words in warning if words else warning == ""
+    assert "saturated" not in saliency_figures.no_gradient(replace(episode, target="q"), norm)
+
+
 @dataclass
 class Weight:
     weight: float
@@ -511,7 +733,7 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
-    monkeypatch.setattr(checkpoints, "load", lambda path: agent)
+    monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
     for value in (1.0, 2.0, 1.0):
         torch.nn.init.constant_(agent.network.weight, value)

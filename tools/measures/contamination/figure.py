@@ -29,6 +29,8 @@ MEASURES = {
     "kl": "KL(pi || pi') in nats",
 }
 LEAST_SCALE = 0.1  # axes reach at least so far, so that small effects look small
+POWERLESS_BELOW = 0.02
+"""Noise on the very frame that decides changes so few decisions: it cannot matter to any other."""
 # bars of an example, as in the paper
 CLEAN_BEST = "#354e6a"
 OTHER_BEST = "#a33a2f"
@@ -54,6 +56,7 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.contamination, vars(options), progress)
     result = Made([], notes, [_table(label, changes) for label, changes in measured])
+    result.notes += _powerless_notes(measured)
     tasks = style.agents_by_task(pool(by_task(measured), options.confidence))
     for (game, twin), agents in tasks.items():
         seeds = [pair for pair in measured if pair[0].task[1:] == (game, twin)]
@@ -68,6 +71,32 @@ def by_delay(options: ContaminationOptions, progress: Progress | None) -> Made:
             name = f"contamination-{_kind(options)}-example-{game}-{twin}"
             result.pictures.append(Picture(name, *_example(label, example)))
     return result
+
+
+def _powerless_notes(measured: Sequence[tuple[Label, measure.Contamination]]) -> list[str]:
+    """Which noise cannot matter to which checkpoint, a line each."""
+    notes = list[str]()
+    for label, changes in measured:
+        powerless = list[str]()
+        for sigma, share in zip(changes.sigmas, ceiling(changes), strict=True):
+            if share < POWERLESS_BELOW:
+                powerless.append("the shuffle" if np.isnan(sigma) else f"sigma {sigma:g}")
+        if powerless:
+            notes.append(
+                f"{label}: {' and '.join(powerless)} cannot matter: at most "
+                f"{100 * POWERLESS_BELOW:g} % of decisions change even on the frame that decides, "
+                "so zeros after it say nothing about memory; see analyze counterfactual"
+            )
+    return notes
+
+
+def ceiling(changes: measure.Contamination) -> Any:
+    """The most that each strength of noise can do, float64 [S]: the share of decisions that change
+    at delay 0; NaN where that was not measured.
+    """
+    if changes.delays[0] != 0:
+        return np.full(len(changes.sigmas), np.nan)
+    return changes.mean("flip")[:, 0]
 
 
 def _kind(options: ContaminationOptions) -> str:
@@ -337,12 +366,28 @@ def plot(
         axis.errorbar(x, mean, bars, fmt="none", ecolor=colours[agent], capsize=2, lw=1)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(range(len(delays)), [str(delay) for delay in delays])
+    note = _why_empty(name, [value[name].mean[column] for value in agents.values()])
+    axis.text(0.5, 0.6, note, transform=axis.transAxes, ha="center", color=style.NEUTRAL)
+
+
+def _why_empty(name: str, means: Sequence[Any]) -> str:
+    """Why a panel shows no line, or only lines on its zero; empty if it shows some."""
+    values = np.array(means)
+    if not np.isfinite(values).any():
+        return "not measured: no episode is so long, or outputs are all alike"
+    if np.nanmax(values) > 0:
+        return ""
+    return "no decision changes" if name == "flip" else "nothing changes"
 
 
 def contamination_section(
     cells: Cells, agents: Sequence[str], progress: Progress | None
 ) -> dict[str, Any]:
-    """Share of decisions that one noisy frame changes, by delay; a picture a task."""
+    """Share of decisions that one noisy frame changes, by delay; a picture a task.
+
+    ``short`` has the tasks whose episodes are too short for some delay, and the longest that is
+    there.
+    """
     colours = style.agent_colours(agents)
 
     def draw(by_agent: Mapping[str, Measures], axis: Any) -> None:
@@ -352,7 +397,13 @@ def contamination_section(
         axis.set_xlabel("steps after the noisy frame")
 
     of_cell = (measure.contamination, NOISE)
-    return section("contamination", cells, of_cell, _section_row, draw, progress)
+    parts = section("contamination", cells, of_cell, _section_row, draw, progress)
+    short = dict[str, int]()
+    for row in parts["rows"]:
+        task = f"{row['game']} {row['twin']}"
+        short[task] = max(row["longest"], short.get(task, 0))
+    parts["short"] = {task: delay for task, delay in short.items() if delay < NOISE["delays"][-1]}
+    return parts
 
 
 def _section_row(
@@ -362,6 +413,7 @@ def _section_row(
     measures = next(iter(pool(by_task(measured)).values()))
     seeds = [seed for _, seed in measured]
     later = np.concatenate([seed.flip[:, 0, 1:].ravel() for seed in seeds])
+    most = np.mean([ceiling(seed)[0] for seed in seeds])
     flip = measures["flip"].mean[0]
     row = {
         "seeds": len(seeds),
@@ -370,5 +422,7 @@ def _section_row(
         "one": flip[1],
         "later": float(np.ma.filled(np.ma.masked_invalid(later).mean(), np.nan)),
         "change": measures["change"].mean[0, 1],
+        "powerless": bool(most < POWERLESS_BELOW),
+        "longest": int(seeds[0].delays[reached([measures]) - 1]),
     }
     return measures, row

@@ -128,18 +128,20 @@ def contamination(
     player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
     steps = np.unique(np.array(delays, np.int64))
-    probe = Probe(player, _compared(player, target), disturbance, steps, starts, feedback, seed)
+    probe = Probe(
+        player, output_of_actions(player, target), disturbance, steps, starts, feedback, seed
+    )
     episodes = 4 * math.ceil(starts / disturbance.points_an_episode) + 16
     probe.run(greedy_windows(player, env, episodes=episodes, seed=seed, cap=cap), progress)
     return probe.result()
 
 
-def _compared(model: Any, target: Target) -> str:
+def output_of_actions(model: Any, target: Target) -> str:
     """The output that is compared; a ``ValueError`` if it says nothing of actions."""
     name = resolve(model, target)
     if name == "value":
         raise ValueError(
-            "contamination compares actions: target must be q, logits or probs, not value"
+            "decisions are compared by their actions: target must be q, logits or probs, not value"
         )
     return name
 

@@ -16,7 +16,7 @@ from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.checkpoints import checkpoints_of, measure_run, measure_runs
 from arcade_torch.tools.measures.frames import pictures
 from arcade_torch.tools.measures.saliency import SaliencyOptions
-from arcade_torch.tools.measures.saliency.measure import episode_saliency
+from arcade_torch.tools.measures.saliency.measure import EpisodeSaliency, episode_saliency
 from arcade_torch.tools.measures.section import Cells
 from arcade_torch.tools.options import at_least
 
@@ -24,6 +24,15 @@ SIGMA_PX = 6.0  # width of the smoothing at 128 px, as in the paper's figures; s
 # of a report: frames of a strip; episodes that are tried until one has as many
 SHOW = 8
 TRIES = 10
+
+SATURATED = 0.99
+"""From this probability of one action on the softmax of a policy is flat: its slope, ``p (1 - p)``,
+is a twenty-fifth of the steepest and less.
+"""
+VANISHING = 1e-10
+"""Below this sum of squared gradients an episode has none to speak of: if all values of a frame of
+128 pixels move by 1 (of 255), then, to first order, no output moves by more than 0.003.
+"""
 
 # title, frames [T, *frame] of any kind, maps [T, H, W] up to step n
 Row = tuple[str, Any, NDArray[np.float32]]
@@ -49,6 +58,12 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         shares = episode.shares()
         drawn.append((title, episode.frames, episode.maps))
         cells.append((title, len(shares), f"{100 * shares[-1]:.1f} %"))
+        warning = no_gradient(episode, options.norm)
+        if warning:
+            notes.append(
+                f"{title}: shares of the gradient say nothing: {warning}; take --target logits, "
+                "or analyze counterfactual"
+            )
         numbers += rows_of(row=index, run=title, step=np.arange(len(shares)), share=shares)
         arrays[f"title_{index}"] = np.array(title)
         arrays[f"frames_{index}"] = episode.frames
@@ -134,29 +149,53 @@ def plot(
 
 def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, Any]]:
     """Frames under heat of every cell, from its first seed; with the value drawn brightest and the
-    last share (%).
+    last share (%). Where gradients vanish a warning, and the same by the logits.
     """
     strips = []
     for done, ((agent, game, twin), paths) in enumerate(cells.items(), start=1):
-        _, episode = measure_run(paths[0], episode_saliency, {"show": SHOW, "tries": TRIES})
-        shares = 100 * episode.shares()
-        count = min(SHOW, len(episode.frames))
-        lines = math.ceil(count / 4)
-        figure, axes = panels(lines, 4, (4.8, 1.4 * lines))
-        for axis in axes.flat[count:]:
-            axis.set_axis_off()
-        peak = plot(episode.frames, episode.maps, axes.flat[:count], below=shares)
-        strips.append(
-            {
-                "agent": agent,
-                "game": game,
-                "twin": twin,
-                "frames": len(shares),
-                "last_share": shares[-1],
-                "peak": peak,
-                "source": b64encode(png(figure)).decode("ascii"),
-            }
-        )
+        settings = {"show": SHOW, "tries": TRIES}
+        _, episode = measure_run(paths[0], episode_saliency, settings)
+        warning = no_gradient(episode)
+        logits = None
+        if warning and episode.target == "probs":
+            _, by_logits = measure_run(paths[0], episode_saliency, settings | {"target": "logits"})
+            logits = _strip(by_logits)
+        names = {"agent": agent, "game": game, "twin": twin}
+        strips.append(names | _strip(episode) | {"warning": warning, "logits": logits})
         if progress is not None:
             progress("saliency", done, len(cells))
     return strips
+
+
+def _strip(episode: EpisodeSaliency) -> dict[str, Any]:
+    """The last frames of an episode under heat, as a picture, with its numbers."""
+    shares = 100 * episode.shares()
+    count = min(SHOW, len(episode.frames))
+    lines = math.ceil(count / 4)
+    columns = math.ceil(count / lines)
+    figure, axes = panels(lines, columns, (0.9 * columns, 1.1 * lines))
+    for axis in axes.flat[count:]:
+        axis.set_axis_off()
+    peak = plot(episode.frames, episode.maps, axes.flat[:count], below=shares)
+    return {
+        "frames": len(shares),
+        "last_share": shares[-1],
+        "peak": peak,
+        "source": b64encode(png(figure)).decode("ascii"),
+    }
+
+
+def no_gradient(episode: EpisodeSaliency, norm: str = "l2sq") -> str:
+    """Why the shares of an episode say nothing, or an empty text if they do.
+
+    Args:
+        episode: saliency of a decision.
+        norm: with which it was computed; sums of others than ``l2sq`` are not compared.
+    """
+    reasons = list[str]()
+    if episode.target == "probs" and episode.output.max() >= SATURATED:
+        reasons.append(f"the policy is saturated, its best action has {episode.output.max():.5f}")
+    total = episode.per_frame.sum()
+    if norm == "l2sq" and total < VANISHING:
+        reasons.append(f"all squared gradients sum to {total:.0e}")
+    return ", and ".join(reasons)
