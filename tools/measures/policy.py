@@ -308,7 +308,8 @@ def _of_module(module: TensorDictModuleBase, names: Names) -> Policy:
     from arcade_torch.tools.measures.tensordict_policy import TensorDictPolicy
 
     wrapper = TensorDictPolicy(module, names)
-    if isinstance(wrapper.only_part, MemoryNetwork | ActorCriticNetwork):
+    reads_as_usual = set(names) <= set(RENAMES)
+    if isinstance(wrapper.only_part, MemoryNetwork | ActorCriticNetwork) and reads_as_usual:
         network = replace(as_policy(wrapper.only_part), module=module)
         return _renamed(network, names)
     return Policy(

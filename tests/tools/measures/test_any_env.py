@@ -23,7 +23,14 @@ from torchrl.modules.utils import get_primers_from_module
 import arcade_torch
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import as_policy, contamination, greedy_window, recall_density, saliency
+from arcade_torch.tools import (
+    as_policy,
+    contamination,
+    counterfactual,
+    greedy_window,
+    recall_density,
+    saliency,
+)
 from arcade_torch.tools.measures.contamination.measure import contamination_example
 from arcade_torch.tools.measures.frames import channel_axis, pictures, white_of
 from arcade_torch.tools.measures.saliency.measure import episode_saliency
@@ -154,6 +161,8 @@ def test_every_measure_takes_any_frames_actions_and_batches_with_the_same_names(
     assert example.frames.shape[-1] == 3 and example.values.shape[1] == ACTIONS
     feedback = contamination(policy, env, delays=(0, 2), starts=4, feedback=True, **NAMES)
     assert feedback.clean_error < 1e-5
+    effects = counterfactual(policy, env, episodes=3, donors=2, **NAMES)
+    assert effects.clean_error < 1e-5 and (effects.by_lag("change")[:, 0] > 0).all()
     window = greedy_window(policy, Foreign(kind, batch[:0], one_hot), **NAMES)
     gradients = saliency(
         policy, window.frames, window.last_action, window.is_init, window.state, **NAMES

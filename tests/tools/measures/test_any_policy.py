@@ -264,6 +264,17 @@ def test_a_wrapped_policy_of_ours_equals_the_agent_to_the_bit(name: str) -> None
         np.testing.assert_array_equal(old.output, new.output)
 
 
+def test_a_policy_of_ours_takes_names_of_outputs_and_frames_too() -> None:
+    network = make_actor_critic("small", "gru", store="step")
+    policy = make_policy(network)
+    pixels = torch.randint(256, (2, 128, 128, 3), dtype=torch.uint8)
+    actions = torch.zeros(2, dtype=torch.int64)
+    usual = saliency(policy, pixels, actions, white=255.0)
+    named = saliency(policy, pixels, actions, output_key="logits", output_kind="logits")
+    np.testing.assert_allclose(named.maps, usual.maps, rtol=1e-3, atol=1e-6 * usual.maps.max())
+    assert named.target == usual.target == "probs"
+
+
 def test_the_guides_sequence_equals_the_network_written_as_one() -> None:
     net = Net("gru", torch.float32)
     parts = TensorDictSequential(
