@@ -8,7 +8,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -279,6 +279,7 @@ def train(
     resume: bool = False,
     progress: Progress | None = None,
     on_evaluation: Callable[[Agent], None] | None = None,
+    imports: Sequence[Mapping[str, str]] = (),
 ) -> TrainResult:
     """Train an agent in a run folder.
 
@@ -296,6 +297,8 @@ def train(
             ``eval_return``, the mean of the last greedy evaluation (None before the first).
         on_evaluation: called with the agent after every greedy evaluation; it may play, and must
             change nothing.
+        imports: files and modules that game and memory came from, each with ``name`` and
+            ``sha256``; only kept in ``config.json``, for whoever opens the run.
 
     Returns:
         How it ended.
@@ -311,7 +314,7 @@ def train(
         ValueError: the game, the memory model, the network or the device does not exist.
     """
     config = dataclasses.replace(config, env=resolve_id(config.env))
-    folder = RunFolder(Path(run_dir))
+    folder = RunFolder(Path(run_dir), imports)
     folder.check(config, resume)
     check_logger(config.logger)
     if (result := folder.finished()) is not None:

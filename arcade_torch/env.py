@@ -293,6 +293,22 @@ class ArcadeEnv(EnvBase):
         frames = to_torch(self._batched.render(self._with_ends()), self.device)
         return self._root(self._live.batch, self._live.ended, frames)
 
+    def facts(self) -> TensorDict:
+        """Name what the present states hold, whatever the frames show; see ``Game.facts``.
+
+        Returns:
+            TensorDict [N] of bool and integers (classes) and float32 (numbers), empty for games
+            that name none. Tensors lie over memory that JAX wrote for them alone.
+
+        Raises:
+            ValueError: Several games that have no fact in common.
+        """
+        wait_for_torch(self.device, self._jax_device)
+        facts = dict[str, torch.Tensor]()
+        for name, values in self._batched.facts(self._with_ends()).items():
+            facts[name] = to_torch(values, self.device)
+        return TensorDict(facts, batch_size=self.batch_size, device=self.device)
+
     @property
     def generation(self) -> tuple[int, int]:
         """Changes of the state (steps, resets, loads) and of the observability, so that a collector

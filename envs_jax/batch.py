@@ -97,6 +97,7 @@ class Steps(abc.ABC):
         self.init = compiled(self._init)
         self.step = compiled(self._step)
         self.render = compiled(self._render)
+        self.facts = compiled(self._facts)
         self.reset_where = compiled(self._reset_where)
         self.reset_render = compiled(self._reset_render)
         self.step_autoreset = compiled(self._step_autoreset)
@@ -138,6 +139,12 @@ class Steps(abc.ABC):
     @abc.abstractmethod
     def _render(self, batch: Batch) -> Array:
         """Draw every env: uint8 [N, S, S, 3]."""
+
+    @abc.abstractmethod
+    def _facts(self, batch: Batch) -> dict[str, Array]:
+        """The facts of every env, see :meth:`Game.facts`: arrays [N, ...] that share no memory with
+        the batch.
+        """
 
     def _step_autoreset(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
         """Step, begin anew where an episode ended, then draw once.
@@ -267,6 +274,10 @@ class BatchedGame(Steps, Generic[State]):
 
     def _render(self, batch: Batch) -> Array:
         return jax.vmap(self.game.render)(batch.state, batch.partial)
+
+    def _facts(self, batch: Batch) -> dict[str, Array]:
+        facts = jax.vmap(self.game.facts)(batch.state)
+        return {name: jnp.array(value) for name, value in facts.items()}
 
 
 def with_flags(batch: Batch) -> Batch:

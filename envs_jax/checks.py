@@ -22,8 +22,8 @@ _ROUNDING = 1e-4  # of a return
 def check_game(game: Game[Any], play: bool = False) -> None:
     """Refuse a game whose functions do not fit together, or whose frames nobody could use.
 
-    Traces ``reset``, ``step`` and ``render`` once each, for shapes and types alone; that takes
-    milliseconds. ``make`` and ``BatchedGame`` call it for every game that is not one of this
+    Traces ``reset``, ``step``, ``render`` and ``facts`` once each, for shapes and types alone; that
+    takes milliseconds. ``make`` and ``BatchedGame`` call it for every game that is not one of this
     package.
 
     Args:
@@ -62,8 +62,30 @@ def check_game(game: Game[Any], play: bool = False) -> None:
     _check_array(name, "step gives truncated as", stepped[3], (), "bool")
     frame = _traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
     _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
+    _check_facts(name, _traced(name, "facts", game.facts, first))
     if play:
         _check_play(game)
+
+
+def _check_facts(name: str, facts: Any) -> None:
+    """Refuse facts that are no dictionary of arrays of booleans, integers or float32."""
+    if not isinstance(facts, dict):
+        raise ValueError(
+            f"{name}: facts gives a {type(facts).__name__}, wanted a dictionary of arrays by name"
+        )
+    for fact, value in facts.items():
+        if not isinstance(fact, str) or not fact or "." in fact:
+            raise ValueError(f"{name}: facts names {fact!r}, wanted a word without a dot")
+        dtype = getattr(value, "dtype", None)
+        is_class = dtype is not None and (
+            dtype == jnp.bool_ or jnp.issubdtype(dtype, jnp.signedinteger)
+        )
+        if not is_class and dtype != jnp.float32:
+            kind = type(value).__name__ if dtype is None else dtype
+            raise ValueError(
+                f"{name}: facts gives {fact!r} as {kind}, wanted bool or signed integers for a "
+                "class, or float32 for a number"
+            )
 
 
 def _check_play(game: Game[Any]) -> None:

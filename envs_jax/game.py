@@ -19,6 +19,15 @@ NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 ENDS = ("terminated", "truncated")  # the flags of an end
+MEMORY_KINDS = {
+    "recall": "what was seen once",
+    "counting": "how often something was seen",
+    "mapping": "where things lie that are covered again",
+    "tracking": "where something is that moves unseen",
+    "velocity": "where something is of which only the velocity is seen",
+    "none": "nothing: a player without memory can earn the most",
+}
+"""What a POMDP twin can ask of a memory."""
 # such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
 UNSET: Any = None
 
@@ -110,7 +119,22 @@ def _wrap_render(render: Callable[..., Any]) -> Callable[..., Any]:
     return fixed(wrapped)
 
 
-_WRAPPERS = {"reset": _wrap_reset, "step": _wrap_step, "render": _wrap_render}
+def _wrap_facts(facts: Callable[..., Any]) -> Callable[..., Any]:
+    """A game's ``facts`` under fixed settings; see :class:`Game`."""
+
+    @functools.wraps(facts)
+    def wrapped(self: Any, state: Any) -> Any:
+        return facts(self, state)
+
+    return fixed(wrapped)
+
+
+_WRAPPERS = {
+    "reset": _wrap_reset,
+    "step": _wrap_step,
+    "render": _wrap_render,
+    "facts": _wrap_facts,
+}
 
 
 class Game(abc.ABC, Generic[State]):
@@ -118,9 +142,10 @@ class Game(abc.ABC, Generic[State]):
 
     The three methods are pure, can be compiled and vectorised over envs, and hold no state of their
     own. MDP and POMDP twins are the same game: only ``render`` is told which of the two the player
-    sees.
+    sees. A fourth, ``facts``, may name what the state holds, for measures that ask what an agent
+    knows.
 
-    Whatever class is derived from this one, its three methods are wrapped, so that they give the
+    Whatever class is derived from this one, its methods are wrapped, so that they give the
     same bits under all settings of JAX (:mod:`arcade_torch.envs_jax.settings`), take keys of both
     styles, and give states whose leaves share no memory. Where the state is a named tuple with
     fields ``terminated`` and ``truncated``, ``UNSET`` by default, the wrapper sets them, and a step
@@ -136,9 +161,12 @@ class Game(abc.ABC, Generic[State]):
         num_actions: Always 5: up, down, left, right, fire.
         oracles: The scripted players there are, ``"state"``, ``"frames"`` or both: called with the
             game, each gives a player, see :mod:`arcade_torch.envs_jax.oracles`.
+        memory_kind: What the POMDP twin asks of a memory, a key of ``MEMORY_KINDS``; empty where
+            nobody has said.
     """
 
     num_actions: ClassVar[int] = NUM_ACTIONS
+    memory_kind: ClassVar[str] = ""
     oracles: ClassVar[Mapping[str, Callable[[Any], Any]]] = {}
     id: str
     obs_size: int
@@ -191,6 +219,23 @@ class Game(abc.ABC, Generic[State]):
         Returns:
             uint8 [S, S, 3], rows downwards, RGB.
         """
+
+    def facts(self, state: State) -> dict[str, Array]:
+        """Name the facts of a state that a player may have to remember; by default none.
+
+        Booleans and integers are classes, floats are numbers. An array of more than one element
+        holds a fact for each of its cells. A negative integer and NaN mean that the fact has no
+        value at this state, such as a card to be named while none is asked for.
+
+        Args:
+            state: Any state, the last of an episode too.
+
+        Returns:
+            Arrays by name: bool, integers or float32, of one shape at every state. They depend on
+            the state alone, and not on what the player sees of it.
+        """
+        del state
+        return {}
 
     @fixed
     def step_autoreset(

@@ -200,6 +200,25 @@ class MixedGames(Steps):
         joined: Array = jax.lax.platform_dependent(*frames, cuda=_join_words, default=_join_bytes)
         return joined
 
+    def _facts(self, batch: Batch) -> dict[str, Array]:
+        """The facts that all games name alike, with equal shapes and types.
+
+        Raises:
+            ValueError: The games have facts, and none that all share.
+        """
+        of_games = []
+        for group, part in zip(self.groups, self._parts(batch), strict=True):
+            of_games.append(group.facts(part))
+        shared = dict[str, Array]()
+        for name, first in of_games[0].items():
+            values = [facts[name] for facts in of_games if name in facts]
+            kinds = {(value.shape[1:], value.dtype) for value in values}
+            if len(values) == len(of_games) and kinds == {(first.shape[1:], first.dtype)}:
+                shared[name] = jnp.concatenate(values)
+        if any(of_games) and not shared:
+            raise ValueError(_no_shared_facts(self.game.games, of_games))
+        return shared
+
     def _pad(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...]: states of a game are zero in the envs that play
         another.
@@ -281,6 +300,18 @@ def _rows_of(tree: Any, rows: slice) -> Any:
 def _concatenate(trees: Sequence[Any]) -> Any:
     """Put the rows of equal pytrees one after the other."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
+
+
+def _no_shared_facts(games: Sequence[Game[Any]], of_games: Sequence[dict[str, Array]]) -> str:
+    """What is said where games of a mixture share no fact."""
+    lists = []
+    for game, facts in zip(games, of_games, strict=True):
+        kinds = [f"{name} {value.dtype}{list(value.shape[1:])}" for name, value in facts.items()]
+        lists.append(f"{game.id}: {', '.join(kinds) or 'none'}")
+    return (
+        f"the games of this batch have no fact in common ({'; '.join(lists)}): "
+        "ask a batch of one game"
+    )
 
 
 def _check(games: Sequence[Game[Any]], weights: tuple[int, ...]) -> None:

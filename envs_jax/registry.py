@@ -155,6 +155,16 @@ def resolve_id(id: str) -> str:
     )
 
 
+def is_built_in(id: str) -> bool:
+    """Whether a registered id, bare name or alias means a game of this package, not one of yours.
+
+    Example:
+        >>> is_built_in("TetrisEasy")
+        True
+    """
+    return isinstance(_ENTRIES[resolve_id(id)].factory, str)
+
+
 def _newest() -> dict[str, str]:
     """The newest id of each bare name."""
     versions = sorted(

@@ -8,8 +8,8 @@ of the batch begins, and the rows that do get zeros.
 Importing this file registers the model, and every tool knows it; run as a script it first checks
 the laws that a memory has to keep and then is ``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_memory.py --memory lstm --preset small --total-frames
-    1e5 python examples/own_memory.py --preset small --env SignpostEasy --observability partial
+    arcade-torch train --import examples/own_memory.py --memory torch_lstm --preset small
+    python examples/own_memory.py --preset small --env SignpostEasy --observability partial
 """
 
 import sys
@@ -49,11 +49,11 @@ class LSTM(nn.Module):
         return TensorDict({"h": zeros, "c": zeros.clone()}, batch_size=batch)
 
 
-register_memory("lstm", LSTM)
+register_memory("torch_lstm", LSTM)
 
 if __name__ == "__main__":
     from arcade_torch.tools.cli import main
 
     for law, discrepancy in check_memory(LSTM(4, 8)).items():
         print(f"{law}: {discrepancy:.2g}", file=sys.stderr)
-    sys.exit(main(["train", "--memory", "lstm", *sys.argv[1:]]))
+    sys.exit(main(["train", "--memory", "torch_lstm", *sys.argv[1:]]))

@@ -46,24 +46,44 @@ def _offsets(row, step, lane, strides):
 
 
 @triton.jit
-def _load_pairs(at, inside):
-    """(real, imaginary parts), zero outside; both in one load, so that neighbours in memory are
-    read together.
-    """
-    x = tl.load(
-        tl.expand_dims(at, -1) + tl.arange(0, 2), mask=tl.expand_dims(inside, -1), other=0.0
-    )
-    return tl.split(x)
+def _load_initial_pairs(h0, row, lane, used, strides):
+    """(real, imaginary parts) [LANES] of the state before the first step."""
+    at = h0 + 2 * (row * strides[0] + lane * strides[1])
+    pairs = tl.load(at[:, None] + tl.arange(0, 2)[None, :], mask=used[:, None], other=0.0)
+    return tl.split(pairs)
 
 
 @triton.jit
-def _store_pairs(at, real, imaginary, inside):
+def _parts(row, step, exists, F, strides, LANES: tl.constexpr):
+    """Offsets of the parts of the program's lanes, real and imaginary in turn, and which exist:
+    both [CHUNK, 2 * LANES].
+
+    Where lanes are neighbours, so are these offsets, which lets a thread move four floats at a
+    time.
+    """
+    first = ((tl.program_id(0) % tl.cdiv(F, LANES)) * LANES).to(tl.int64)
+    part = 2 * first + tl.arange(0, 2 * LANES)
+    column = part
+    if strides[2] != 1:
+        column = 2 * (part // 2) * strides[2] + part % 2
+    offsets = 2 * (row * strides[0] + step[:, None] * strides[1]) + column[None, :]
+    return offsets, exists[:, None] & (part < 2 * F)[None, :]
+
+
+@triton.jit
+def _load_pairs(x, row, step, exists, F, strides, LANES: tl.constexpr):
+    """(real, imaginary parts) [CHUNK, LANES] of x [B, T, F, 2], zero outside."""
+    offsets, inside = _parts(row, step, exists, F, strides, LANES)
+    pairs = tl.load(x + offsets, mask=inside, other=0.0)
+    return tl.split(tl.reshape(pairs, (step.shape[0], LANES, 2)))
+
+
+@triton.jit
+def _store_pairs(x, real, imaginary, row, step, exists, F, strides, LANES: tl.constexpr):
     """The reverse of :func:`_load_pairs`."""
-    tl.store(
-        tl.expand_dims(at, -1) + tl.arange(0, 2),
-        tl.join(real, imaginary),
-        mask=tl.expand_dims(inside, -1),
-    )
+    offsets, inside = _parts(row, step, exists, F, strides, LANES)
+    pairs = tl.reshape(tl.join(real, imaginary), (step.shape[0], 2 * LANES))
+    tl.store(x + offsets, pairs, mask=inside)
 
 
 @triton.jit
@@ -192,18 +212,18 @@ def forward_complex(
     ``x_by``.
     """
     row, lane, used, index = _place(F, CHUNK, LANES)
-    sr, si = _load_pairs(h0 + 2 * (row * h0_by[0] + lane * h0_by[1]), used)
+    sr, si = _load_initial_pairs(h0, row, lane, used, h0_by)
     for begin in range(0, T, CHUNK):
         step = begin + index
-        inside = (step < T)[:, None] & used[None, :]
-        ar, ai = _load_pairs(a + 2 * _offsets(row, step, lane, a_by), inside)
-        xr, xi = _load_pairs(b + 2 * _offsets(row, step, lane, b_by), inside)
-        flag = _flags(start, row, step, step < T, start_by, LANES)
+        exists = step < T
+        ar, ai = _load_pairs(a, row, step, exists, F, a_by, LANES)
+        xr, xi = _load_pairs(b, row, step, exists, F, b_by, LANES)
+        flag = _flags(start, row, step, exists, start_by, LANES)
         enters = (index == 0)[:, None] & (flag == 0)
         xr = tl.where(enters, ar * sr[None, :] - ai * si[None, :] + xr, xr)
         xi = tl.where(enters, ar * si[None, :] + ai * sr[None, :] + xi, xi)
         _, _, hr, hi, _ = tl.associative_scan((ar, ai, xr, xi, flag), 0, join_complex)
-        _store_pairs(out + 2 * _offsets(row, step, lane, out_by), hr, hi, inside)
+        _store_pairs(out, hr, hi, row, step, exists, F, out_by, LANES)
         sr = _last_row(hr, CHUNK)
         si = _last_row(hi, CHUNK)
 
@@ -215,39 +235,30 @@ def backward_complex(
 ):  # fmt: skip
     """:func:`backward_real` on pairs."""
     row, lane, used, index = _place(F, CHUNK, LANES)
-    h0r, h0i = _load_pairs(h0 + 2 * (row * h0_by[0] + lane * h0_by[1]), used)
+    h0r, h0i = _load_initial_pairs(h0, row, lane, used, h0_by)
     sr = tl.zeros_like(h0r)
     si = tl.zeros_like(h0i)
     for begin in range(0, T, CHUNK):
         step = T - 1 - begin - index
         exists = step >= 0
         followed = (step >= 0) & (step < T - 1)
-        inside = exists[:, None] & used[None, :]
-        ar, ai = _load_pairs(
-            a + 2 * _offsets(row, step + 1, lane, a_by), followed[:, None] & used[None, :]
-        )
+        ar, ai = _load_pairs(a, row, step + 1, followed, F, a_by, LANES)
         ai = -ai
-        gr, gi = _load_pairs(grad + 2 * _offsets(row, step, lane, grad_by), inside)
+        gr, gi = _load_pairs(grad, row, step, exists, F, grad_by, LANES)
         flag = _flags(start, row, step + 1, followed, start_by, LANES)
         enters = (index == 0)[:, None] & (flag == 0)
         gr = tl.where(enters, ar * sr[None, :] - ai * si[None, :] + gr, gr)
         gi = tl.where(enters, ar * si[None, :] + ai * sr[None, :] + gi, gi)
         _, _, gr, gi, _ = tl.associative_scan((ar, ai, gr, gi, flag), 0, join_complex)
-        _store_pairs(grad_b + 2 * _offsets(row, step, lane, out_by), gr, gi, inside)
+        _store_pairs(grad_b, gr, gi, row, step, exists, F, out_by, LANES)
         sr = _last_row(gr, CHUNK)
         si = _last_row(gi, CHUNK)
 
-        hr, hi = _load_pairs(
-            h + 2 * _offsets(row, step - 1, lane, h_by), (step > 0)[:, None] & used[None, :]
-        )
+        hr, hi = _load_pairs(h, row, step - 1, step > 0, F, h_by, LANES)
         is_first = (step == 0)[:, None]
         hr = tl.where(is_first, h0r[None, :], hr)
         hi = tl.where(is_first, h0i[None, :], hi)
         begins = _flags(start, row, step, exists, start_by, LANES) != 0
-        at = grad_a + 2 * _offsets(row, step, lane, out_by)
-        _store_pairs(
-            at,
-            tl.where(begins, 0.0, gr * hr + gi * hi),
-            tl.where(begins, 0.0, gi * hr - gr * hi),
-            inside,
-        )
+        grad_real = tl.where(begins, 0.0, gr * hr + gi * hi)
+        grad_imaginary = tl.where(begins, 0.0, gi * hr - gr * hi)
+        _store_pairs(grad_a, grad_real, grad_imaginary, row, step, exists, F, out_by, LANES)

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
 
-__all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward"]
+__all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward", "one_by_one"]
 
 
 class GRU(Memory):
@@ -179,7 +179,7 @@ def _differentiate(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, .
 gru_scan.register_autograd(_differentiate, setup_context=_save)
 
 
-def _one_by_one(op: Any) -> Any:
+def one_by_one(op: Any) -> Any:
     """A vmap rule: the operator once for each entry of the mapped dimension (the weights may
     differ).
     """
@@ -197,5 +197,5 @@ def _one_by_one(op: Any) -> Any:
     return rule
 
 
-gru_scan.register_vmap(_one_by_one(gru_scan))
-gru_scan_backward.register_vmap(_one_by_one(gru_scan_backward))
+gru_scan.register_vmap(one_by_one(gru_scan))
+gru_scan_backward.register_vmap(one_by_one(gru_scan_backward))

@@ -8,10 +8,12 @@ from typing import Any
 from torch import nn
 
 from arcade_torch.models.attention import Attention
+from arcade_torch.models.frame_stack import FrameStack
 from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
 from arcade_torch.models.linear_transformer import LinearTransformer
 from arcade_torch.models.lru import LRU
+from arcade_torch.models.lstm import LSTM
 from arcade_torch.models.mingru import MinGRU
 from arcade_torch.models.stateless import Stateless
 from arcade_torch.models.ttt import TTTLinear
@@ -29,6 +31,8 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "attention": Attention,
     "gdn": GatedDeltaNet,
     "ttt": TTTLinear,
+    "lstm": LSTM,
+    "frame_stack": FrameStack,
 }
 
 ALIASES = {"fart": "linear_transformer"}
@@ -85,6 +89,17 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     except TypeError as error:
         raise TypeError(f"memory {name!r} has other options: {error}") from error
     return _FACTORIES[name](input_size, hidden_size, **options)
+
+
+def is_built_in(name: str) -> bool:
+    """Whether a name, such as ``"lru"``, means a memory model of this package, not one of yours.
+
+    Example:
+        >>> is_built_in("lru"), is_built_in("no_such_memory")
+        (True, False)
+    """
+    factory = _FACTORIES.get(ALIASES.get(name, name))
+    return str(getattr(factory, "__module__", "")).startswith("arcade_torch.models.")
 
 
 def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = False) -> None:

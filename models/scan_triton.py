@@ -13,8 +13,9 @@ Sizes. A row of a chunk is one cache line of 128 bytes: 32 float32, 16 complex64
 complex128, so that every line that is fetched is used whole. 64 steps make 8 KiB of each tensor on
 their way at a time for a program; with the 256 programs of B = 16 and H = 512 that is 4 MiB of
 inputs, more than what a fast card needs in flight to be busy (3 TB/s at a delay of 1 us: 3 MB),
-where one step at a time would have 64 KiB. With 4 warps a thread holds 16 entries of a real chunk;
-compiled for sm_80 and sm_90, no kernel spills registers. How fast it is on a card has not been
+where one step at a time would have 64 KiB. With 4 warps a thread holds 16 entries of a real chunk
+and moves 16 bytes at a time; compiled for sm_80, sm_90 and sm_100, no kernel spills registers (at
+most 128 a thread). How fast it is on a card has not been
 measured; ``arcade-torch bench memory --device cuda`` does it where there is one.
 
 Like every parallel form it multiplies factors of several steps. Where |a| is far above 1 such a

@@ -23,6 +23,9 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
+# What tests import is no choice of the user who runs them.
+os.environ["XDG_STATE_HOME"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "state")
+
 # Compilation makes the first example slow, and a red test has to stay red when it is run again.
 settings.register_profile(
     "arcade",

@@ -238,6 +238,21 @@ def test_the_table_of_environments_is_true() -> None:
         assert game.return_range == pytest.approx((float(lowest), float(highest)), abs=5e-5), id
 
 
+def test_the_kinds_of_memory_on_the_page_are_those_of_the_games() -> None:
+    from arcade_torch.envs_jax import make
+    from arcade_torch.envs_jax.game import MEMORY_KINDS
+    from arcade_torch.envs_jax.registry import GAMES, PROBES
+
+    text = (ROOT / "docs/environments.md").read_text(encoding="utf-8")
+    on_page = dict(
+        re.findall(r"^\| \[(\w+)\]\(games/\w+\.md\) \| .+ \| (\w+) \|$", text, re.MULTILINE)
+    )
+    kinds = {name: make(f"{name}Easy").memory_kind for name in GAMES | PROBES}
+    assert on_page == kinds
+    assert set(kinds.values()) == set(MEMORY_KINDS)
+    assert all(f"*{kind}*" in text for kind in MEMORY_KINDS)
+
+
 @pytest.mark.parametrize("table", ["metrics.csv", "eval.csv"])
 def test_the_columns_in_the_glossary_are_those_that_are_written(table: str) -> None:
     from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS

@@ -13,12 +13,16 @@ import jax.numpy as jnp
 import pytest
 import torch
 
+from arcade_torch.agents import check_replay
+from arcade_torch.models import MemoryModule
+
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 def example(name: str) -> Any:
     """Import a script without running it."""
-    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    module_name = f"example_{name.replace('/', '_')}"
+    spec = importlib.util.spec_from_file_location(module_name, EXAMPLES / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module: ModuleType = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -42,6 +46,37 @@ def test_torchrls_trainer_begins_with_the_policy_that_acted(
     result = script.main(frames=2 * script.NUM_ENVS * script.NUM_STEPS, memory="lru")
     assert result.log_ratio < 1e-5 and seen == [script.MINIBATCH]
     assert len(result.returns) == 2 and all(-1 <= value <= 1 for value in result.returns)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["ppo", "dqn"])
+def test_torchrls_configured_trainers_learn_from_what_their_policy_did(name: str) -> None:
+    hydra = pytest.importorskip("hydra", reason="needs the hydra extra")
+    script = example("torchrl_config/train")
+    frames = 2560
+    sizes = [f"trainer.total_frames={frames}", "width=16", "memory=lru"]
+    with hydra.initialize_config_dir(str(EXAMPLES / "torchrl_config"), version_base=None):
+        trainer = script.make_trainer(hydra.compose(name, overrides=sizes))
+    loss = trainer.loss_module
+    network = loss.actor_network if name == "ppo" else loss.value_network
+    assert (
+        next(m for m in network.modules() if isinstance(m, MemoryModule)).memory.hidden_size == 16
+    )
+    before = [weight.detach().clone() for weight in loss.parameters()]
+    differences: list[float] = []
+
+    def check(batch: Any) -> Any:
+        differences.append(check_replay(network, batch))
+        return batch
+
+    trainer.register_op("process_optim_batch", check)
+    trainer.train()
+    assert trainer.collected_frames == frames
+    # 64 slices of 5 steps in a minibatch: the first update sees what acting saw
+    assert differences[0] < 1e-5
+    assert max(differences) > differences[0]
+    moved = [not torch.equal(x, y) for x, y in zip(before, loss.parameters(), strict=True)]
+    assert sum(moved) > len(moved) / 2
 
 
 @pytest.mark.filterwarnings("ignore")

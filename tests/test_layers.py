@@ -230,7 +230,13 @@ def loaded_after(statement: str) -> set[str]:
                 f"import arcade_torch.tools.measures.{measure}.measure",
                 {"torchrl", "jax", "matplotlib", "tyro"},
             )
-            for measure in ("saliency", "recall_density", "contamination", "counterfactual")
+            for measure in (
+                "saliency",
+                "recall_density",
+                "contamination",
+                "counterfactual",
+                "beliefs",
+            )
         ),
     ],
 )

@@ -11,6 +11,8 @@ import torch
 from arcade_torch.models import check_memory, make_memory, registry
 from arcade_torch.models.memory import replay
 from arcade_torch.tools import cli
+from arcade_torch.tools.bench.memory_tests.table import Row
+from arcade_torch.tools.files import read_rows
 from arcade_torch.tools.options import VARIABLE
 
 FILE = Path(__file__).resolve().parents[1] / "examples/own_memory.py"
@@ -29,7 +31,7 @@ def lstm(own_names: None) -> Any:
     spec = importlib.util.spec_from_file_location("own_memory_example", FILE)
     assert spec is not None and spec.loader is not None
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    return make_memory("lstm", 3, 4)
+    return make_memory("torch_lstm", 3, 4)
 
 
 def test_the_class_and_its_registration_take_under_thirty_lines() -> None:
@@ -40,7 +42,7 @@ def test_the_class_and_its_registration_take_under_thirty_lines() -> None:
 
 def test_it_keeps_the_laws_alone_and_in_a_network(lstm: Any) -> None:
     check_memory(lstm)
-    check_memory(make_memory("lstm", 5, 2))
+    check_memory(make_memory("torch_lstm", 5, 2))
 
 
 def test_starts_inside_a_sequence_equal_torchs_lstm_on_each_episode_alone(lstm: Any) -> None:
@@ -65,12 +67,12 @@ def test_a_buffer_replays_it_step_by_step_though_it_has_no_replay(lstm: Any) -> 
 
 
 @pytest.mark.usefixtures("own_names")
-def test_it_trains_and_is_evaluated_with_the_stock_tools(
+def test_it_trains_and_is_evaluated_and_tested_with_the_stock_tools(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = [
         "--memory",
-        "lstm",
+        "torch_lstm",
         "--preset",
         "smoke",
         "--env",
@@ -81,3 +83,9 @@ def test_it_trains_and_is_evaluated_with_the_stock_tools(
     assert cli.main(["train", "--import", str(FILE), *words]) == cli.EXIT_OK
     assert cli.main(["evaluate", str(tmp_path / "run"), "--episodes", "4"]) == cli.EXIT_OK
     assert "SignpostEasy-v0" in capsys.readouterr().out
+
+    out = tmp_path / "tests.csv"
+    words = ["--tests", "parity", "--memory", "torch_lstm", "--steps", "3", "--seeds", "1"]
+    words += ["--hidden-size", "8", "--out", str(out)]
+    assert cli.main(["bench", "recall", "--import", str(FILE), *words]) == cli.EXIT_OK
+    assert {(row.model, row.test) for row in read_rows(out, Row)} == {("torch_lstm", "parity")}

@@ -12,6 +12,7 @@ _PUBLIC = {
     "Policy": "measures.policy",
     "as_policy": "measures.policy",
     "Study": "studies.grid",
+    "beliefs": "measures.beliefs.measure",
     "contamination": "measures.contamination.measure",
     "contamination_example": "measures.contamination.measure",
     "contamination_example_figure": "measures.contamination.figure",
@@ -20,6 +21,7 @@ _PUBLIC = {
     "counterfactual_figure": "measures.counterfactual.figure",
     "gap_and_bias": "measures.gap_bias.measure",
     "greedy_window": "measures.windows",
+    "patching": "measures.beliefs.patching",
     "recall_density": "measures.recall_density.measure",
     "recall_density_figure": "measures.recall_density.figure",
     "report": "reports",
@@ -29,6 +31,8 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.measures.beliefs.measure import beliefs
+    from arcade_torch.tools.measures.beliefs.patching import patching
     from arcade_torch.tools.measures.contamination.figure import (
         contamination_example_figure,
         contamination_figure,
@@ -51,9 +55,9 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "contamination", "contamination_example",
+    "Policy", "Study", "as_policy", "beliefs", "contamination", "contamination_example",
     "contamination_example_figure", "contamination_figure", "counterfactual",
-    "counterfactual_figure", "gap_and_bias", "greedy_window", "recall_density",
+    "counterfactual_figure", "gap_and_bias", "greedy_window", "patching", "recall_density",
     "recall_density_figure", "report", "saliency", "saliency_figure", "study",
 ]  # fmt: skip
 

@@ -24,7 +24,7 @@ from arcade_torch.tools.errors import (
     trouble_of_the_machine,
 )
 from arcade_torch.tools.figures.catalogue import FIGURES
-from arcade_torch.tools.options import imported, load_extensions, take_imports
+from arcade_torch.tools.imports import import_for_command, imported, take_imports
 from arcade_torch.tools.text import printable, warn
 
 EXIT_OK = 0
@@ -46,11 +46,16 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "list.List",
         "games, memory models, what scripted players earn, and pictures of the games",
     ),
+    "new memory": ("new.NewMemory", "a file with a memory model to change, that works as it is"),
     "train": ("train.Train", "train one agent into a run folder"),
     "evaluate": ("train.Evaluate", "greedy returns of a trained agent"),
     "study": (
         "study.StudyCommand",
         "run a grid of trainings from one TOML file, resumable run by run",
+    ),
+    "compare": (
+        "compare.Compare",
+        "a memory model of yours against others: a small study of some minutes, and its report",
     ),
     "report": ("study.Report", "write the HTML page of a study"),
     **{
@@ -204,7 +209,7 @@ def _print_page(words: Sequence[str]) -> None:
 def _parse(words: Sequence[str], imports: Sequence[str]) -> Any:
     """The command that a command line asks for, with its options."""
     name, options = split_command(words)
-    load_extensions(imports)
+    import_for_command(imports)
     command = command_class(name).parse(options, f"arcade-torch {name}")
     command.argv = tuple(options)
     return command

@@ -120,7 +120,21 @@ def find_runs(paths: Sequence[Path]) -> Runs:
         notes.append(
             f"the runs were made with several versions of arcade_torch: {', '.join(versions)}"
         )
+    notes += import_notes(finished)
     return Runs(tuple(finished), notes)
+
+
+def import_notes(runs: Sequence[Run]) -> list[str]:
+    """A note on every imported file that changed between the trainings of some runs."""
+    texts: dict[str, set[str]] = {}
+    for run in runs:
+        for name, sha256 in run.imports.items():
+            texts.setdefault(name, set()).add(sha256)
+    notes = []
+    for name, hashes in texts.items():
+        if len(hashes) > 1:
+            notes.append(f"{name} has changed between the runs: {len(hashes)} versions of it")
+    return notes
 
 
 def _folders(path: Path, search: RunFolders) -> list[Path]:

@@ -98,6 +98,28 @@ def agent_names(keys: Iterable[AgentKey], sized: bool = False) -> dict[AgentKey,
     return names
 
 
+def find_agent(names: Mapping[AgentKey, str], wanted: str) -> str:
+    """The agent that a name means: its very name, or the memory that no other agent has.
+
+    Example:
+        >>> find_agent({AgentKey("pqn", "lru"): "pqn-lru", AgentKey("ppo", "gru"): "gru"}, "lru")
+        'pqn-lru'
+    """
+    if wanted in names.values():
+        return wanted
+    agents = []
+    for key, name in names.items():
+        if key.memory == wanted:
+            agents.append(name)
+    if len(agents) == 1:
+        return agents[0]
+    if agents:
+        raise ValueError(f"subject {wanted!r} is several agents, name one: {', '.join(agents)}")
+    raise ValueError(
+        f"subject {wanted!r} is none of the agents with finished runs, {', '.join(names.values())}"
+    )
+
+
 def _several(words: Iterable[str]) -> bool:
     """Whether there are several different words; empty ones do not count."""
     return len(set(words) - {""}) > 1

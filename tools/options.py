@@ -1,28 +1,18 @@
-"""Words of the command line: commands and their options, read into dataclasses by tyro, and
-``--import`` of a user's games and models.
-"""
+"""Words of the command line: commands and their options, read into dataclasses by tyro."""
 
-import hashlib
-import importlib.util
 import json
-import os
 import re
 import shlex
-import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr
-from importlib.machinery import SourceFileLoader
 from io import StringIO
-from pathlib import Path
 from typing import Any, ClassVar
 
-from arcade_torch.tools.errors import one_line
+from arcade_torch.tools.imports import FLAG, imported
+from arcade_torch.tools.imports import VARIABLE as VARIABLE
+from arcade_torch.tools.imports import load_extensions as load_extensions
+from arcade_torch.tools.imports import take_imports as take_imports
 
-FLAG = "--import"
-VARIABLE = "ARCADE_TORCH_IMPORT"
-"""Environment variable that hands what was imported on to worker processes; entries separated like
-those of PATH.
-"""
 LARGEST = 2**53
 """No option that counts something goes beyond; up to here every whole number is a float as well."""
 SUGGESTION = "Perhaps you meant:"
@@ -184,88 +174,8 @@ def name_and_value(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the
-    remaining words.
-
-    Example:
-        >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
-        (['my_games'], ['train', '--env', 'PairsEasy'])
-    """
-    modules = list[str]()
-    rest = list[str]()
-    pending = iter(words)
-    for word in pending:
-        flag, equals, value = word.partition("=")
-        if flag != FLAG:
-            rest.append(word)
-            continue
-        name = value if equals else next(pending, "")
-        if not name or "\0" in name:
-            raise ValueError(
-                f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
-                "something"
-            )
-        modules.append(str(Path(name).resolve()) if _is_file(name) else name)
-    return modules, rest
-
-
-def load_extensions(names: Sequence[str] = ()) -> None:
-    """Import files and modules that register games or memory models, once a process, and all that a
-    parent process did.
-
-    Raises:
-        FileNotFoundError: there is no such file or module.
-        ValueError: it could not be imported; says why in one line.
-    """
-    if wanted := list(dict.fromkeys([*imported(), *names])):
-        for name in wanted:
-            _load(name)
-        os.environ[VARIABLE] = os.pathsep.join(wanted)
-
-
-def imported() -> list[str]:
-    """What is imported in this process and its workers."""
-    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
-
-
 def command_line(words: Sequence[str]) -> str:
     """A line for a shell that runs ``arcade-torch`` with these words and the same imports."""
     return shlex.join(
         ["arcade-torch", *words, *(part for name in imported() for part in (FLAG, name))]
     )
-
-
-def _is_file(name: str) -> bool:
-    return name.endswith(".py") or os.sep in name
-
-
-def _load(name: str) -> None:
-    if _is_file(name) and not Path(name).is_file():
-        raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
-    # A file gets a name of its own, so that two files of one name do not meet.
-    module = (
-        f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-        if _is_file(name)
-        else name
-    )
-    try:
-        if not _is_file(name):
-            importlib.import_module(module)
-        elif module not in sys.modules:
-            spec: Any = importlib.util.spec_from_file_location(
-                module, name, loader=SourceFileLoader(module, name)
-            )
-            sys.modules[module] = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(sys.modules[module])
-    except Exception as error:
-        sys.modules.pop(module, None)
-        if not isinstance(error, ModuleNotFoundError):
-            why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
-        elif error.name and (name == error.name or name.startswith(f"{error.name}.")):
-            raise FileNotFoundError(
-                f"{FLAG} {name}: there is no module of that name; a file needs its .py"
-            ) from error
-        else:
-            why = f"it imports {error.name}, which is not installed"
-        raise ValueError(f"{FLAG} {name}: {why}") from error

@@ -7,6 +7,7 @@ from typing import Any
 
 from arcade_torch.agents.config import flatten
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
+from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey
 
 
@@ -43,6 +44,13 @@ class Run:
         """The resolved settings, flat or nested as the trainer wrote them."""
         inner = self.record.get("config", self.record)
         return dict(inner) if isinstance(inner, dict) else {}
+
+    @cached_property
+    def imports(self) -> dict[str, str]:
+        """The files and modules that its game and its memory came from -> SHA-256, empty of
+        modules.
+        """
+        return remembered_imports(self.record, self.path / self.settings_file)
 
     @cached_property
     def final(self) -> dict[str, Any] | None:

@@ -6,7 +6,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,11 @@ class RunFolder:
     creates.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, imports: Sequence[Mapping[str, str]] = ()) -> None:
         self.path = path
+        self.imports = [dict(entry) for entry in imports]
+        """What game and memory were imported from, ``name`` and ``sha256``; kept in
+        ``config.json``."""
         self.checkpoints = path / "checkpoints"
         self.replay = path / "replay"
         self._config = path / "config.json"
@@ -109,14 +112,19 @@ class RunFolder:
         remove_draft_checkpoints(self.checkpoints)
         if self._config.exists():
             self._check_same(config)  # another process may have come first
+            record = read_json(self._config)
+            if not self.imports or record.get("imports") == self.imports:
+                return
+            record["imports"] = self.imports  # the run goes on with these
         else:
             record = {
                 "format": FORMAT,
                 "config": config.to_dict(),
                 "versions": versions(),
                 "command": sys.argv,
+                "imports": self.imports,
             }
-            write_json(self._config, record)
+        write_json(self._config, record)
 
     def _check_same(self, config: TrainConfig) -> None:
         try:

@@ -37,6 +37,7 @@ class AutoEncode(LevelGame[AutoEncodeState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "recall"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -63,3 +64,7 @@ class AutoEncode(LevelGame[AutoEncodeState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return rules.step(state, action, self.level, self.rules)
+
+    def facts(self, state: AutoEncodeState) -> dict[str, Array]:
+        """The suit that is to be named now; -1 while cards are dealt, and at the end."""
+        return {"asked": rules.asked_suit(state, self.level)}

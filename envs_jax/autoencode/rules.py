@@ -81,3 +81,11 @@ def step(
     judged = state if is_late else new
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, judged.given >= level.cards, judged.timestep >= level.max_steps
+
+
+def asked_suit(state: AutoEncodeState, level: Params) -> Array:
+    """The suit that an answer has to name now: int32 0..3, -1 where no card is asked for."""
+    asked = level.cards - 1 - state.given
+    suit = jnp.where(jnp.arange(level.cards) == asked, state.cards, 0).sum(dtype=jnp.int32)
+    is_asked = (state.timestep >= level.cards) & (asked >= 0)
+    return jnp.where(is_asked, suit, -1)

@@ -31,6 +31,7 @@ class BattleShip(LevelGame[BattleShipState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "none"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
@@ -48,3 +49,7 @@ class BattleShip(LevelGame[BattleShipState]):
     ) -> tuple[BattleShipState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
+
+    def facts(self, state: BattleShipState) -> dict[str, Array]:
+        """Which cells hold a ship and which are shot at, bool [side, side] each, indexed [x, y]."""
+        return {"ship": state.board == 1, "shot": state.guesses == 1}

@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from arcade_torch.envs_jax.breakout import rules
 from arcade_torch.envs_jax.breakout.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.breakout.renderer import TAILS, Screen, Tail
@@ -39,6 +41,7 @@ class Breakout(LevelGame[BreakoutState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "tracking"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -70,3 +73,13 @@ class Breakout(LevelGame[BreakoutState]):
     ) -> tuple[BreakoutState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
+
+    def facts(self, state: BreakoutState) -> dict[str, Array]:
+        """Column and row of the ball, and by how many it moves in a step (1 or -1), float32."""
+        dx, dy = rules.velocity(state.ball_dir)
+        return {
+            "ball_x": state.ball_x.astype(jnp.float32),
+            "ball_y": state.ball_y.astype(jnp.float32),
+            "ball_dx": dx.astype(jnp.float32),
+            "ball_dy": dy.astype(jnp.float32),
+        }

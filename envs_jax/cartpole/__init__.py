@@ -36,6 +36,7 @@ class CartPole(LevelGame[CartPoleState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "velocity"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -57,3 +58,14 @@ class CartPole(LevelGame[CartPoleState]):
     ) -> tuple[CartPoleState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules)
+
+    def facts(self, state: CartPoleState) -> dict[str, Array]:
+        """Position (m) and velocity of the cart, angle (rad) and angular velocity of the pole,
+        without the noise of the picture.
+        """
+        return {
+            "position": state.x,
+            "velocity": state.x_dot,
+            "angle": state.theta,
+            "angular_velocity": state.theta_dot,
+        }

@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from arcade_torch.envs_jax.countrecall import rules
 from arcade_torch.envs_jax.countrecall.oracle import FramesOracle, StateOracle
 from arcade_torch.envs_jax.countrecall.renderer import Screen
@@ -39,6 +41,7 @@ class CountRecall(LevelGame[CountRecallState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "counting"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -71,3 +74,11 @@ class CountRecall(LevelGame[CountRecallState]):
         """See :meth:`Game.step`."""
         del key  # nothing is random after the deal
         return rules.step(state, action, self.level, self.max_steps, self.rules)
+
+    def facts(self, state: CountRecallState) -> dict[str, Array]:
+        """The suit asked for, the right answer, and how many cards of each suit were dealt before,
+        float32 [suits]; -1 and NaN after the last turn.
+        """
+        query, counts = rules.dealt(state, self.level)
+        answer = jnp.where(query < 0, jnp.nan, counts[jnp.maximum(query, 0)])
+        return {"query": query, "answer": answer, "dealt": counts}

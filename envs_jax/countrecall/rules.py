@@ -79,3 +79,19 @@ def step(
     new = CountRecallState(state.cards, state.queries, turn, answer, score, state.moves + 1)
     reward = jnp.where(right, jnp.float32(1 / level.cards), jnp.float32(0))
     return new, reward, new.timestep >= level.cards, new.moves >= max_steps
+
+
+def dealt(state: CountRecallState, level: Params) -> tuple[Array, Array]:
+    """What is asked for in this turn, and what is to be counted.
+
+    Returns:
+        The suit asked for, int32, -1 after the last turn; and how many cards of each suit were
+        dealt before this turn, float32 [suits].
+    """
+    index = jnp.arange(level.cards)
+    now = index == state.timestep
+    query = jnp.where(now, state.queries, 0).sum(dtype=jnp.int32)
+    is_before = index < state.timestep
+    suits = jnp.arange(level.suits)
+    counts = (is_before & (state.cards == suits[:, None])).sum(1)
+    return jnp.where(now.any(), query, -1), counts.astype(jnp.float32)

@@ -36,6 +36,7 @@ class MineSweeper(LevelGame[MineSweeperState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -62,3 +63,7 @@ class MineSweeper(LevelGame[MineSweeperState]):
     ) -> tuple[MineSweeperState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules, self.mine_reward)
+
+    def facts(self, state: MineSweeperState) -> dict[str, Array]:
+        """Which cells hold a mine and which are swept, bool [side, side] each, indexed [x, y]."""
+        return {"mine": rules.mines(state, self.level), "swept": state.grid == rules.SWEPT}

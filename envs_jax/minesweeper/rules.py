@@ -75,6 +75,13 @@ def count_neighbours(mines: Array) -> Array:
     return columns[:, :side] + columns[:, 1 : side + 1] + columns[:, 2:]
 
 
+def mines(state: MineSweeperState, level: Params) -> Array:
+    """Where mines lie, and lay: bool [side, side]. One that was hit is under the cursor."""
+    covered = state.grid == COVERED_MINE
+    hit = covered.sum() < level.mines
+    return covered | (hit & cell_mask(state.x, state.y, level.side))
+
+
 def draw_mines(key: Array, level: Params) -> Array:
     """Distinct uniformly random cells: int8 [side, side], 1 where a mine lies."""
     return (

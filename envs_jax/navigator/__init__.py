@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.navigator import rules
 from arcade_torch.envs_jax.navigator.oracle import FramesOracle, StateOracle
@@ -32,6 +34,7 @@ class Navigator(LevelGame[NavigatorState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
@@ -51,3 +54,13 @@ class Navigator(LevelGame[NavigatorState]):
     ) -> tuple[NavigatorState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level, self.rules)
+
+    def facts(self, state: NavigatorState) -> dict[str, Array]:
+        """Where treasure and agent are: column and row, float32."""
+        is_treasure = state.board == rules.TREASURE
+        return {
+            "treasure_x": is_treasure.any(1).argmax().astype(jnp.float32),
+            "treasure_y": is_treasure.any(0).argmax().astype(jnp.float32),
+            "agent_x": state.x.astype(jnp.float32),
+            "agent_y": state.y.astype(jnp.float32),
+        }

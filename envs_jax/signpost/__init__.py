@@ -29,6 +29,7 @@ class Signpost(LevelGame[SignpostState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "recall"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
@@ -46,3 +47,7 @@ class Signpost(LevelGame[SignpostState]):
     ) -> tuple[SignpostState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(state, action, self.level)
+
+    def facts(self, state: SignpostState) -> dict[str, Array]:
+        """The sign, the action that opens the gate."""
+        return {"sign": state.sign}

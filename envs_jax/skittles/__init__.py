@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from arcade_torch.envs_jax.game import Array, LevelGame, Rules
 from arcade_torch.envs_jax.skittles import rules
 from arcade_torch.envs_jax.skittles.oracle import FramesOracle, StateOracle
@@ -34,6 +36,7 @@ class Skittles(LevelGame[SkittlesState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "tracking"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(
@@ -55,3 +58,9 @@ class Skittles(LevelGame[SkittlesState]):
     ) -> tuple[SkittlesState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules, self.hit_reward)
+
+    def facts(self, state: SkittlesState) -> dict[str, Array]:
+        """The column of the block in each row from the top, int32 [10], -1 in an empty row; and the
+        agent's column, float32.
+        """
+        return {"block": state.column, "agent_x": state.x.astype(jnp.float32)}

@@ -40,6 +40,7 @@ class Tetris(LevelGame[TetrisState]):
     """
 
     levels = LEVELS
+    memory_kind: ClassVar = "mapping"
     oracles: ClassVar = {"state": StateOracle, "frames": FramesOracle}
 
     def __init__(self, level: Params, *, id: str, obs_size: int, rules: Rules) -> None:
@@ -58,3 +59,9 @@ class Tetris(LevelGame[TetrisState]):
     ) -> tuple[TetrisState, Array, Array, Array]:
         """See :meth:`Game.step`."""
         return rules.step(key, state, action, self.level, self.rules)
+
+    def facts(self, state: TetrisState) -> dict[str, Array]:
+        """The piece that falls, the next one (0 to 6: I O T S Z J L), and which cells of the board
+        are filled, bool [20, 10].
+        """
+        return {"piece": state.piece, "next_piece": state.next[0], "filled": state.board > 0}

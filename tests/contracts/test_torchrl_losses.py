@@ -40,7 +40,18 @@ from arcade_torch.models import memory_names
 from tests.contracts.pomdp import ACTIONS, CONTROL, STEPS, collected, explorer, network
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/losses.md"
-MEMORIES = ("lru", "mingru", "gru", "linear_transformer", "attention", "gdn", "ttt", "mlp")
+MEMORIES = (
+    "lru",
+    "mingru",
+    "gru",
+    "linear_transformer",
+    "attention",
+    "gdn",
+    "ttt",
+    "lstm",
+    "frame_stack",
+    "mlp",
+)
 
 
 class Row(NamedTuple):

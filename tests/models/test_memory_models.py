@@ -27,6 +27,10 @@ MODELS = [
     ("gdn", {"gate_alpha": False, "beta_range": 1.0}),
     ("gdn", {"legacy_left": True}),
     ("ttt", {}),
+    ("lstm", {}),
+    ("frame_stack", {}),
+    ("frame_stack", {"frames": 2}),
+    ("frame_stack", {"frames": 9}),
 ]
 NAMES = memory_names()
 LENGTHS = [1, 2, 3, 7, 128, 132, 1000]
@@ -55,6 +59,8 @@ def test_every_model_satisfies_the_protocols(name):
         ("linear_transformer", 47_616),
         ("gdn", 48_642),
         ("ttt", 48_658),  # our own variant, unpublished
+        ("lstm", 2_099_200),  # torch.nn.LSTM without the second of its biases
+        ("frame_stack", 1_049_088),
     ],
 )
 def test_parameter_counts_at_width_512_are_the_published_ones(name, count):

@@ -249,7 +249,7 @@ def test_another_dtype_is_refused_in_one_line() -> None:
     assert not scan_triton.runs_triton(x)
 
 
-def test_they_compile_for_cards_and_read_neighbours_together(tmp_path: Path) -> None:
+def test_they_compile_for_cards_move_16_bytes_at_a_time_and_spill_nothing(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     environment["TRITON_CACHE_DIR"] = str(tmp_path)
     command = [sys.executable, "-W", "ignore", "-m", "tests.models.triton_targets"]
@@ -258,8 +258,11 @@ def test_they_compile_for_cards_and_read_neighbours_together(tmp_path: Path) -> 
     )
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(rows) == 2 * 4 * 2 and all(row["code"] > 0 for row in rows)
+    assert len(rows) == 3 * 4 * 2 and all(row["code"] > 0 for row in rows)
     for row in rows:
-        assert row["widest"] == (
-            4 if (row["kernel"].endswith("real") and row["dtype"] == "fp32") else 2
-        ), row
+        assert row["spilled"] == 0, row
+        narrow = {size: count for size, count in row["accesses"].items() if size not in ("1", "16")}
+        # the initial state of complex64, a load for each part of a chunk's first rows
+        pairs_of_floats = row["kernel"].endswith("complex") and row["dtype"] == "fp32"
+        assert narrow == ({"8": 2} if pairs_of_floats else {}), row
+        assert row["accesses"]["16"] >= 12, row

@@ -163,7 +163,9 @@ def test_a_tiny_benchmark_of_everything_is_written_read_and_equals_itself(
     out = tmp_path / "bench.json"
     assert cli.main(["bench", "all", "--size", "tiny", "--out", str(out)]) == 0
     results = read_results(out)
-    assert set(results["tables"]) == set(TABLES) and results["machine"]["torch"]
+    # the tests that tell memories apart are asked for by name
+    assert set(results["tables"]) == set(TABLES) - {"memory_tests"}
+    assert results["machine"]["torch"]
     assert (
         results["machine"]["keep_memory"] == "train"
     )  # the others show what a loop of your own gets

@@ -133,6 +133,7 @@ def test_every_maker_of_figures_is_covered_here_or_has_no_names() -> None:
         "size-sweep",
         "recall-density",
         "counterfactual",
+        "beliefs",
         "contamination",
     }  # fixed names, or by the style alone
     assert set(FIGURES) == drawn_here | others

@@ -24,6 +24,8 @@ def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(
         ("mlp", 0, 0, 8 * 8),
         ("mingru", 8, 32, 2 * 8 * 8),
         ("gru", 8, 32, 6 * 8 * 8),
+        ("lstm", 16, 64, 8 * 8 * 8),
+        ("frame_stack", 24, 96, 4 * 8 * 8),
         ("lru", 16, 64, 4 * 8 * 8),
         ("linear_transformer", 12, 48, 3 * 8 * 3 + 3 * 4 + 3 * 4 + 3 * 8),
         ("attention", 128 * 16 + 1, 128 * 8 * 8 + 8, 3 * 8 * 8 + 2 * 128 * 8),

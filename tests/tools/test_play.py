@@ -275,13 +275,13 @@ def test_a_window_plays_what_is_pressed_and_shows_it(
     assert player.closed and pygame.display.get_surface() is None
     assert [a.actions for a in found] == ["43", "012"]
     twin, _ = session(seed=3)
-    frames = [twin.frame]
+    frames = [twin.picture]
     for keys in ("4", "3", "p"):
         press(twin, keys)
-        frames.append(twin.frame)
+        frames.append(twin.picture)
     assert len(shown) == 9  # the first picture, and one for each key that means something
     for (surface, _), frame in zip(shown, frames, strict=False):
-        assert surface.shape == (384, 384, 3) and (surface[1::3, 1::3] == frame).all()
+        assert surface.shape == (420, 384, 3) and (surface[1::3, 1::3] == frame).all()
     assert "steps 1/32" in shown[1][1] and " POMDP " in shown[3][1]
 
 

@@ -93,7 +93,11 @@ def test_a_scene_shows_the_same_moment_to_both_twins() -> None:
 
 
 def test_a_sheet_has_a_place_for_every_frame() -> None:
-    assert sheet(["SignpostEasy"], columns=2).shape == (264, 2 * (2 * 256 + 2 * 128 + 4 * 8), 3)
+    assert sheet(["SignpostEasy"], columns=2).shape == (
+        24 + 264,
+        2 * (2 * 256 + 2 * 128 + 4 * 8),
+        3,
+    )
 
 
 def test_few_episodes_have_students_interval_and_one_has_none() -> None:

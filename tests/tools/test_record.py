@@ -144,7 +144,7 @@ def test_a_run_folder_plays_as_it_is_evaluated(
     assert said in capsys.readouterr().out
     frames, _ = pictures(tmp_path / "a.gif")
     player, _ = session(seed=seed, partial=True)  # the twin it was trained on
-    assert (frames[0] == player.frame).all()
+    assert (frames[0] == player.picture).all()
     assert (
         cli.main([*words[:-1], str(tmp_path / "b.gif"), "--obs-size", "256"]) == cli.EXIT_BAD_INPUT
     )
@@ -164,7 +164,8 @@ def test_a_gif_holds_the_true_frames(tmp_path: Path, both: bool) -> None:
     assert all((frame == frames[-1]).all() for frame in frames[-5:])
     twin, _ = session(seed=2, both=both)
     for action, frame in zip(found[0].actions, frames, strict=False):
-        assert (frame[::2, ::2] == twin.frame).all() and (frame[1::2, 1::2] == twin.frame).all()
+        seen = twin.picture
+        assert (frame[::2, ::2] == seen).all() and (frame[1::2, 1::2] == seen).all()
         twin.press(("up", "down", "left", "right", "fire")[int(action)])
     kept, durations = pictures(write_gif(tmp_path / "x.gif", frames, 20.0))
     assert (kept == np.stack(frames)).all()
@@ -204,8 +205,8 @@ def test_an_mp4_holds_the_frames_nearly(tmp_path: Path) -> None:
     )
     path = write_mp4(tmp_path / "x.mp4", frames, 10.0)
     film = ffmpeg.read_frames(str(path))
-    assert next(film)["size"] == (256, 256)
-    kept = np.stack([np.frombuffer(data, np.uint8).reshape(256, 256, 3) for data in film])
+    assert next(film)["size"] == (256, 280)
+    kept = np.stack([np.frombuffer(data, np.uint8).reshape(280, 256, 3) for data in film])
     assert len(kept) == len(frames)
     assert np.abs(kept.astype(int) - np.stack(frames)).mean() < 6
     with pytest.raises(ValueError, match=r"ffmpeg could not write .*y\.mp4: "):
@@ -237,7 +238,7 @@ def test_the_command_records_scripted_players(
         r"seed 3: return [+-]\d\.\d+ in \d+ steps, (terminated|truncated)\nrecording: ", said
     )
     frames, _ = pictures(out)
-    assert frames.shape[1:] == (128, 256, 3)
+    assert frames.shape[1:] == (12 + 128, 256, 3)
     assert [path.name for path in out.parent.iterdir()] == ["x.gif"]
 
 

@@ -284,3 +284,16 @@ def test_one_scale_serves_a_whole_row_and_few_frames_leave_places_empty() -> Non
         heats = [axis.images[1].get_array() for axis in axes[1:]]
     assert [axis.get_title() for axis in axes] == ["", "$o_{n-1}$", "$o_{n}$"]
     assert not axes[0].images and heats[0].max() == 1.0 and heats[1].max() == np.sqrt(0.5)
+
+
+def test_ticks_are_readable_on_a_telephone(page: str) -> None:
+    """Of its 390 pixels a picture has 326. Before: letters of 9 pixels."""
+    widths = [float(width) for width in re.findall(r'viewBox="0 0 ([\d.]+)', page)]
+    assert widths and all(10 * 326 / width >= 11 for width in widths)
+
+
+def test_a_panel_with_nothing_in_it_is_left_out(tmp_path: Path, no_oracles: None) -> None:
+    """Before: Memory Bias of the memory-free agent alone was an empty picture."""
+    write_study(tmp_path / "s", small_study(memories=["mlp"]))
+    page = report(tmp_path / "s", skip=("saliency",)).read_text()
+    assert "Observability Gap" in page and ">Memory Bias<" not in page

@@ -1,5 +1,5 @@
-"""Delayed recall: see one of four symbols, wait among distractors, name it when asked. Plain
-supervised learning.
+"""Tests of memory. Of this file, *symbol*: see one of four symbols, wait among distractors, name it
+when asked. Plain supervised learning. The tests that tell memories apart stand in `memory_tests`.
 
 Every step shows one token, one-hot: 0 to 3 are the symbols, 4 to 7 distractors, 8 asks. An episode
 shows a symbol at its first step, then ``delay`` distractors, then asks. A quarter of the episodes
@@ -17,17 +17,19 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from arcade_torch.models import MemoryBlock, memory_names
+from arcade_torch.models import MemoryBlock, make_memory, memory_names
+from arcade_torch.tools.bench.memory_tests import TESTS, table
+from arcade_torch.tools.bench.memory_tests.training import MOST_SEED, MOST_STEPS, Setting
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.files import markdown_table, measured_rows, write_between
 from arcade_torch.tools.machine import torch_threads
-from arcade_torch.tools.options import at_least
+from arcade_torch.tools.options import at_least, at_most
 
 SYMBOLS = 4
 DISTRACTORS = 4
@@ -49,28 +51,60 @@ at least.
 """
 BEGIN = "<!-- recall -->"
 END = "<!-- end of recall -->"
+SYMBOL = "symbol"
+OUT = Path("recall.csv")
+OUT_OF_TESTS = Path("memory_tests.csv")
+TestName = Literal[
+    "symbol",
+    "delay",
+    "noise",
+    "capacity",
+    "association",
+    "rewriting",
+    "forgetting",
+    "copy",
+    "counting",
+    "parity",
+    "s3",
+    "s5",
+]
 
 
 @dataclass
 class Options(BenchOptions):
-    """Delayed recall: see one of four symbols, wait among distractors, name it when asked.
+    """Tests of memory: what a model holds, for how long, and what it can do with it.
 
-    Each model is trained alone, on one thread, until 99 % of fresh answers are right or its budget
-    is spent; chance is 25 %. Keeps a CSV file that it goes on with after an interruption, and can
-    write the table into a Markdown page.
+    symbol, the default: see one of four symbols, wait among distractors, name it when asked. Each
+    model is trained alone, on one thread, until 99 % of fresh answers are right or its budget is
+    spent; chance is 25 %. The other tests tell memories apart: all models learn each of them with
+    one setting, and are asked at sizes that they have learned and at new ones. Keeps a CSV file
+    that it goes on with after an interruption, and can write the table into a Markdown page.
 
-    Example: arcade-torch bench recall lru attention --delays 8 32 --out recall.csv
+    Example: arcade-torch bench recall --tests delay parity s5 --memory lru gru
     """
 
     resumable: ClassVar[bool] = True
     memories: tuple[str, ...] = ()  # Memory models; all of them by default.
-    delays: tuple[int, ...] = (8, 32, 96)  # Steps between symbol and question.
+    tests: tuple[TestName, ...] = ("symbol",)  # What they are asked; symbol stands alone.
+    delays: tuple[int, ...] = (8, 32, 96)  # Of symbol: steps between symbol and question.
     hidden_size: int = 64  # Width of the memory block.
-    seconds: float = 60.0  # Budget of each training, processor time.
-    seed: int = 0  # Of weights and data.
-    out: Path | None = Path("recall.csv")
-    """Table; rows it holds are not measured again."""
-    page: Path | None = None  # Markdown page that gets the table between its marks.
+    seconds: float = 60.0  # Of symbol: budget of each training, processor time.
+    steps: int = 800  # Of the other tests: gradient steps of each training, at most.
+    seed: int = 0  # Of weights and data; the first of them.
+    seeds: int = 3  # Of the other tests: number of seeds.
+    out: Path | None = OUT
+    """Table; rows it holds are not measured again. Of the other tests memory_tests.csv by
+    default.
+    """
+    page: Path | None = None
+    """Markdown page that gets the table between its marks, and beside it, of the other tests, a
+    picture of its name.
+    """
+
+    def __post_init__(self) -> None:
+        """The file of the other tests has other columns."""
+        if self.tests != (SYMBOL,) and self.out == OUT:
+            self.out = OUT_OF_TESTS
 
 
 class Recall(NamedTuple):
@@ -89,8 +123,48 @@ class Recall(NamedTuple):
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Rows of the table ``recall``; those that the file holds already are not measured again."""
-    at_least(options, seconds=0.01, hidden_size=1, delays=1, seed=0)
+    """Rows of the table ``recall``, or of ``memory_tests``; those that the file holds already are
+    not measured again.
+    """
+    at_least(options, seconds=0.01, hidden_size=1, delays=1, seed=0, seeds=1, steps=1)
+    at_most(options, steps=MOST_STEPS, seed=MOST_SEED, seeds=MOST_SEED)
+    for memory in options.memories:
+        make_memory(memory, 1, 1)  # refuses a name that is none, before anything is trained
+    if options.tests == (SYMBOL,):
+        yield from _run_symbol(options, log)
+    elif SYMBOL in options.tests or not options.tests:
+        raise ValueError(
+            f"--tests must be {SYMBOL} alone, whose table has other columns, or some of "
+            f"{', '.join(TESTS)}, got {' '.join(options.tests) or 'none'}"
+        )
+    else:
+        yield from _run_tests(options, log)
+
+
+def _run_tests(
+    options: Options, log: Callable[[str], None]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table ``memory_tests``, then its page and picture."""
+    from arcade_torch.tools.bench.memory_tests import figure
+
+    setting = Setting(hidden_size=options.hidden_size, steps=options.steps)
+    seeds = range(options.seed, options.seed + options.seeds)
+    tests = [TESTS[name] for name in dict.fromkeys(options.tests)]
+    memories = list(dict.fromkeys(options.memories)) or memory_names()
+    rows = []
+    with torch_threads(1):
+        for row in table.measured(options.out, memories, tests, seeds, setting, log):
+            rows.append(row)
+            yield "memory_tests", row._asdict()
+    if options.page is not None:
+        write_between(options.page, table.BEGIN, table.END, table.markdown(rows, memories))
+        figure.write(options.page.with_suffix(".png"), rows, memories)
+
+
+def _run_symbol(
+    options: Options, log: Callable[[str], None]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Rows of the table ``recall``, then its page."""
     sizes = (options.hidden_size, options.seed)
     asked = []
 

@@ -24,7 +24,7 @@ BENCHES = {
     "envs": "frames per second of the games, every frame consumed",
     "train": "frames per second of training, and where the time goes",
     "memory": "time of the memory models, of the scans behind them, and of saliency",
-    "recall": "delayed recall: which model remembers one symbol for how long",
+    "recall": "tests of memory: which model holds what, for how long, and what it does with it",
 }
 """Name -> what it measures. A module of that name has ``Options`` (`BenchOptions`) and
 ``run(options, log)``, which yields ``(table, row)``."""
@@ -101,6 +101,11 @@ TABLES: dict[str, Kind] = {
     "recall": Kind(
         "Delayed recall: right answers, and processor time until they were right",
         ("model", "delay", "hidden_size", "seed"),
+        {"accuracy": "share", "seconds": "s"},
+    ),
+    "memory_tests": Kind(
+        "Tests of memory: right answers",
+        ("model", "test", "level", "seed", "hidden_size", "most_steps"),
         {"accuracy": "share", "seconds": "s"},
     ),
 }

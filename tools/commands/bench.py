@@ -31,6 +31,7 @@ class Bench(Command):
         name = prog.split()[-1]
         if words and not words[0].startswith("-") and name in ("memory", "recall"):
             words = ["--memories", *words]
+        words = ["--memories" if word == "--memory" else word for word in words]
         return cls(name, parse_options(registry.module_of(name).Options, words, prog))
 
     def run(self) -> int:

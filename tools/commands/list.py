@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from arcade_torch.envs_jax import make, registered_ids, resolve_id
+from arcade_torch.envs_jax.game import MEMORY_KINDS
 from arcade_torch.tools import players
 from arcade_torch.tools.files import Table, write_between
 from arcade_torch.tools.options import Command, at_least
@@ -80,19 +81,27 @@ class List(Command):
         if self.steps and len(ids) != 1:
             raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
         ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
-        picture = strip(ids[0], self.steps) if self.steps else sheet(ids)
+        with Bars(first_line_s=0.0) as bars:
+
+            def show(id: str, done: int) -> None:
+                bars.update("sheet", done, len(ids), id)
+
+            picture = strip(ids[0], self.steps) if self.steps else sheet(ids, progress=show)
         say(write_png(self.out or Path("games.png"), picture).resolve())
 
     def _envs(self) -> None:
         games = [make(env_id) for env_id in registered_ids()]
-        rows = [
-            (game.id, game.max_steps, "{:g} to {:g}".format(*game.return_range)) for game in games
-        ]
-        Table("environments", ("id", "time limit", "return"), rows).show()
+        rows = []
+        for game in games:
+            returns = "{:g} to {:g}".format(*game.return_range)
+            rows.append((game.id, game.max_steps, returns, game.memory_kind or "not said"))
+        Table("environments", ("id", "time limit", "return", "the POMDP asks for"), rows).show()
         print(
             "each as an MDP (full) and a POMDP (partial); frames uint8 [128, 128, 3] or [256, 256, "
             "3]; 5 actions"
         )
+        for kind, meaning in MEMORY_KINDS.items():
+            print(f"{kind}: {meaning}")
 
     def _memories(self) -> None:
         from arcade_torch.models import make_memory, memory_names

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from arcade_torch.agents.config import require
+from arcade_torch.tools.imports import import_again, load_agent
 from arcade_torch.tools.options import Command, at_least, at_most, name_and_value
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
@@ -173,6 +174,8 @@ class Record(GameCommand):
             self.fps,
             f"at least 0.01 and at most {fastest} for {self.out.suffix}",
         )
+        if self.player not in recording.SCRIPTED:
+            import_again(Path(self.player))  # which may register the game, too
         game_id = resolve_id(self.game)
         scene = self.scene(game_id)
         game = compiled_game(game_id, scene.obs_size, scene.rules, scene.options)
@@ -216,13 +219,12 @@ class Record(GameCommand):
 
     def scene_of_agent(self, game_id: str) -> Scene:
         """What is recorded of the agent in a run folder."""
-        from arcade_torch.agents import load
         from arcade_torch.envs_jax import resolve_id
         from arcade_torch.tools.play import recording
 
         allowed = f"{', '.join(recording.SCRIPTED)}, or a run folder"
         require(Path(self.player).is_dir(), "--player", self.player, allowed)
-        agent = load(self.player)
+        agent = load_agent(Path(self.player))
         config = agent.config
         if self.obs_size not in (None, config.obs_size):
             raise ValueError(

@@ -1,7 +1,8 @@
 """``arcade-torch study``, ``demo``, a small one, and ``report``, its page."""
 
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -26,7 +27,13 @@ class Resumable(Command):
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
 
     def carry_out(
-        self, definition: Study, out: Path, engine: Engine, shard: str = "", report: bool = True
+        self,
+        definition: Study,
+        out: Path,
+        engine: Engine,
+        shard: str = "",
+        report: bool = True,
+        skip: Sequence[Part] = (),
     ) -> int:
         """Run a study, say how each run ended, and write the report; exit code 1 if a run
         failed.
@@ -50,7 +57,7 @@ class Resumable(Command):
             say(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
             try:
-                write_page(result.root)
+                write_page(result.root, skip=skip)
             except Exception:
                 again = command_line(["report", str(result.root)])
                 print(
@@ -67,8 +74,8 @@ class StudyCommand(Resumable):
     interruption.
 
     The file names games, memories and seeds, and optionally observability, algorithms, preset,
-    total_frames, baseline, sizes, question and a table [settings] with fields of the config that
-    train takes. Where it names no algorithms, the preset's is trained, as train does.
+    total_frames, baseline, sizes, question, subject and a table [settings] with fields of the
+    config that train takes. Where it names no algorithms, the preset's is trained, as train does.
 
     Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
@@ -87,6 +94,10 @@ class StudyCommand(Resumable):
     into one folder.
     """
     dry_run: bool = False  # Only print every run with its frames, and the frames of all together.
+    # The agent that the report is about and compares with every other; that of the file by default.
+    subject: str = ""
+    # Check the laws that a memory has to keep before models of yours are trained.
+    check_memory: bool = True
     # Write the HTML report at the end; of shards, the one that finishes the study writes it.
     report: bool = True
 
@@ -101,6 +112,8 @@ class StudyCommand(Resumable):
             definition = study_preset(self.preset)
         else:
             definition = Study.load(str(self.file))
+        if self.subject:
+            definition = replace(definition, subject=self.subject)
         warning = definition.overridden_preset()
         if warning:
             print(f"warning: {warning}", file=sys.stderr)
@@ -113,6 +126,8 @@ class StudyCommand(Resumable):
                 say(f"{run.name}  {frames:,} frames")
             print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
             return 0
+        if self.check_memory:
+            check_memories_of(definition)
         engine = make_engine(self.engine, self.workers, self.ray)
         return self.carry_out(
             definition, self.out or Path("runs") / definition.name, engine, self.shard, self.report
@@ -161,11 +176,26 @@ class Report(Command):
     """Parts to leave out: strips, densities, exchanged frames, what one noisy frame changes,
     returns of the random policy and oracles.
     """
+    subject: str = ""
+    """The agent that the page is about and compares with every other; that of the study by
+    default.
+    """
 
     def run(self) -> int:
         """Write the page."""
-        write_page(self.study, self.out, metric=self.metric, skip=self.skip)
+        write_page(self.study, self.out, metric=self.metric, skip=self.skip, subject=self.subject)
         return 0
+
+
+def check_memories_of(definition: Study) -> None:
+    """Check the laws on every memory model of a study that is none of this package."""
+    from arcade_torch.tools.memory_files import check_memory_of
+
+    checked = set[str]()
+    for run in definition.runs():
+        if run.memory not in checked:
+            checked.add(run.memory)
+            check_memory_of(definition.config(run))
 
 
 def write_page(study: Path, out: Path | None = None, **options: Any) -> None:

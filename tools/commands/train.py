@@ -1,5 +1,6 @@
 """``arcade-torch train`` and ``arcade-torch evaluate``."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -10,6 +11,8 @@ import tyro
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.tools.imports import import_again, imports_of, load_agent
+from arcade_torch.tools.memory_files import check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
@@ -42,6 +45,8 @@ class Train(Command):
     resume: bool = False  # Go on with the run in that folder.
     # Seconds to wait until another process that trains in that folder has stopped.
     wait: float = 0.0
+    # Check the laws that a memory has to keep before a model of yours is trained (about a second).
+    check_memory: bool = True
     videos: Literal["none", "gif", "mp4"] = "none"
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the
     extra video.
@@ -81,8 +86,10 @@ class Train(Command):
         """Train."""
         from arcade_torch.agents.runs.folder import wait_until_free
         from arcade_torch.agents.training import train
-        from arcade_torch.tools.machine import keep_freed_memory, watch_parent
+        from arcade_torch.tools.exploring import stopped_exploring
+        from arcade_torch.tools.machine import PARENT_VARIABLE, keep_freed_memory, watch_parent
         from arcade_torch.tools.progress import Bars, describe_row
+        from arcade_torch.tools.runs import Run
 
         at_least(self, wait=0)
         watch_parent()
@@ -94,6 +101,12 @@ class Train(Command):
             from arcade_torch.tools.play.recording import EvaluationVideos
 
             film = EvaluationVideos(folder / "videos", f".{self.videos}")
+        if self.resume:
+            import_again(folder)
+        # a study has checked what its workers train, and a run that was begun what it goes on with
+        is_first = PARENT_VARIABLE not in os.environ and not (folder / "config.json").exists()
+        if self.check_memory and is_first:
+            check_memory_of(run)
         wait_until_free(folder, self.wait)
         with Bars(unit="frames", first_line_s=0.0) as bars:
 
@@ -102,13 +115,15 @@ class Train(Command):
                     str(folder), int(row["frames"]), int(row["total_frames"]), describe_row(row)
                 )
 
-            result = train(run, folder, self.resume, show, film)
+            result = train(run, folder, self.resume, show, film, imports_of(run))
         if result.evaluation is None:
             raise KeyboardInterrupt
         say(
             f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} "
             "episodes"
         )
+        if reason := stopped_exploring(Run(result.run_dir)):
+            say(f"this run {reason}")
         say(f"finished: {result.run_dir}")
         return 0
 
@@ -135,11 +150,10 @@ class Evaluate(Command):
     def run(self) -> int:
         """Evaluate and print."""
         from arcade_torch.agents.evaluation import evaluate
-        from arcade_torch.agents.policy import load
 
         if self.json is not None and self.json.exists():
             raise FileExistsError(f"{self.json} exists: choose another file")
-        agent = load(self.run_folder)
+        agent = load_agent(self.run_folder)
         result = evaluate(agent, self.observability, self.episodes)
         config = agent.config
         twin = self.observability or agent.config.observability

@@ -13,7 +13,8 @@ from arcade_torch.tools.figures import (
     PaperOptions,
     Progress,
 )
-from arcade_torch.tools.measures import CheckpointOptions
+from arcade_torch.tools.measures import EpisodeOptions
+from arcade_torch.tools.measures.beliefs import BeliefsOptions
 from arcade_torch.tools.measures.contamination import ContaminationOptions
 from arcade_torch.tools.measures.counterfactual import CounterfactualOptions
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
@@ -76,6 +77,14 @@ FIGURES = {
         True,
         True,
     ),
+    "beliefs": Entry(
+        BeliefsOptions,
+        "measures.beliefs.figure.by_fact",
+        "which hidden facts can be read off the recurrent state, and which off a frame",
+        "runs/one runs/control --episodes 64",
+        True,
+        True,
+    ),
     "contamination": Entry(
         ContaminationOptions,
         "measures.contamination.figure.by_delay",
@@ -127,7 +136,7 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
     confidence = getattr(options, "confidence", 0.95)
     entry = FIGURES[name]
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
-    if isinstance(options, CheckpointOptions) and not options.runs:
+    if isinstance(options, EpisodeOptions) and not options.runs:
         raise ValueError("name at least one run folder")
     if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):
         raise ValueError(f"this figure has several files: give a folder, not --out {options.out}")

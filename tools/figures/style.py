@@ -33,6 +33,8 @@ AGENT_COLOURS = {
     "gdn": "#56b4e9",
     "ttt": "#5e3c10",
     "tttl": "#5e3c10",
+    "lstm": "#117733",
+    "frame_stack": "#882255",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
@@ -55,8 +57,9 @@ POMDP_THIRDS = ("#fdd0a2", "#fdae6b", "#e6550d")
 TWIN_COLOURS = {"full": MDP_THIRDS[-1], "partial": POMDP_THIRDS[-1]}
 TWIN_NAMES = {"full": "MDP", "partial": "POMDP"}
 NEUTRAL = "#555555"
-# inches of a picture of a report; small ones for many tasks
-PANEL = (4.9, 3.0)
+# inches of a picture of a report, narrow enough for its letters on a telephone; small ones for many
+# tasks
+PANEL = (3.9, 2.55)
 SMALL_PANEL = (3.3, 2.3)
 
 STYLES = Path(__file__).resolve().parents[1] / "data"
@@ -148,13 +151,18 @@ def agent_colours(names: Sequence[str]) -> dict[str, str]:
     """A colour for every agent: that of its memory, or a spare one where there is none or another
     agent has it.
     """
+    usual: dict[str, str] = {}  # of the agents whose memories have one: it is theirs
+    for name in names:
+        memory = name.lower().partition(" ")[0].rpartition("-")[2]
+        colour = AGENT_COLOURS.get(memory)
+        if colour is not None and colour not in usual.values():
+            usual[name] = colour
     colours: dict[str, str] = {}
     for place, name in enumerate(names):
-        memory = name.lower().partition(" ")[0].rpartition("-")[2]
-        colour = AGENT_COLOURS.get(memory, SPARE_COLOURS[place % len(SPARE_COLOURS)])
-        taken = set(colours.values())
+        taken = {*usual.values(), *colours.values()}
         free = [spare for spare in SPARE_COLOURS if spare not in taken]
-        colours[name] = free[0] if colour in taken and free else colour
+        spare = free[0] if free else SPARE_COLOURS[place % len(SPARE_COLOURS)]
+        colours[name] = usual.get(name, spare)
     return colours
 
 

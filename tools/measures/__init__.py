@@ -15,11 +15,17 @@ from arcade_torch.tools.figures import Options
 
 
 @dataclass
-class CheckpointOptions(Options):
-    """Options of figures that look into checkpoints."""
+class EpisodeOptions(Options):
+    """Options of figures that play episodes of checkpoints."""
 
     # Another twin than the agents were trained on.
     observability: Literal["full", "partial"] | None = None
+    seed: int = 0  # Of the episodes, and of what is drawn in them.
+
+
+@dataclass
+class CheckpointOptions(EpisodeOptions):
+    """Options of figures that look at the outputs of checkpoints."""
+
     target: Literal["auto", "q", "logits", "probs", "value"] = "auto"
     """The outputs that are looked at; Q-values, or a policy's probabilities, by default."""
-    seed: int = 0  # Of the episodes, and of what is drawn in them.

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 import arcade_torch
-from arcade_torch.agents.policy import load
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.files import cached_arrays
+from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.policy import Progress
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
 from arcade_torch.tools.runs import Run, described
@@ -97,7 +97,7 @@ def measure_run(
     it gets those that it has arguments for; ``observability`` is another twin than the one trained
     on.
     """
-    agent = load(path)
+    agent = load_agent(path)
     config = agent.config
     twin = options.get("observability") or config.observability
     key = AgentKey.of(config.to_dict())

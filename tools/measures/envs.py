@@ -37,6 +37,7 @@ class EpisodeBatch:
         self.size = int(shape[0]) if shape else 1
         spec = _action_spec(env, keys.action)
         self._one_hot = spec if _is_one_hot(spec) else None
+        self._count = getattr(spec, "n", None)  # of actions
         self._action_shape = None if spec is None else spec.shape
         self._root: Any = None
 
@@ -56,7 +57,15 @@ class EpisodeBatch:
 
         Returns:
             (the next observations [N], reward float [N, 1], done bool [N]).
+
+        Raises:
+            ValueError: the env does not have so many actions.
         """
+        if self._count is not None and int(action.max()) >= self._count:
+            raise ValueError(
+                f"actions must be below {self._count}, the number of the env's, got "
+                f"{int(action.max())}: the policy has outputs for more"
+            )
         encoded = self._encode(action)
         given = encoded if self.is_batch else encoded[0]
         if self._action_shape is not None:

@@ -237,7 +237,7 @@ class TensorDictPolicy:
         if self.reads_last_action:
             step[self.keys.last_action] = obs["last_action"]
         self._set_flags(step, obs["is_init"])
-        step.update(state)
+        step.update(state.clone(recurse=False))  # a policy may write its state in place
         with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
             step = self.module(step)
         after = state.clone(recurse=False)

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.envs import EpisodeBatch
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
@@ -265,9 +266,7 @@ def resolve_agent(
         ValueError: there is no environment for it, or more than one.
     """
     if isinstance(agent, str | Path):
-        from arcade_torch.agents.policy import load
-
-        agent = load(agent)
+        agent = load_agent(Path(agent))
     acts = hasattr(agent, "act") and hasattr(agent, "initial_state")
     player = agent if acts and not names else as_policy(agent, **names)
     if env is not None:

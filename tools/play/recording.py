@@ -21,6 +21,7 @@ from arcade_torch.envs_jax import ACTION_NAMES, make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
 from arcade_torch.gym.window import enlarge
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.play.captions import HEIGHT, PAPER, TWINS, caption
 from arcade_torch.tools.play.session import NEXT, QUIT, Frame, Session
 
 SCRIPTED = ("random", "state-oracle", "frames-oracle")
@@ -33,8 +34,7 @@ FILM_SEED = 2**31
 compare.
 """
 GAP = 8
-PAPER = 255
-"""Between pictures on a sheet or a strip, in pixels, and its colour."""
+"""Between pictures on a sheet or a strip, in pixels."""
 
 Chooser = Callable[[Session], int]
 """Somebody who plays: looks at a session and names an action, 0 to 4."""
@@ -84,7 +84,7 @@ def recorded_frames(
 ) -> Iterator[Frame]:
     """Play a session to its end and give out its frames, the last of an episode ``hold`` times."""
     while not session.closed:
-        frame = enlarge(session.frame, scale)
+        frame = enlarge(session.picture, scale)
         yield frame
         if session.end is not None:
             yield from repeat(frame, hold - 1)
@@ -183,14 +183,26 @@ def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> 
     return np.hstack(columns)[:-GAP, :-GAP]
 
 
-def sheet(ids: Sequence[str], columns: int = 2) -> Frame:
-    """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128."""
-    games = []
+def sheet(
+    ids: Sequence[str], columns: int = 2, progress: Callable[[str, int], None] | None = None
+) -> Frame:
+    """All games on one picture; a game is four frames: both twins at 256 pixels, both at 128.
+
+    ``progress`` is called with the id of every game that is drawn, and how many are.
+    """
+    games = list[Frame]()
     for id in ids:
         frames = [*scene(id, 256), *scene(id, 128)]
         games.append(np.hstack([_padded(frame, 256) for frame in frames]))
+        if progress is not None:
+            progress(id, len(games))
+    names = []
+    for size in (256, 128):
+        for name in TWINS.values():
+            gap = np.full((HEIGHT * 2, GAP, 3), PAPER, np.uint8)
+            names.append(np.hstack([caption([name], size, 2), gap]))
     games += [np.full_like(games[0], PAPER)] * (-len(games) % columns)
-    lines = []
+    lines = [np.hstack(names * columns)]
     for first in range(0, len(games), columns):
         lines.append(np.hstack(games[first : first + columns]))
     return np.vstack(lines)

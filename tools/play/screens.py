@@ -85,7 +85,7 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
     pygame = window.pygame
     keys = {getattr(pygame, constant): name for constant, name in WINDOW_KEYS.items()}
     try:
-        window.show(session.frame, session.caption)
+        window.show(session.picture, session.caption)
         if key_repeat_ms:
             pygame.key.set_repeat(_DELAY_MS, key_repeat_ms)
         else:
@@ -95,7 +95,7 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
                 key = QUIT if event.type == pygame.QUIT else keys.get(event.key)
                 if key is not None:
                     session.press(key)
-                    window.show(session.frame, session.caption)
+                    window.show(session.picture, session.caption)
             window.tick(FPS)
     finally:
         window.close()

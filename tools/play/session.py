@@ -16,6 +16,7 @@ from arcade_torch.agents.config import require
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.gym.batch import NumpyBatch, seed_keys
+from arcade_torch.tools.play.captions import captioned
 
 Frame = npt.NDArray[np.uint8]
 End = Literal["terminated", "truncated", "abandoned"]
@@ -129,8 +130,17 @@ class Session:
     @property
     def frame(self) -> Frame:
         """What the player sees: uint8 [S, S, 3], or [S, 2 S, 3] with both twins."""
-        twins = (False, True) if self.both else (self.partial,)
-        return np.concatenate([self.view(partial)[0] for partial in twins], axis=1)
+        return np.concatenate([self.view(partial)[0] for partial in self._twins], axis=1)
+
+    @property
+    def picture(self) -> Frame:
+        """The frame, under the names of the twins that it shows."""
+        return captioned(self.frame, self._twins)
+
+    @property
+    def _twins(self) -> tuple[bool, ...]:
+        """Which twins are seen, by whether they are partial."""
+        return (False, True) if self.both else (self.partial,)
 
     @property
     def caption(self) -> str:

@@ -11,11 +11,13 @@ from typing import Any, get_args
 
 from arcade_torch.agents.config import TrainConfig, flatten, require
 from arcade_torch.agents.runs.files import write_atomic
-from arcade_torch.tools.comparable import Runs, check_comparable
+from arcade_torch.tools.comparable import Runs, check_comparable, import_notes
 from arcade_torch.tools.errors import need
+from arcade_torch.tools.exploring import stopped_exploring
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.imports import import_again
 from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
 from arcade_torch.tools.measures.counterfactual import figure as counterfactual
@@ -23,20 +25,30 @@ from arcade_torch.tools.measures.gap_bias import figure as gap_bias
 from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias, gap_and_bias, normalise
 from arcade_torch.tools.measures.recall_density import figure as recall_density
 from arcade_torch.tools.measures.saliency import figure as saliency
+from arcade_torch.tools.names import find_agent
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.panels import Finals
+from arcade_torch.tools.reports.subject import TRUSTED_COVERAGE, subject_section
 from arcade_torch.tools.runs import open_run
 from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 
 MANY_PANELS = 8  # from here on pictures of learning are small
-# below this measured coverage a difference is one of the seeds that were run
-TRUSTED_COVERAGE = 0.85
 
 Players = Mapping[str, Mapping[str, Baseline]]  # game -> player -> what it earned
+
+# how the measures of a report are taken, for its text
+_PROTOCOLS = {
+    "twin_names": TWIN_NAMES,
+    "density": recall_density.DENSITY,
+    "bins": recall_density.BINS,
+    "exchanges": counterfactual.EXCHANGES,
+    "noise": contamination.NOISE,
+    "powerless_below": contamination.POWERLESS_BELOW,
+}
 
 
 def report(
@@ -45,6 +57,7 @@ def report(
     *,
     metric: str = "eval_final",
     skip: Sequence[Part] = (),
+    subject: str = "",
     progress: Progress | None = None,
 ) -> Path:
     """Write the page of a study, one HTML file that loads nothing, and return its path.
@@ -59,19 +72,16 @@ def report(
         metric: score of a run that headline and table rest on, ``eval_final`` or ``train_max_ewm``.
         skip: parts to leave out: saliency strips, recall density, counterfactual recall, state
             contamination, returns of random policy and oracles.
+        subject: the agent, or its memory, that the page is about; by default that of the study, if
+            it has one.
         progress: called with (what, done, total).
 
     Raises:
         FileNotFoundError: ``root`` is no study.
-        ValueError: no run has finished yet, or there is no such part.
+        ValueError: no run has finished yet, or there is no such part or subject.
         MissingPackage: jinja2 is not installed.
     """
-    require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
-    unknown = sorted(set(skip) - set(get_args(Part)))
-    if unknown:
-        raise ValueError(
-            f"a report has no part {unknown[0]!r} to skip; parts: {', '.join(get_args(Part))}"
-        )
+    _check_options(metric, skip)
     environment = _environment()
     folder = StudyFolder(Path(root))
     study = folder.load()
@@ -80,26 +90,58 @@ def report(
     if not runs.runs:
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
     check_comparable(runs)
+    about = _subject(study, runs, subject)
     context: dict[str, Any] = {
         "study": study,
+        "changes": import_notes(runs.runs),
+        "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
-        "twin_names": TWIN_NAMES,
-        "density": recall_density.DENSITY,
-        "bins": recall_density.BINS,
-        "exchanges": counterfactual.EXCHANGES,
-        "noise": contamination.NOISE,
-        "powerless_below": contamination.POWERLESS_BELOW,
     }
+    context |= _PROTOCOLS
     with drawing("light"):
         players: Players = {}
         if "references" not in skip:
             players = _players(folder, runs, progress)
-        context |= _parts(study, runs, players, skip, progress)
-        context |= _scores(folder, study, runs, metric)
+        context |= _parts(study, runs, about, players, skip, progress)
+        context |= _scores(folder, study, runs, metric, about)
+    context["subject"] = None
+    if about:
+        rival = _rival(context["table"], about)
+        context["subject"] = subject_section(folder, runs, about, metric, rival)
     context |= _repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
+
+
+def _check_options(metric: str, skip: Sequence[str]) -> None:
+    """Refuse a metric or a part that there is not."""
+    require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
+    unknown = sorted(set(skip) - set(get_args(Part)))
+    if unknown:
+        raise ValueError(
+            f"a report has no part {unknown[0]!r} to skip; parts: {', '.join(get_args(Part))}"
+        )
+
+
+def _rival(table: GapBias | None, about: str) -> str:
+    """The agent that the headline holds the subject against; empty without a table."""
+    return "" if table is None else str(table.baselines[about])
+
+
+def _subject(study: Study, runs: Runs, subject: str) -> str:
+    """The agent that the page is about; empty if it is about all, or nothing is known of it yet."""
+    memories = {run.key.memory for run in runs.runs}
+    waits = study.subject in study.memories and study.subject not in memories
+    if not subject and (not study.subject or waits):
+        return ""
+    return find_agent(runs.names, subject or study.subject)
+
+
+def _stopped(runs: Runs) -> dict[str, str]:
+    """The runs that stopped exploring before they learned, name -> one line on it."""
+    lines = {run.path.name: stopped_exploring(run) for run in runs.runs}
+    return {name: line for name, line in lines.items() if line}
 
 
 def _environment() -> Any:
@@ -128,13 +170,18 @@ def _finished_runs(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str
 
 
 def _parts(
-    study: Study, runs: Runs, players: Players, skip: Sequence[Part], progress: Progress | None
+    study: Study,
+    runs: Runs,
+    subject: str,
+    players: Players,
+    skip: Sequence[Part],
+    progress: Progress | None,
 ) -> dict[str, Any]:
     """What the agents learned, and what a look into some of them shows."""
     agents = list(dict.fromkeys(runs.names[run.key] for run in runs.runs))
     finals = _finals(runs)
     parts = _learning(runs, finals, agents, players)
-    cells, note = panels.select_cells(runs, finals, study.baseline)
+    cells, note = panels.select_cells(runs, finals, study.baseline, subject)
     parts["note"] = note
     parts["colours"] = {agent: f"c{place}" for place, agent in enumerate(agents)}
     parts["palette"] = list(agent_colours(agents).values())
@@ -146,14 +193,14 @@ def _parts(
         parts["strips"] = saliency.saliency_strips(cells, progress)
     with_recall = "recall" not in skip
     if with_recall:
-        parts["recall"] = recall_density.recall_section(cells, agents, progress)
+        parts["recall"] = _unless_empty(recall_density.recall_section(cells, agents, progress))
     if "counterfactual" not in skip:
-        parts["counterfactual"] = counterfactual.counterfactual_section(
-            cells, agents, progress, with_recall
-        )
+        section = counterfactual.counterfactual_section(cells, agents, progress, with_recall)
+        parts["counterfactual"] = _unless_empty(section)
     parts["vanishing"] = _vanishing(parts["strips"], parts["counterfactual"])
     if "contamination" not in skip:
-        parts["contamination"] = contamination.contamination_section(cells, agents, progress)
+        section = contamination.contamination_section(cells, agents, progress)
+        parts["contamination"] = _unless_empty(section)
     return parts
 
 
@@ -171,6 +218,11 @@ def _vanishing(
     return list(dict.fromkeys(names))
 
 
+def _unless_empty(section: dict[str, Any]) -> dict[str, Any] | None:
+    """A section, or None if it has nothing to show or to say."""
+    return section if section["pictures"] or section["notes"] else None
+
+
 def _finals(runs: Runs) -> Finals:
     """The final greedy returns of the seeds of every agent, by task."""
     returns = {}
@@ -185,7 +237,9 @@ def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Play
     first_runs = {run.game: run for run in reversed(runs.runs)}
     games = dict.fromkeys(run.game for run in runs.runs)
     for done, game in enumerate(games, start=1):
-        config = first_runs[game].config
+        run = first_runs[game]
+        import_again(run.path)  # of a game of the user's
+        config = run.config
         rules = str(config.get("rules", "default"))
         options = dict(config.get("env_options") or {})
         players[game] = references(game, folder.analysis, rules, options)
@@ -244,7 +298,9 @@ def _final_row(agent: str, returns: Sequence[float], levels: Mapping[str, float]
     }
 
 
-def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[str, Any]:
+def _scores(
+    folder: StudyFolder, study: Study, runs: Runs, metric: str, subject: str
+) -> dict[str, Any]:
     """Gap and bias by both metrics, also written as CSV, and what they say; or why there are
     none.
     """
@@ -262,19 +318,21 @@ def _scores(folder: StudyFolder, study: Study, runs: Runs, metric: str) -> dict[
         "trouble": trouble,
         "table": table,
         "second": second[0] if second else None,
-        "sentences": _score_sentences(table) if table is not None else [],
+        "sentences": _score_sentences(table, subject) if table is not None else [],
         "score_panels": gap_bias.score_panels(table) if table is not None else [],
         "caution": coverage_sentence(table) if table is not None else "",
     }
 
 
-def _score_sentences(table: GapBias) -> list[str]:
-    """All findings, those about the agent with the highest return on the POMDP first."""
+def _score_sentences(table: GapBias, subject: str) -> list[str]:
+    """All findings, those about the subject first, and then about the agent with the highest return
+    on the POMDP.
+    """
     rows = []
     for row in table.rows:
         if table.baselines[row.agent] not in (None, row.agent):
             rows.append(row)
-    rows.sort(key=lambda row: -row.pomdp.value)
+    rows.sort(key=lambda row: (row.agent != subject, -row.pomdp.value))
     sentences = []
     for row in rows:
         for name in SENTENCES:

@@ -24,8 +24,10 @@ Finals = Mapping[tuple[str, str], Mapping[str, Sequence[float]]]
 Levels = Mapping[str, Mapping[str, float]]  # game -> player -> mean return
 
 
-def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[Cells, str]:
-    """The cells that are looked into, and a note on those that are not."""
+def select_cells(runs: Runs, finals: Finals, baseline: str, subject: str = "") -> tuple[Cells, str]:
+    """The cells that are looked into, those of the subject among them, and a note on those that are
+    not.
+    """
     cells = dict[tuple[str, str, str], list[Path]]()
     bare = 0
     most_seeds = 0
@@ -43,17 +45,21 @@ def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[Cells, str]
         if seeds:
             notes.append(f"Shown: {seeds} of each agent.")
         return cells, " ".join(notes)
-    agents, games = representatives(finals, baseline)
+    agents, games = representatives(finals, baseline, subject)
     all_agents = {agent for agent, _, _ in cells}
     all_games = {game for _, game, _ in cells}
     selection = f"{' and '.join(agents)} on {', '.join(games)}"
     if seeds:
         selection += f", {seeds}"
+    best = "the memory with the highest mean return where observations are partial"
+    if (len(agents), len(games)) == (len(all_agents), len(all_games)):
+        if seeds:
+            notes.append(f"Shown: {seeds} of each agent.")
+        return cells, " ".join(notes)
     notes.append(
-        f"Shown: {selection}, out of {len(all_agents)} agents and {len(all_games)} games: the "
-        "memory with the highest mean return where observations are partial, beside the "
-        "memory-free agent, on the "
-        "games where it is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
+        f"Shown: {selection}, out of {len(all_agents)} agents and {len(all_games)} games: "
+        f"{f'{subject}, ' if subject else ''}{best}, beside the memory-free agent, on the games "
+        f"where {subject or 'it'} is furthest ahead. Others: arcade-torch figure NAME --runs STUDY."
     )
     selected = {}
     for task, paths in cells.items():
@@ -63,9 +69,11 @@ def select_cells(runs: Runs, finals: Finals, baseline: str) -> tuple[Cells, str]
     return selected, " ".join(notes)
 
 
-def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]]:
-    """A memory-free agent (if there is one), the best agent with memory, and the games that tell
-    them apart.
+def representatives(
+    finals: Finals, baseline: str, subject: str = ""
+) -> tuple[list[str], list[str]]:
+    """A memory-free agent (if there is one), the best agent with memory, the subject, and the games
+    that tell the first and the last apart.
 
     Example:
         >>> both = {("A", "partial"): {"mlp": [0.1], "lru": [0.9]}}
@@ -86,10 +94,13 @@ def representatives(finals: Finals, baseline: str) -> tuple[list[str], list[str]
     free = [agent for agent in returns if memory_free(agent, baseline)]
     remembering = [agent for agent in returns if agent not in free]
     remembering.sort(key=lambda agent: -fmean(returns[agent]))
-    pair = [*free[:1], *remembering[:1]]
-    games = [game for game, agents in means.items() if set(pair) <= set(agents)]
-    games.sort(key=lambda game: means[game][pair[0]] - means[game][pair[-1]])
-    return pair, games[:MOST_GAMES]
+    selection = [*free[:1], *remembering[:1]]
+    if subject:
+        selection = [agent for agent in selection if agent != subject]
+        selection.append(subject)
+    games = [game for game, agents in means.items() if set(selection) <= set(agents)]
+    games.sort(key=lambda game: means[game][selection[0]] - means[game][selection[-1]])
+    return selection, games[:MOST_GAMES]
 
 
 def curve_panels(

@@ -34,8 +34,8 @@ from arcade_torch.agents.runs.files import (
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
+from arcade_torch.tools.imports import VARIABLE, imports_of, load_extensions
 from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores, keep_freed_memory
-from arcade_torch.tools.options import VARIABLE, load_extensions
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
@@ -45,6 +45,13 @@ _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DEDUP_LOGS": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+
+
+# what one worker has compiled, the others read: five seconds less of a core for each
+_KEEP_PROGRAMS = {
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
 
 
@@ -76,7 +83,7 @@ class Job(NamedTuple):
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
         config = TrainConfig.from_dict(read_json(self.config))
-        result = train(config, self.folder, resume=True)
+        result = train(config, self.folder, resume=True, imports=imports_of(config))
         if result.status == "interrupted":
             raise KeyboardInterrupt
 
@@ -142,8 +149,13 @@ class Processes:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
         to save.
         """
+        # in a folder that nobody else can write to: what is read from it is run
+        with tempfile.TemporaryDirectory(prefix="arcade-torch-") as programs:
+            yield from self._run(list(jobs), programs)
+
+    def _run(self, waiting: list[Job], programs: str) -> Iterator[JobResult]:
+        """The same, with a folder for compiled programs."""
         cores = available_cores()
-        waiting = list(jobs)
         active = dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
         # Fewer workers go where there is room: another study, or shard, may be at work on the same
         # machine.
@@ -155,7 +167,7 @@ class Processes:
                 while waiting and free:
                     job = waiting.pop(0)
                     where = free.pop(0)
-                    active[self._start(job, where)] = job, where
+                    active[self._start(job, where, programs)] = job, where
                 for process in list(active):
                     if process.poll() is not None:
                         job, where = active.pop(process)
@@ -173,12 +185,15 @@ class Processes:
                     process.kill()
                     process.wait()
 
-    def _start(self, job: Job, cores: set[int]) -> "subprocess.Popen[bytes]":
+    def _start(self, job: Job, cores: set[int], programs: str) -> "subprocess.Popen[bytes]":
         job.add_to_log("")
         environment = dict(os.environ)
         for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment[variable] = "1"
         environment[PARENT_VARIABLE] = str(os.getpid())
+        for variable, value in _KEEP_PROGRAMS.items():
+            environment.setdefault(variable, value)
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", programs)
         with open_append(job.log) as log:
             process = subprocess.Popen(
                 [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],

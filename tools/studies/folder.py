@@ -24,6 +24,7 @@ from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.comparable import FREE
 from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.imports import imports_of
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.runs import Run, described, read_record
@@ -150,6 +151,12 @@ class StudyFolder:
                 raise FileExistsError(
                     f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
                 )
+            changed = _changed_imports(run, config)
+            if changed:
+                raise FileExistsError(
+                    f"{run.path} was trained with {changed[0]} as it was before it changed: choose "
+                    "another --out"
+                )
 
     def _new_record(self, study: Study, command: str, old: dict[str, Any]) -> dict[str, Any]:
         """What ``study.json`` is to hold; the versions of the first runs stay on record."""
@@ -229,6 +236,12 @@ def _final_columns(final: Mapping[str, Any]) -> Row:
         squares = sum((value - mean) ** 2 for value in returns)
         columns["eval_std"] = (squares / (len(returns) - 1)) ** 0.5
     return columns
+
+
+def _changed_imports(run: Run, plan: TrainConfig) -> list[str]:
+    """The files that a run was trained with and that are imported otherwise, or not at all, now."""
+    now = {entry["sha256"] for entry in imports_of(plan)}
+    return [name for name, sha256 in run.imports.items() if sha256 not in now]
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:

@@ -44,6 +44,7 @@ _OTHERS = {
     "preset": str,
     "baseline": str,
     "question": str,
+    "subject": str,
 }
 """The same of what is no axis."""
 _FRAMES = Annotated[int, Range("from 1 to 10**15", lambda frames: 1 <= frames <= 10**15)]
@@ -95,6 +96,8 @@ class Study:
     # of the memory block, ``2x512``; the memory-free agent keeps the preset's
     sizes: tuple[str, ...] = ()
     question: str = ""  # what the study asks, a sentence for its report
+    # the memory, or the agent, that the report is about: it is compared with every other
+    subject: str = ""
 
     def __post_init__(self) -> None:
         for name, kind in _OTHERS.items():
@@ -137,6 +140,7 @@ class Study:
             study = cls.from_dict({"name": path.stem} | values)
             if "baseline" in values:
                 study.require_baseline()
+            study.require_subject()
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"no study at {path}: give a TOML file with games, memories and seeds"
@@ -165,6 +169,20 @@ class Study:
                 f"baseline = {self.baseline!r} is none of the agents that this study trains, "
                 f"{', '.join(names)}: "
                 "add it to memories, or name one of them"
+            )
+
+    def require_subject(self) -> None:
+        """Refuse a subject that the study does not train; an empty one is none."""
+        if not self.subject:
+            return
+        agents = product(self.algorithms, self.memories)
+        names = list(agent_names(AgentKey(*agent) for agent in agents).values())
+        for run in self.runs():
+            names.append(run.agent)
+        if self.subject not in (*self.memories, *names):
+            raise ValueError(
+                f"subject = {self.subject!r} is none of the agents that this study trains, "
+                f"{', '.join(dict.fromkeys(names))}"
             )
 
     def overridden_preset(self) -> str:
@@ -274,6 +292,26 @@ def demo_study(games: tuple[str, ...], frames: int, seeds: int) -> Study:
         "POMDPs (partial)?"
     )
     return replace(study, question=question)
+
+
+def compare_study(
+    memory: str, against: Sequence[str], games: tuple[str, ...], frames: int, seeds: int
+) -> Study:
+    """The study behind ``arcade-torch compare``: one memory model beside others, as `demo` trains
+    them, and a report about the one.
+    """
+    others = [Study.baseline if name == "none" else name for name in against]
+    changes = {
+        "name": f"compare-{memory}",
+        "games": games,
+        "memories": (memory, *others),
+        "seeds": seeds,
+        "total_frames": frames,
+        "subject": memory,
+        "question": f"What does {memory} remember that {' and '.join(others)} do not, or the other "
+        "way round, and what does it cost where nothing has to be remembered (MDP)?",
+    }
+    return Study.from_dict(study_preset("demo").to_dict() | changes)
 
 
 def _text_of(path: Path) -> str:

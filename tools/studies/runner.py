@@ -192,6 +192,7 @@ def _check_names(plan: Study) -> None:
             raise ValueError(f"memories = {first}, {memory} are one memory model: give it once")
     if plan.baseline != Study.baseline:
         plan.require_baseline()
+    plan.require_subject()
 
 
 class Results:

@@ -280,6 +280,14 @@ def test_what_would_be_measured_wrong_is_refused_in_one_line() -> None:
         ValueError, match=r"^the env must have the frames under \('view', 'image'\), g"
     ):
         greedy_window(policy_of(), GymEnv("CartPole-v1"), pixels_key=("view", "image"))
+    more = TensorDictModule(nn.Linear(4, 2 * ACTIONS), ["observation"], ["action_value"])
+    for cartpole in (
+        GymEnv("CartPole-v1"),
+        GymEnv("CartPole-v1", categorical_action_encoding=True),
+    ):
+        more.module.bias.data = 100 * torch.arange(2.0 * ACTIONS)  # the last is always best
+        with pytest.raises(ValueError, match=r"^actions must be below 2, the number of the env's"):
+            greedy_window(more, cartpole)
     continuous = TensorDictModule(Flat((7,), 1), [("view", "image")], ["move"])
     with pytest.raises(ValueError, match=r"^the policy must write action_value, logits or probs"):
         greedy_window(continuous, Foreign("vector"), **NAMES)

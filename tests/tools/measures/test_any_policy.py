@@ -305,6 +305,40 @@ def test_a_value_beside_logits_is_looked_at_and_a_head_alone_is_not_taken_for_bo
     assert as_policy(network.critic).offers == ("value",)
 
 
+class InPlace(TensorDictModuleBase):
+    """A cell whose next state takes the place of the one before, below a nested key."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell = nn.GRUCell(WIDTH, WIDTH)
+        self.in_keys = ["features", ("m", "h")]
+        self.out_keys = ["remembered", ("m", "h")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        hidden = self.cell(tensordict["features"], tensordict["m", "h"])
+        return tensordict.set("remembered", hidden).set(("m", "h"), hidden)
+
+
+def test_a_state_that_is_handed_over_stays_as_it_is() -> None:
+    torch.manual_seed(0)
+    network = TensorDictSequential(
+        TensorDictModule(Encoder(), ["pixels"], ["features"]),
+        InPlace(),
+        TensorDictModule(nn.Linear(WIDTH, ACTIONS), ["remembered"], ["action_value"]),
+    )
+    start = TensorDict({"m": TensorDict({"h": torch.zeros(WIDTH)}, [])}, [])
+    policy = as_policy(network, state_keys={("m", "h"): ("m", "h")}, initial_state=start)
+    pixels = frames(4)[None]
+    state = policy.initial_state(1)
+    before = state.clone()
+    actions, after = act(policy, pixels, torch.zeros(1, 4, dtype=torch.bool), state)
+    outputs, replayed = policy.unroll(policy.features(pixels, batch_ndim=2), state=state)
+    assert (state == before).all() and not (after == before).all()
+    assert torch.equal(outputs.argmax(-1), actions)
+    torch.testing.assert_close(replayed["m", "h"], after["m", "h"])
+    assert not start["m", "h"].any()
+
+
 def test_keys_are_told_apart_or_named() -> None:
     torch.manual_seed(0)
     encode = TensorDictModule(Encoder(), [("seen", "image")], ["features"])

@@ -22,6 +22,8 @@ from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
 from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, new_figure, panels
 from arcade_torch.tools.measures import checkpoints
+from arcade_torch.tools.measures.beliefs import figure as beliefs
+from arcade_torch.tools.measures.beliefs.measure import Beliefs
 from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task
 from arcade_torch.tools.measures.contamination import ContaminationOptions
@@ -523,6 +525,72 @@ def test_counterfactual_recall_of_checkpoints_is_drawn_with_its_numbers(
     assert "--lags must be at least 1" in refused(capsys, *words, "--lags", "0")
 
 
+def test_beliefs_of_checkpoints_are_drawn_with_their_numbers(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(run) for run in sorted(trained.iterdir())]
+    words = ["analyze", "beliefs", *runs, "--episodes", "16", "--max-steps", "5"]
+    words += ["--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "hidden facts that can be read" in text and "gru on" in text
+    assert "whose decision an exchanged state brings" in text
+    name = tmp_path / "beliefs-MineSweeperEasy-v0-full"
+    assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
+    rows = read_csv(name.with_suffix(".csv"))
+    assert [row["step"] for row in rows[:6]] == ["all", "0", "1", "2", "3", "4"]
+    assert {(row["fact"], row["source"]) for row in rows} == {
+        (fact, source) for fact in ("mine", "swept") for source in ("state", "frame")
+    }
+    assert rows[0]["seeds"] == "2"
+    assert float(rows[0]["low"]) <= float(rows[0]["score"]) <= float(rows[0]["high"])
+    assert "--episodes must be at least 8" in refused(capsys, *words, "--episodes", "7")
+    assert "--max-steps must be at least 1" in refused(capsys, *words, "--max-steps", "0")
+
+
+def probes(state: float | None, frame: float, fact: str = "sign") -> Beliefs:
+    """Two episodes of two steps in which a guess is always wrong, and probes with such scores."""
+    guess = np.ones((1, 2, 2))
+    return Beliefs(
+        names=np.array([fact]),
+        is_class=np.array([True]),
+        cells=np.array([1]),
+        guess_loss=guess,
+        state_loss=guess * (np.nan if state is None else 1 - state),
+        frame_loss=guess * (1 - frame),
+        constant=np.array(["sky"]),
+        state_width=0 if state is None else 3,
+        frame_width=4,
+        episodes=8,
+    )
+
+
+def test_probes_pool_seeds_and_an_agent_without_memory_has_no_bar_of_a_state() -> None:
+    scores = {
+        "lru": beliefs.scores_of([probes(0.9, 0.2), probes(0.7, 0.4)]),
+        "mlp": beliefs.scores_of([probes(None, 0.3)]),
+    }
+    overall = scores["lru"]["sign", "state"].overall
+    assert overall.value == pytest.approx(0.8) and 0.7 <= overall.low < 0.8 < overall.high
+    np.testing.assert_allclose(scores["lru"]["sign", "frame"].by_step, [0.3, 0.3])
+    assert list(scores["mlp"]) == [("sign", "frame")]
+    with drawing("light"):
+        axis = panels(1, 1, (4, 3))[1][0, 0]
+        beliefs.plot_bars(scores, axis, {"lru": "#0072b2", "mlp": "#000000"})
+        heights = [bar.get_height() for bar in axis.patches]
+        axis = panels(1, 1, (4, 3))[1][0, 0]
+        beliefs.plot_steps(scores, "sign", axis, {"lru": "#0072b2", "mlp": "#000000"})
+    np.testing.assert_allclose(heights, [0.8, 0.3, 0.3])
+    assert [line.get_linestyle() for line in axis.lines[:3]] == ["-", "--", "--"]
+
+
+def test_probes_say_who_has_no_memory_and_what_did_not_vary() -> None:
+    label = Label(AgentKey("pqn", "mlp"), "SignpostEasy-v0", "partial", 0, Path("run"), "mlp")
+    no_state, left_out = beliefs._notes([(label, probes(None, 0.3))])
+    assert "mlp on SignpostEasy-v0 (partial), seed 0 has no recurrent state" in no_state
+    assert left_out.endswith("sky did not vary, and can be read off nothing")
+
+
 def exchanges(flip: Sequence[float], state: float, **other: Any) -> Counterfactual:
     """One decision with two donors, of which the second alone differs, and changes nothing else."""
     lags = np.stack([np.zeros(len(flip)), np.array(flip)], -1)[None]
@@ -666,7 +734,7 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
-    monkeypatch.setattr(checkpoints, "load", lambda path: agent)
+    monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
     for value in (1.0, 2.0, 1.0):
         torch.nn.init.constant_(agent.network.weight, value)

@@ -359,9 +359,14 @@ def _cell(interval: Interval) -> str:
 
 
 def score_panels(table: GapBias) -> list[str]:
-    """Pictures of normalised returns on both twins, Gap and Bias."""
+    """Pictures of normalised returns on both twins, Gap and Bias; no Bias where there are only
+    memory-free agents.
+    """
     pictures = []
     for name in PANELS:
+        rows = [row for row in table.rows if row.agent != table.baselines[row.agent]]
+        if name == "bias" and not any(map(_has_bias, rows)):
+            continue
         figure, axes = panels(1, 1, style.PANEL)
         plot_bars(table.rows, axes[0, 0], name)
         pictures.append(style.svg(figure, name))

@@ -266,7 +266,7 @@ def _place(task: str) -> tuple[str, int, str]:
     return game, DIFFICULTIES.index(rest) if rest in DIFFICULTIES else -1, task
 
 
-def _generator(seed: int, agent: str, task: str, twin: str) -> np.random.Generator:
+def generator_of(seed: int, agent: str, task: str, twin: str) -> np.random.Generator:
     """The draws of a cell: the same whatever else is in the table, and in which order it was
     met.
     """
@@ -335,7 +335,7 @@ def _returns(
     scaled = list[Array]()
     for task in tasks:
         seeds = cells[agent, task, twin]
-        (drawn,) = bootstrap.resampled([seeds], draws, _generator(seed, agent, task, twin))
+        (drawn,) = bootstrap.resampled([seeds], draws, generator_of(seed, agent, task, twin))
         returns = np.vstack([seeds, drawn])
         raw.append(returns)
         scaled.append(normalise(task, returns))

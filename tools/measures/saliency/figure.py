@@ -172,7 +172,8 @@ def _strip(episode: EpisodeSaliency) -> dict[str, Any]:
     shares = 100 * episode.shares()
     count = min(SHOW, len(episode.frames))
     lines = math.ceil(count / 4)
-    figure, axes = panels(lines, 4, (4.8, 1.4 * lines))
+    columns = math.ceil(count / lines)
+    figure, axes = panels(lines, columns, (0.9 * columns, 1.1 * lines))
     for axis in axes.flat[count:]:
         axis.set_axis_off()
     peak = plot(episode.frames, episode.maps, axes.flat[:count], below=shares)

@@ -1,0 +1,108 @@
+"""The LSTM is torch's, with starts in the middle of a sequence; its numbers are pinned."""
+
+import pytest
+import torch
+from torch import nn
+
+from arcade_torch.models import make_memory
+from arcade_torch.models.lstm import lstm_loop, lstm_scan, lstm_scan_backward
+
+F64 = torch.float64
+
+
+def pair() -> tuple[nn.Module, nn.LSTM]:
+    """Ours and torch's with the same weights."""
+    theirs = nn.LSTM(3, 5, batch_first=True, dtype=F64)
+    ours = make_memory("lstm", 3, 5).to(F64)
+    with torch.no_grad():
+        ours.from_input.weight.copy_(theirs.weight_ih_l0)
+        ours.from_input.bias.copy_(theirs.bias_ih_l0 + theirs.bias_hh_l0)
+        ours.from_state.weight.copy_(theirs.weight_hh_l0)
+    return ours, theirs
+
+
+def test_values_states_and_gradients_are_those_of_torch() -> None:
+    ours, theirs = pair()
+    x = torch.randn(2, 9, 3, dtype=F64)
+    h, c = torch.randn(2, 2, 5, dtype=F64)
+    state = ours.initial_state(2).set("h", torch.stack([h, c], dim=1))
+    y, after = ours(x, state, torch.zeros(2, 9, dtype=torch.bool))
+    wanted, (last_h, last_c) = theirs(x, (h[None], c[None]))
+    torch.testing.assert_close(y, wanted, rtol=0, atol=1e-14)
+    torch.testing.assert_close(after["h"][:, 0], last_h[0], rtol=0, atol=1e-14)
+    torch.testing.assert_close(after["h"][:, 1], last_c[0], rtol=0, atol=1e-14)
+
+    direction = torch.randn_like(y)
+    (y * direction).sum().backward()
+    (wanted * direction).sum().backward()
+    for mine, torchs in (
+        (ours.from_input.weight, theirs.weight_ih_l0),
+        (ours.from_input.bias, theirs.bias_ih_l0),
+        (ours.from_state.weight, theirs.weight_hh_l0),
+    ):
+        torch.testing.assert_close(mine.grad, torchs.grad, rtol=1e-12, atol=1e-13)
+
+
+def test_a_start_in_the_middle_is_torchs_lstm_begun_again() -> None:
+    ours, theirs = pair()
+    x = torch.randn(2, 9, 3, dtype=F64)
+    is_init = torch.zeros(2, 9, dtype=torch.bool)
+    is_init[:, 4] = True
+    y, _ = ours(x, ours.initial_state(2), is_init)
+    wanted = torch.cat([theirs(x[:, :4])[0], theirs(x[:, 4:])[0]], dim=1)
+    torch.testing.assert_close(y, wanted, rtol=0, atol=1e-14)
+
+
+def problem() -> list[torch.Tensor]:
+    """Random arguments of the scan, with a start at index 0."""
+    steps = torch.randn(2, 6, 12, dtype=F64, requires_grad=True)
+    weight = torch.randn(12, 3, dtype=F64, requires_grad=True)
+    stored = torch.randn(2, 6, 2, 3, dtype=F64, requires_grad=True)
+    start = torch.rand(2, 6) < 0.4
+    start[:, 0] = True
+    return [steps, weight, start, stored]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_operator_equals_the_loop_values_and_gradients(seed: int) -> None:
+    torch.manual_seed(seed)
+    arguments = problem()
+    ours = lstm_scan(*arguments)[0]
+    plain = lstm_loop(*arguments)[0]
+    torch.testing.assert_close(ours, plain, rtol=0, atol=0)
+    leaves = [x for x in arguments if x.requires_grad]
+    direction = torch.randn_like(plain)  # at h and at c
+    gradients = torch.autograd.grad(ours, leaves, direction)
+    wanted = torch.autograd.grad(plain, leaves, direction)
+    torch.testing.assert_close(gradients, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_opcheck_passes() -> None:
+    arguments = problem()
+    torch.library.opcheck(lstm_scan, arguments)
+    with torch.no_grad():
+        states, gates = lstm_scan(*arguments)
+    detached = [x.detach() for x in arguments[1:]]
+    torch.library.opcheck(lstm_scan_backward, (*detached, states, gates, torch.randn_like(states)))
+
+
+def test_initial_weights_are_drawn_as_torch_draws_them() -> None:
+    weights = torch.cat([p.flatten() for p in make_memory("lstm", 64, 256).parameters()])
+    assert weights.abs().max() <= 1 / 16
+    assert float(weights.detach().std()) == pytest.approx(1 / 16 / 3**0.5, rel=0.02)
+
+
+@torch.no_grad()
+def test_one_forward_pass_is_pinned() -> None:
+    memory = make_memory("lstm", 2, 2).double()
+    for number, parameter in enumerate(memory.parameters(), 1):
+        places = torch.arange(parameter.numel(), dtype=F64)
+        parameter.copy_(torch.sin(number + places).view_as(parameter))
+    x = torch.cos(torch.arange(6, dtype=F64)).view(1, 3, 2)
+    y, state = memory(x, memory.initial_state(1), torch.zeros(1, 3, dtype=torch.bool))
+    torch.testing.assert_close(y[0], torch.tensor(PINNED, dtype=F64), rtol=0, atol=1e-6)
+    assert torch.equal(state["h"][0, 0], y[0, -1])
+
+
+PINNED = [[-0.12554549, -0.18269191], [0.03346850, 0.36448462], [-0.26381443, 0.19179912]]
+"""Of torch.nn.LSTM 2.13."""

@@ -1,0 +1,282 @@
+"""``--import`` of a user's games and models, and what runs remember of it.
+
+A run folder keeps the absolute path and the SHA-256 of the files that its game or memory model came
+from. That says what to import, and never that it may be: a folder can come from somebody else and
+name any file of this machine. So every file behind ``--import`` is also noted in a record of the
+user, outside of all run folders, and what a run remembers is imported again only where that record
+holds the same path with the same hash.
+"""
+
+import contextlib
+import hashlib
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
+from arcade_torch.tools.errors import one_line
+
+if TYPE_CHECKING:
+    from arcade_torch.agents.config import TrainConfig
+    from arcade_torch.agents.policy import Agent
+
+FLAG = "--import"
+VARIABLE = "ARCADE_TORCH_IMPORT"
+"""Environment variable that hands what was imported on to worker processes; entries separated like
+those of PATH.
+"""
+MOST_SOURCE = 16 * 2**20
+"""Bytes of the largest file that is imported."""
+MOST_REMEMBERED = 100
+"""Imports of one run."""
+MOST_TRUSTED = 1_000
+"""Entries in the user's record; the oldest are forgotten."""
+Import = dict[str, str]
+"""``name``, of a file its absolute path, and ``sha256``, which is empty for a module."""
+
+_HASH = re.compile("[0-9a-f]{64}")
+_hashes: dict[str, str] = {}  # file that was imported in this process -> SHA-256 of its text
+_again: set[str] = set()  # what was imported in this process because a run remembers it
+
+
+class ImportRefusedError(RuntimeError):
+    """What a run remembers may not be imported again, or is not there as it was."""
+
+
+def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate ``--import`` from a command line: what to import (files as absolute paths), and the
+    remaining words.
+
+    Example:
+        >>> take_imports(["train", "--import", "my_games", "--env", "PairsEasy"])
+        (['my_games'], ['train', '--env', 'PairsEasy'])
+    """
+    modules = list[str]()
+    rest = list[str]()
+    pending = iter(words)
+    for word in pending:
+        flag, equals, value = word.partition("=")
+        if flag != FLAG:
+            rest.append(word)
+            continue
+        name = value if equals else next(pending, "")
+        if not name or "\0" in name:
+            raise ValueError(
+                f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
+                "something"
+            )
+        modules.append(str(Path(name).resolve()) if _is_file(name) else name)
+    return modules, rest
+
+
+def import_for_command(names: Sequence[str]) -> None:
+    """Import what stands behind ``--import``, and note its files in the user's record; raises as
+    `load_extensions`.
+    """
+    load_extensions(names)
+    chosen = [[name, _hashes[name]] for name in names if name in _hashes]
+    if not chosen:
+        return
+    entries = [entry for entry in _trusted() if entry not in chosen]
+    # without a home, or on a disk that takes no files, --import has to be given every time
+    with contextlib.suppress(OSError, RuntimeError):
+        write_json(record_file(), [*entries, *chosen][-MOST_TRUSTED:])
+
+
+def load_extensions(names: Sequence[str] = ()) -> None:
+    """Import files and modules that register games or memory models, once a process, and all that a
+    parent process did.
+
+    Raises:
+        FileNotFoundError: there is no such file or module.
+        ValueError: it could not be imported; says why in one line.
+    """
+    if wanted := list(dict.fromkeys([*imported(), *names])):
+        for name in wanted:
+            _load(name)
+        os.environ[VARIABLE] = os.pathsep.join(wanted)
+
+
+def imported() -> list[str]:
+    """What is imported in this process and its workers."""
+    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+
+
+def imports_of(config: "TrainConfig") -> list[Import]:
+    """What a run has to remember: all that is imported, or nothing if its game and its memory are
+    of this package.
+    """
+    from arcade_torch.envs_jax.registry import is_built_in as is_our_game
+
+    if is_our_game(config.env) and not is_from_user(config.memory):
+        return []
+    return [{"name": name, "sha256": _hashes.get(name, "")} for name in imported()]
+
+
+def is_from_user(memory: str) -> bool:
+    """Whether a memory model is none of this package."""
+    from arcade_torch.models.presets import FEED_FORWARD
+    from arcade_torch.models.registry import is_built_in
+
+    return memory != FEED_FORWARD and not is_built_in(memory)
+
+
+def import_again(path: Path) -> None:
+    """Import what the run at a path remembers, if the user has imported it on this machine before.
+
+    An ``--import`` that was given to this process takes the place of what runs remember.
+
+    Args:
+        path: a run folder, its ``checkpoints`` folder, or one of its checkpoints; where there is no
+            ``config.json`` nothing happens.
+
+    Raises:
+        ImportRefusedError: the user has not imported that file here, it has changed since, or it is
+            gone; says how to go on.
+        ValueError: the ``config.json`` is damaged, or the file cannot be imported.
+    """
+    if set(imported()) - _again:
+        return
+    absolute = path.absolute()
+    for folder in (absolute, *absolute.parents[:2]):
+        file = folder / "config.json"
+        if file.is_file():
+            for name, sha256 in remembered_imports(read_json(file), file).items():
+                _import_again(path, name, sha256)
+            return
+
+
+def load_agent(path: Path) -> "Agent":
+    """The agent of a run or a checkpoint, after `import_again`; raises as `agents.load` too."""
+    from arcade_torch.agents.policy import load
+
+    import_again(path)
+    return load(path)
+
+
+def remembered_imports(record: Any, file: Path) -> dict[str, str]:
+    """The imports in what a ``config.json`` holds, name -> SHA-256; a ``ValueError`` if they are
+    damaged.
+    """
+    imports = record.get("imports", []) if isinstance(record, Mapping) else []
+    if not isinstance(imports, list) or len(imports) > MOST_REMEMBERED:
+        raise ValueError(f"{file} is damaged: its imports are no list of at most {MOST_REMEMBERED}")
+    hashes = dict[str, str]()
+    for entry in imports:
+        if not isinstance(entry, dict) or not _is_import(entry.get("name"), entry.get("sha256")):
+            raise ValueError(f"{file} is damaged: an import has a name and a sha256")
+        hashes[entry["name"]] = entry["sha256"]
+    return hashes
+
+
+def _is_import(name: object, sha256: object) -> bool:
+    """Whether these are the name of a module, or the path of a file and its hash."""
+    if not isinstance(name, str) or not isinstance(sha256, str) or not name or "\0" in name:
+        return False
+    return not sha256 or (_HASH.fullmatch(sha256) is not None and os.path.isabs(name))
+
+
+def _import_again(run: Path, name: str, sha256: str) -> None:
+    """Import one file; one that the user has not imported before is not even opened."""
+    if not sha256 or [name, sha256] not in _trusted():
+        raise ImportRefusedError(
+            f"{run} imported {name}, which you have not imported on this machine: pass "
+            f"{FLAG} {name} if you trust it"
+        )
+    changed = ImportRefusedError(
+        f"{run} imported {name}, which has changed since: pass {FLAG} {name} to take it as it is "
+        "now"
+    )
+    if _hashes.get(name, sha256) != sha256:
+        raise changed
+    try:
+        text = read_bytes(Path(name), MOST_SOURCE)
+    except FileNotFoundError:
+        raise ImportRefusedError(
+            f"{run} imported {name}, which is not there any more: pass {FLAG} with its new place"
+        ) from None
+    if hashlib.sha256(text).hexdigest() != sha256:
+        raise changed
+    _load(name, text)
+    _again.add(name)
+    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*imported(), name]))
+
+
+def record_file() -> Path:
+    """The user's record of the files that were imported on this machine."""
+    state = os.environ.get("XDG_STATE_HOME", "")
+    folder = Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state"
+    return folder / "arcade-torch" / "imports.json"
+
+
+def _trusted() -> list[Any]:
+    """Path and hash of the files in the user's record; none if it is damaged."""
+    try:
+        entries = read_json(record_file())
+    except (OSError, ValueError, RuntimeError):
+        return []
+    return entries if isinstance(entries, list) else []
+
+
+def _is_file(name: str) -> bool:
+    return name.endswith(".py") or os.sep in name
+
+
+class _Source(SourceFileLoader):
+    """Runs the very text that was hashed: compiled files beside it are neither read nor written."""
+
+    def __init__(self, module: str, path: str, text: bytes) -> None:
+        super().__init__(module, path)
+        self._text = text
+
+    def get_data(self, path: str) -> bytes:
+        """The text, whatever the path."""
+        return self._text
+
+    def path_stats(self, path: str) -> Mapping[str, Any]:
+        """Say that nothing is known of the file, so that no compiled one is taken for it."""
+        raise OSError("only the text counts")
+
+
+def _load(name: str, text: bytes | None = None) -> None:
+    """Import a module, or a file, of which the text may have been read already."""
+    if _is_file(name) and not Path(name).is_file():
+        raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
+    try:
+        if _is_file(name):
+            _run_file(name, text)
+        else:
+            importlib.import_module(name)
+    except Exception as error:
+        if not isinstance(error, ModuleNotFoundError):
+            why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
+        elif error.name and (name == error.name or name.startswith(f"{error.name}.")):
+            raise FileNotFoundError(
+                f"{FLAG} {name}: there is no module of that name; a file needs its .py"
+            ) from error
+        else:
+            why = f"it imports {error.name}, which is not installed"
+        raise ValueError(f"{FLAG} {name}: {why}") from error
+
+
+def _run_file(name: str, text: bytes | None) -> None:
+    """Import a file under a name of its own, so that two files of one name do not meet."""
+    module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    if module in sys.modules:
+        return
+    if text is None:
+        text = read_bytes(Path(name), MOST_SOURCE)
+    loader = _Source(module, name, text)
+    spec: Any = importlib.util.spec_from_file_location(module, name, loader=loader)
+    sys.modules[module] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(sys.modules[module])
+    except BaseException:
+        del sys.modules[module]
+        raise
+    _hashes[name] = hashlib.sha256(text).hexdigest()

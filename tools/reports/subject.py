@@ -1,0 +1,140 @@
+"""The part of a report about its subject: one agent beside every other, and what each costs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.tools.comparable import Runs
+from arcade_torch.tools.errors import one_line
+from arcade_torch.tools.figures.style import TWIN_NAMES
+from arcade_torch.tools.files import write_csv
+from arcade_torch.tools.imports import ImportRefusedError, import_again
+from arcade_torch.tools.measures.bootstrap import measured_coverage
+from arcade_torch.tools.measures.gap_bias.pairs import Pair, pair_rows, pairs
+from arcade_torch.tools.runs import Run
+from arcade_torch.tools.studies.folder import StudyFolder
+
+# below this measured coverage a difference is one of the seeds that were run
+TRUSTED_COVERAGE = 0.85
+MEANS = {"full": "mean of the MDPs", "partial": "mean of the POMDPs", "": "mean of all"}
+"""Rows over all games, by twin."""
+
+
+def subject_section(
+    folder: StudyFolder, runs: Runs, subject: str, metric: str, rival: str
+) -> dict[str, Any]:
+    """Sentences and tables on one agent against each of the others; the differences are written as
+    CSV too. The sentences on Gap and Bias compare it with ``rival`` already.
+    """
+    table = pairs(runs.scores(metric), subject)
+    write_csv(folder.analysis / f"differences_{metric}.csv", pair_rows(table, subject))
+    others = list(dict.fromkeys(pair.other for pair in table))
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    has_one_game = len({pair.game for pair in table if pair.game}) == 1
+    for pair in table:
+        if has_one_game and not pair.game and pair.twin:
+            continue  # the mean of one
+        name = f"{pair.game} {TWIN_NAMES[pair.twin]}" if pair.game else MEANS[pair.twin]
+        row = {"name": name, "is_mean": not pair.game, "mine": pair.subject_return, "pairs": {}}
+        rows.setdefault((pair.game, pair.twin), row)["pairs"][pair.other] = pair
+    sentences = list[str]()
+    for other in others:
+        if other != rival:
+            sentences.append(subject_sentence(table, subject, other))
+    cost_rows, trouble = costs(runs)
+    return {
+        "name": subject,
+        "others": others,
+        "rows": list(rows.values()),
+        "sentences": sentences,
+        "costs": cost_rows,
+        "trouble": trouble,
+    }
+
+
+def subject_sentence(table: Sequence[Pair], subject: str, other: str) -> str:
+    """What one agent earns against another where something has to be remembered, and where not."""
+    clauses = []
+    for twin, place in (("partial", "On the POMDP"), ("full", "on the MDP")):
+        of_twin = [pair for pair in table if (pair.twin, pair.other) == (twin, other)]
+        if of_twin:
+            *tasks, mean = of_twin
+            clauses.append(f"{place} {_verdict(mean, len(tasks), subject)}")
+    sentence = "; ".join(clauses)
+    return f"{sentence[0].upper()}{sentence[1:]}." if sentence else ""
+
+
+def _verdict(pair: Pair, tasks: int, subject: str) -> str:
+    """Two returns, and how sure their difference is."""
+    fact = (
+        f"{subject} reaches a normalised return of {pair.subject_return:.2f} and {pair.other} "
+        f"{pair.other_return:.2f}"
+    )
+    difference = pair.difference
+    if not difference.exists:
+        return f"{fact}, with a single seed, which says nothing about others"
+    if difference.low == difference.high == 0:
+        return f"{fact}, with no difference in any seed"
+    ends = f"{difference.value:+.2f} [{difference.low:+.2f}, {difference.high:+.2f}]"
+    if not difference.excludes_zero:
+        return f"{fact}: {ends} contains zero, so {pair.seeds} seeds do not settle it"
+    seeds = (pair.seeds,) * tasks
+    trusted = measured_coverage(seeds, seeds) >= TRUSTED_COVERAGE
+    place = "ahead" if difference.value > 0 else "behind"
+    return f"{fact}: {place} by {ends}" + ("" if trusted else f" over these {pair.seeds} seeds")
+
+
+def costs(runs: Runs) -> tuple[list[dict[str, Any]], str]:
+    """What every agent costs: parameters, recurrent state, and the speed of its trainings; and why
+    something is missing.
+    """
+    by_agent: dict[str, list[Run]] = {}
+    for run in runs.runs:
+        by_agent.setdefault(runs.names[run.key], []).append(run)
+    rows = list[dict[str, Any]]()
+    trouble = ""
+    for agent, of_agent in by_agent.items():
+        frames = 0.0
+        seconds = 0.0
+        for run in of_agent:
+            final = run.final or {}
+            frames += float(final.get("frames") or 0)
+            seconds += float(final.get("seconds") or 0)
+        row: dict[str, Any] = {"agent": agent, "parameters": None}
+        row["fps"] = frames / seconds if seconds else None
+        row["seconds"] = seconds / len(of_agent) if seconds else None
+        try:
+            row |= _sizes(of_agent[0])
+        except (ImportRefusedError, ValueError, TypeError) as error:
+            trouble = f"Parameters of {agent} are not known: {one_line(error)}."
+        rows.append(row)
+    return rows, trouble
+
+
+def _sizes(run: Run) -> dict[str, int]:
+    """Parameters of a run's network and of the memory in it, and bytes of the recurrent state of
+    one environment.
+    """
+    from arcade_torch.agents.policy import build_network
+    from arcade_torch.models.networks import MemoryBlock
+
+    import_again(run.path)
+    config = TrainConfig.from_dict(run.config | {"device": "cpu", "cuda_graphs": False})
+    network: Any = build_network(config)
+    cells = []
+    for module in network.modules():
+        if isinstance(module, MemoryBlock):
+            cells += list(module.cells)
+    state_bytes = 0
+    for leaf in network.initial_state(1).values(True, True):
+        state_bytes += leaf.nbytes
+    return {
+        "parameters": _count(network),
+        "memory_parameters": sum(map(_count, cells)),
+        "state_bytes": state_bytes,
+    }
+
+
+def _count(module: Any) -> int:
+    """Numbers that a module learns."""
+    return sum(parameter.numel() for parameter in module.parameters())
