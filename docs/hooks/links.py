@@ -15,6 +15,7 @@ PAGES = {
     "results/gpu-rehearsal.md": "results/gpu-rehearsal.md",
     "results/gpu-aot.md": "results/gpu-aot.md",
     "results/probe.md": "results/probe.md",
+    "results/memory.md": "results/memory.md",
     "results/recipe.md": "results/recipe.md",
     "examples/notebooks": "notebooks.md",
 }

@@ -20,7 +20,7 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.figures import CurveOptions, PaperOptions, logs
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
-from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, panels
+from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, new_figure, panels
 from arcade_torch.tools.measures import checkpoints
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.beliefs.measure import Beliefs
@@ -631,7 +631,8 @@ def test_profiles_pool_seeds_of_different_lengths_and_a_single_one_over_its_epis
     assert of_state.get_xdata().tolist() == [3.5]
     assert of_state.get_ydata().tolist() == pytest.approx([0.6])
     assert axis.get_xticklabels()[-1].get_text() == "state"
-    figure = counterfactual.counterfactual_figure({"lru": seeds, "one": seeds[0]})
+    both = {"lru": seeds, "one": seeds[0]}
+    figure = counterfactual.counterfactual_figure(both, figure=new_figure())
     everybody, differ = [axis.lines[0].get_ydata().tolist() for axis in figure.axes]
     assert everybody == pytest.approx([0.15, 0.2, 0.3])
     assert differ == pytest.approx([0.3, 0.4, 0.6])
