@@ -276,8 +276,8 @@ class BatchedGame(Steps, Generic[State]):
         return jax.vmap(self.game.render)(batch.state, batch.partial)
 
     def _facts(self, batch: Batch) -> dict[str, Array]:
-        facts = jax.vmap(self.game.facts)(batch.state)
-        return {name: jnp.array(value) for name, value in facts.items()}
+        facts: dict[str, Array] = jax.vmap(self.game.facts)(batch.state)
+        return facts
 
 
 def with_flags(batch: Batch) -> Batch:

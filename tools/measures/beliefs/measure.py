@@ -38,6 +38,7 @@ from arcade_torch.tools.measures.policy import Progress, policy_of
 from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
 
 Ints = NDArray[np.int64]
+Floats = NDArray[np.floating[Any]]  # single precision as recorded: states may be wide
 Source = Literal["state", "frame"]
 SOURCES: tuple[Source, ...] = ("state", "frame")
 PENALTIES = tuple(10.0**power for power in range(-6, 4))
@@ -45,7 +46,10 @@ PENALTIES = tuple(10.0**power for power in range(-6, 4))
 share of right classes in few episodes is too coarse to choose by. The last gives the guess.
 """
 MIN_EPISODES = 8
-MOST_ROWS = 4096  # steps that fit a probe; of more so many are drawn, which bounds its cost
+LARGEST = 2048
+"""Side of the largest matrix that is decomposed: of states that are wider at most so many steps fit
+a probe, drawn at random.
+"""
 DRAWS = 2000  # of the bootstrap
 
 
@@ -53,8 +57,8 @@ DRAWS = 2000  # of the bootstrap
 class Recording:
     """What was recorded of E episodes of at most T steps; entries beyond an end are of no use."""
 
-    states: Array  # [E, T, D], the recurrent state after the frame of the step; D may be 0
-    features: Array  # [E, T, F], of the frame of the step
+    states: Floats  # [E, T, D], the recurrent state after the frame of the step; D may be 0
+    features: Floats  # [E, T, F], of the frame of the step
     facts: Mapping[str, NDArray[Any]]  # [E, T, ...], bool, integers or floats
     lengths: Ints  # [E]
 
@@ -204,14 +208,14 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
     size = int(env.batch_size[0])
     lengths = np.zeros(size, np.int64)
     playing = torch.ones(size, dtype=torch.bool)
-    steps = list[tuple[Array, Array, dict[str, NDArray[Any]]]]()
+    steps = list[tuple[Floats, Floats, dict[str, NDArray[Any]]]]()
     obs = env.reset()
     state = agent.initial_state(size)
     while playing.any() and len(steps) < max_steps:
         facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
         features = policy.features(obs["pixels"])
         action, _, state = agent.act(obs, state)
-        steps.append((flat_state(state, size), features.double().cpu().numpy(), facts))
+        steps.append((flat_state(state, size), features.float().cpu().numpy(), facts))
         lengths += playing.numpy()
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         playing &= ~step.get(("next", "done")).reshape(-1).cpu()
@@ -224,13 +228,13 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
     return Recording(np.stack(states, 1), np.stack(all_features, 1), by_name, lengths)
 
 
-def flat_state(state: Any, size: int) -> Array:
-    """A recurrent state as numbers, float64 [size, D]; complex numbers are pairs."""
-    leaves = list[Array]()
+def flat_state(state: Any, size: int) -> Floats:
+    """A recurrent state as numbers, float32 [size, D]; complex numbers are pairs."""
+    leaves = list[Floats]()
     for leaf in _leaves(state):
         numbers = torch.view_as_real(leaf) if leaf.is_complex() else leaf
-        leaves.append(numbers.detach().reshape(size, -1).double().cpu().numpy())
-    return np.concatenate(leaves, axis=1) if leaves else np.zeros((size, 0))
+        leaves.append(numbers.detach().reshape(size, -1).float().cpu().numpy())
+    return np.concatenate(leaves, axis=1) if leaves else np.zeros((size, 0), np.float32)
 
 
 def _leaves(state: Any) -> Iterator[Tensor]:
@@ -401,7 +405,7 @@ def _tabled(loss: Array, split: Split) -> Array:
     return np.asarray(loss.sum(-1)[split.scored_episodes])
 
 
-def probe_loss(inputs: Array, fact: Fact, split: Split) -> Array:
+def probe_loss(inputs: Floats, fact: Fact, split: Split) -> Array:
     """The loss of probes that read a fact off inputs [E, T, D]: float64 [E, T, C].
 
     Cells that have values at the same steps share one regression.
@@ -416,12 +420,12 @@ def probe_loss(inputs: Array, fact: Fact, split: Split) -> Array:
     return loss
 
 
-def _probe_together(inputs: Array, fact: Fact, split: Split) -> Array:
+def _probe_together(inputs: Floats, fact: Fact, split: Split) -> Array:
     """`probe_loss` of cells that have values at the same steps."""
     exists = fact.exists[..., 0]
     rows = np.argwhere(exists & split.fit)
-    if len(rows) > MOST_ROWS:
-        rows = rows[np.random.default_rng(0).permutation(len(rows))[:MOST_ROWS]]
+    if inputs.shape[-1] > LARGEST:
+        rows = rows[np.random.default_rng(0).permutation(len(rows))[:LARGEST]]
     at = tuple(rows.T)
     targets = Targets.of(fact.values[at], fact.is_class)
     ridge = Ridge.of(inputs[at], targets.numbers(fact.values[at]))

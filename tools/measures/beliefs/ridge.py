@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -25,15 +26,16 @@ class Ridge:
     is_dual: bool
 
     @classmethod
-    def of(cls, inputs: Array, targets: Array, is_dual: bool | None = None) -> "Ridge":
+    def of(cls, inputs: Any, targets: Array, is_dual: bool | None = None) -> "Ridge":
         """Decompose a regression.
 
         Args:
-            inputs: float64 [n, D].
+            inputs: floats [n, D].
             targets: float64 [n, M].
             is_dual: whether the matrix of samples [n, n] is decomposed in place of that of inputs
                 [D, D]; by default the smaller of the two. The solutions are the same.
         """
+        inputs = np.asarray(inputs, np.float64)
         count, width = inputs.shape
         mean = inputs.mean(axis=0)
         deviation = inputs.std(axis=0)
@@ -55,7 +57,7 @@ class Ridge:
         projected = self.vectors.T @ (self.inputs.T @ self.targets)
         return np.asarray(self.vectors @ (projected / damped[:, None]))
 
-    def predict(self, inputs: Array, penalties: Sequence[float]) -> list[Array]:
+    def predict(self, inputs: Any, penalties: Sequence[float]) -> list[Array]:
         """Targets [k, M] of inputs [k, D], for each penalty."""
         scaled = (inputs - self.mean) / self.scale
         return [self.offset + scaled @ self.weights(penalty) for penalty in penalties]
