@@ -16,6 +16,7 @@ PAGES = {
     "results/gpu-aot.md": "results/gpu-aot.md",
     "results/probe.md": "results/probe.md",
     "results/memory.md": "results/memory.md",
+    "results/memory_tests.md": "results/memory_tests.md",
     "results/recipe.md": "results/recipe.md",
     "examples/notebooks": "notebooks.md",
 }
