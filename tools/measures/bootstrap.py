@@ -96,6 +96,38 @@ def pooled(
     return Pooled(all_seeds, mean, low, high)
 
 
+def pooled_episodes(
+    seeds: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0
+) -> Pooled:
+    """Pool the episodes of some seeds, each [n_episodes, L], column by column: the mean over seeds
+    of their means over episodes, both resampled.
+
+    NaN is an episode without a value. Of a single seed the interval is over its episodes alone; the
+    ends are NaN where fewer than two episodes have a value, the mean where none has.
+    """
+    arrays = [np.asarray(episodes, dtype=np.float64) for episodes in seeds]
+    columns = arrays[0].shape[1]
+    means = np.full((len(arrays), columns), np.nan)
+    ends = np.full((3, columns), np.nan)
+    for column in range(columns):
+        rng = np.random.default_rng(seed)
+        finite = [episodes[np.isfinite(episodes[:, column]), column] for episodes in arrays]
+        for place, values in enumerate(finite):
+            means[place, column] = values.mean() if values.size else np.nan
+        cells = [values for values in finite if values.size]
+        if not cells:
+            continue
+        estimate = float(np.mean([values.mean() for values in cells]))
+        of_seeds = np.array([drawn.mean(axis=1) for drawn in resampled(cells, draws, rng)])
+        chosen = rng.integers(len(cells), size=(draws, len(cells)))
+        drawn = rng.integers(draws, size=chosen.shape)
+        several = sum(values.size for values in cells) > 1
+        values = of_seeds[chosen, drawn].mean(axis=1)
+        ends[:, column] = percentile_interval(estimate, values, confidence, several)
+    mean, low, high = ends
+    return Pooled(means, mean, low, high)
+
+
 @lru_cache(maxsize=64)
 def measured_coverage(
     mdp_seeds: tuple[int, ...],

@@ -24,7 +24,7 @@ from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, new_figure,
 from arcade_torch.tools.measures import checkpoints
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.beliefs.measure import Beliefs
-from arcade_torch.tools.measures.bootstrap import Interval, pooled
+from arcade_torch.tools.measures.bootstrap import Interval, pooled, pooled_episodes
 from arcade_torch.tools.measures.checkpoints import Label, by_task
 from arcade_torch.tools.measures.contamination import ContaminationOptions
 from arcade_torch.tools.measures.contamination import figure as contamination
@@ -615,12 +615,10 @@ def exchanges(flip: Sequence[float], state: float, **other: Any) -> Counterfactu
 def test_profiles_pool_seeds_of_different_lengths_and_a_single_one_over_its_episodes() -> None:
     seeds = [exchanges([0.2, 0.4, 0.6], 0.8), exchanges([0.4, 0.4], 0.4)]
     flip = counterfactual.profiles_of(seeds, False)["flip"]
-    assert flip.over == "seeds"
-    np.testing.assert_allclose(flip.values.mean, [0.15, 0.2, 0.3, 0.3])
-    assert np.isnan(flip.values.low[2]) and flip.values.low[3] < 0.3 < flip.values.high[3]
+    np.testing.assert_allclose(flip.mean, [0.15, 0.2, 0.3, 0.3])
+    assert np.isnan(flip.low[2]) and flip.low[3] < 0.3 < flip.high[3]
     differing = counterfactual.profiles_of(seeds[:1], True)["flip"]
-    assert differing.over == "episodes"
-    np.testing.assert_allclose(differing.values.mean, [0.2, 0.4, 0.6, 0.8])
+    np.testing.assert_allclose(differing.mean, [0.2, 0.4, 0.6, 0.8])
     with drawing("light"):
         axis = panels(1, 1, (4, 3))[1][0, 0]
         profiles = {"lru": counterfactual.profiles_of(seeds, True)}
@@ -650,6 +648,23 @@ def test_the_row_of_a_report_names_the_frame_that_matters_most_and_saturated_pol
         np.array([0.1, 0.2, 0.7, 0.4, 0.6]), np.array([3, 2]), np.array([True, True]), 0, 0, "q"
     )
     np.testing.assert_allclose(counterfactual.share_by_lag([density], 3), [0.65, 0.3, 0.1])
+
+
+def test_intervals_resample_seeds_and_their_episodes() -> None:
+    rng = np.random.default_rng(0)
+    episodes = rng.random((40, 1))
+    one = pooled_episodes([episodes])
+    over_episodes = pooled(episodes[:, 0].tolist())
+    np.testing.assert_allclose(one.mean, over_episodes.mean)
+    np.testing.assert_allclose(one.low, over_episodes.low, atol=0.02)
+    same = pooled_episodes([episodes, episodes])  # seeds agree: their episodes still vary
+    assert 0.5 < (same.high - same.low)[0] / (one.high - one.low)[0] < 0.9
+    apart = pooled_episodes([np.zeros((40, 1)), np.ones((40, 1))])
+    assert (apart.low[0], apart.mean[0], apart.high[0]) == (0, 0.5, 1)
+    sure = pooled_episodes([np.ones((40, 2)), np.ones((30, 2))])
+    assert (sure.low == 1).all() and (sure.high == 1).all()
+    none = pooled_episodes([np.full((3, 1), np.nan), np.array([[np.nan], [0.25]])])
+    assert none.mean[0] == 0.25 and np.isnan(none.low[0]) and np.isnan(none.seeds[0, 0])
 
 
 def test_sentences_claim_memory_only_where_an_interval_excludes_zero() -> None:

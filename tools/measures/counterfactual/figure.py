@@ -1,5 +1,5 @@
 """Counterfactual recall: effects of exchanged frames by lag, and of an exchanged state, with
-intervals over seeds, or over episodes where there is one seed.
+intervals over seeds and their episodes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
-from arcade_torch.tools.measures.bootstrap import Array, Interval, Pooled, pooled
+from arcade_torch.tools.measures.bootstrap import Array, Interval, Pooled, pooled_episodes
 from arcade_torch.tools.measures.checkpoints import (
     Label,
     by_task,
@@ -38,14 +38,8 @@ EXCHANGES: Mapping[str, Any] = {**DENSITY, "donors": 4, "most_lags": 24}
 """Options of `counterfactual` for a report: the decisions are those of its recall density."""
 
 
-class Profile(NamedTuple):
-    """One effect of one agent on one task: at every lag, and at last of the state, each [L + 1]."""
-
-    values: Pooled
-    over: str  # what its intervals are over, seeds or episodes
-
-
-Profiles = Mapping[measure.Effect, Profile]
+# of one agent on one task: each effect at every lag, and at last of the state, [L + 1]
+Profiles = Mapping[measure.Effect, Pooled]
 
 
 def by_lag(options: CounterfactualOptions, progress: Progress | None) -> Made:
@@ -101,30 +95,25 @@ def interval_text(interval: Interval) -> str:
 def profiles_of(
     seeds: Sequence[measure.Counterfactual], differing: bool, confidence: float = 0.95
 ) -> Profiles:
-    """The effects of one task, pooled over its seeds, or over the decisions of a single one."""
-    profiles = dict[measure.Effect, Profile]()
+    """The effects of one task, pooled over its seeds and their decisions."""
+    lags = max(seed.flip.shape[1] for seed in seeds)
+    profiles = dict[measure.Effect, Pooled]()
     for effect in EFFECTS:
-        if len(seeds) == 1:
-            (only,) = seeds
-            decisions = np.column_stack(
-                [only.by_lag(effect, differing), only.by_state(effect, differing)]
-            )
-            profiles[effect] = Profile(pooled(decisions.tolist(), confidence), "episodes")
-        else:
-            lags = max(seed.flip.shape[1] for seed in seeds)
-            values = [_of_seed(seed, effect, differing, lags) for seed in seeds]
-            profiles[effect] = Profile(pooled(values, confidence), "seeds")
+        decisions = [_of_seed(seed, effect, differing, lags) for seed in seeds]
+        profiles[effect] = pooled_episodes(decisions, confidence)
     return profiles
 
 
 def _of_seed(
     seed: measure.Counterfactual, effect: measure.Effect, differing: bool, lags: int
 ) -> Array:
-    """The profile of one seed, NaN beyond its longest episode, and then the effect of its state."""
-    values = np.full(lags + 1, np.nan)
-    profile = seed.profile(effect, differing)
-    values[: len(profile)] = profile
-    values[-1] = seed.memory_reliance(effect, differing).value
+    """The decisions of one seed, [D, lags + 1]: at every lag, NaN beyond its longest episode, and
+    then the effect of the state.
+    """
+    by_lag = seed.by_lag(effect, differing)
+    values = np.full((len(by_lag), lags + 1), np.nan)
+    values[:, : by_lag.shape[1]] = by_lag
+    values[:, -1] = seed.by_state(effect, differing)
     return values
 
 
@@ -160,11 +149,11 @@ def _note(
 ) -> str:
     """What was exchanged, and what the intervals are over."""
     counts = [len(seeds) for seeds in agents.values()]
-    if max(counts) > 1:
-        sample = style.seeds_note(counts, options.confidence)
-    else:
-        share = f"{100 * options.confidence:g} %"
-        sample = f"n = 1 seed; bars: {share} bootstrap interval over its episodes"
+    count = f"n = {min(counts)}" if min(counts) == max(counts) else f"n = up to {max(counts)}"
+    over = "its episodes" if max(counts) == 1 else "seeds and their episodes"
+    share = f"{100 * options.confidence:g} %"
+    plural = "s" if max(counts) > 1 else ""
+    sample = f"{count} seed{plural}; bars: {share} bootstrap interval over {over}"
     frames = "one frame" if options.block == 1 else f"{options.block} consecutive frames"
     return (
         f"{sample}; {options.episodes} decisions each, {frames} exchanged for those of up to "
@@ -177,13 +166,13 @@ def _rows(
     agent: str, game: str, twin: str, seeds: int, donors: str, profiles: Profiles
 ) -> list[dict[str, Any]]:
     """The numbers of a figure, one row a lag."""
-    lags = len(profiles["flip"].values.mean) - 1
+    lags = len(profiles["flip"].mean) - 1
     columns: dict[str, Any] = {"agent": agent, "game": game, "observability": twin}
     columns["seeds"] = seeds
     columns["donors"] = donors
     columns["lag"] = [*map(str, range(lags)), STATE]
     for effect in EFFECTS:
-        values = profiles[effect].values
+        values = profiles[effect]
         columns[effect] = values.mean
         columns[f"{effect}_low"] = values.low
         columns[f"{effect}_high"] = values.high
@@ -197,10 +186,10 @@ def plot(
     colours: Mapping[str, str],
 ) -> None:
     """Draw one effect by lag, a line an agent, and at the right the effect of the state."""
-    lags = max(len(profiles[effect].values.mean) for profiles in agents.values()) - 1
+    lags = max(len(profiles[effect].mean) for profiles in agents.values()) - 1
     state = lags + 0.5
     for place, (agent, profiles) in enumerate(agents.items()):
-        values = profiles[effect].values
+        values = profiles[effect]
         steps = np.arange(len(values.mean) - 1)
         x = np.append(steps, state) + 0.08 * (place - (len(agents) - 1) / 2)
         marker = style.MARKERS[place % len(style.MARKERS)]
@@ -230,8 +219,8 @@ def counterfactual_figure(
     differ.
 
     Args:
-        effects: by name what `counterfactual` gave, or that of several seeds; bars are over seeds,
-            or over the episodes of a single one.
+        effects: by name what `counterfactual` gave, or that of several seeds; bars are over seeds
+            and their episodes.
         effect: ``flip``, ``distance`` or ``change``.
         figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
 
@@ -288,7 +277,7 @@ def counterfactual_section(
         profiles = {agent: of_cell.profiles for agent, of_cell in by_agent.items()}
         plot(profiles, axis, "flip", colours)
         for agent, of_cell in by_agent.items():
-            lags = len(profiles[agent]["flip"].values.mean) - 1
+            lags = len(profiles[agent]["flip"].mean) - 1
             share = of_cell.gradients[:lags]
             axis.plot(np.arange(len(share)), share, color=colours[agent], ls="--", lw=1)
         axis.set_xlabel("steps back from the decision")
@@ -346,7 +335,7 @@ def _section_row(seeds: Sequence[measure.Counterfactual]) -> dict[str, Any]:
     """The row of one cell in the table of a report."""
     everybody = profiles_of(seeds, False)["flip"]
     differing = profiles_of(seeds, True)["flip"]
-    profile = everybody.values.mean[:-1]
+    profile = everybody.mean[:-1]
     earlier = np.where(np.isfinite(profile[1:]), profile[1:], -1)
     peak = 1 + int(earlier.argmax()) if earlier.size else 0
     return {
@@ -360,7 +349,6 @@ def _section_row(seeds: Sequence[measure.Counterfactual]) -> dict[str, Any]:
         "at_peak": _cell(everybody, peak),
         "at_peak_differing": _cell(differing, peak),
         "saturated": all(_is_saturated(seed) for seed in seeds),
-        "over": everybody.over,
     }
 
 
@@ -369,7 +357,6 @@ def _is_saturated(seed: measure.Counterfactual) -> bool:
     return seed.target == "probs" and float(seed.certainty.mean()) >= SATURATED
 
 
-def _cell(profile: Profile, place: int) -> Interval:
+def _cell(values: Pooled, place: int) -> Interval:
     """One number of a profile with its interval."""
-    values = profile.values
     return Interval(float(values.mean[place]), float(values.low[place]), float(values.high[place]))
