@@ -142,7 +142,7 @@ def _picture(
     """The figure of one task: bars of all facts, and a panel a fact over the steps."""
     scores = {agent: scores_of(seeds, options.confidence) for agent, seeds in agents.items()}
     facts = facts_of(scores)
-    size = (4.2 + 2.9 * len(facts), 3.6)
+    size = (max(9.5, 4.2 + 2.9 * len(facts)), 3.6)  # room for title and legend
     widths = [1.4, *[1.0] * len(facts)]
     figure, axes = style.panels(1, 1 + len(facts), size, sharey=True, width_ratios=widths)
     colours = style.agent_colours(list(agents))
@@ -253,8 +253,8 @@ def _note(agents: Mapping[str, Sequence[measure.Beliefs]], options: BeliefsOptio
         share = f"{100 * options.confidence:g} %"
         sample = f"n = 1 seed; bars and bands: {share} bootstrap interval over scored episodes"
     note = (
-        f"{sample}; {options.episodes} episodes each, half fit the linear probe, a quarter choose "
-        "its penalty, a quarter are scored;\nclasses: share of the way from the most frequent "
+        f"{sample};\n{options.episodes} episodes: half fit the linear probe, a quarter choose its "
+        "penalty, a quarter are scored;\nclasses: share of the way from the most frequent "
         "class to 1, numbers: R2"
     )
     empty = [agent for agent, seeds in agents.items() if not any(s.state_width for s in seeds)]
