@@ -107,7 +107,10 @@ def scores_of(seeds: Sequence[measure.Beliefs], confidence: float = 0.95) -> OfA
     """The scores of one task, pooled over its seeds, or over the episodes of a single one."""
     steps = max(seed.guess_loss.shape[-1] for seed in seeds)
     scores = dict[tuple[str, measure.Source], Scores]()
-    for fact in dict.fromkeys(name for seed in seeds for name in seed.names.tolist()):
+    names = dict[str, None]()
+    for seed in seeds:
+        names |= dict.fromkeys(seed.names.tolist())
+    for fact in names:
         having = [seed for seed in seeds if fact in seed.names.tolist()]
         for source in measure.SOURCES:
             if source == "state" and not all(seed.state_width for seed in having):
@@ -142,7 +145,7 @@ def _picture(
     """The figure of one task: bars of all facts, and a panel a fact over the steps."""
     scores = {agent: scores_of(seeds, options.confidence) for agent, seeds in agents.items()}
     facts = facts_of(scores)
-    size = (4.2 + 2.9 * len(facts), 3.6)
+    size = (max(9.5, 4.2 + 2.9 * len(facts)), 3.6)  # room for title and legend
     widths = [1.4, *[1.0] * len(facts)]
     figure, axes = style.panels(1, 1 + len(facts), size, sharey=True, width_ratios=widths)
     colours = style.agent_colours(list(agents))
@@ -167,31 +170,33 @@ def facts_of(scores: Mapping[str, OfAgent]) -> list[str]:
     return list(names)
 
 
-def _bars(scores: Mapping[str, OfAgent]) -> Iterator[tuple[float, str, measure.Source, Interval]]:
-    """Place, agent, source and score of every bar: facts side by side, in each the agents, of each
-    its state and its frame.
+def _bars(
+    scores: Mapping[str, OfAgent],
+) -> Iterator[tuple[float, float, str, measure.Source, Interval]]:
+    """Place, width, agent, source and score of every bar: facts side by side, in each the agents,
+    of each its state and its frame.
     """
-    sources = [(agent, source) for agent in scores for source in measure.SOURCES]
-    present = [key for key in sources if any(source == key[1] for _, source in scores[key[0]])]
+    present = list[tuple[str, measure.Source]]()
+    for agent, of_agent in scores.items():
+        sources = {source for _, source in of_agent}
+        present += [(agent, source) for source in measure.SOURCES if source in sources]
     width = 0.8 / len(present)
     for fact_place, fact in enumerate(facts_of(scores)):
         for place, (agent, source) in enumerate(present):
             if (fact, source) in scores[agent]:
                 x = fact_place + width * (place - (len(present) - 1) / 2)
-                yield x, agent, source, scores[agent][fact, source].overall
+                yield x, width, agent, source, scores[agent][fact, source].overall
 
 
 def plot_bars(scores: Mapping[str, OfAgent], axis: Any, colours: Mapping[str, str]) -> None:
     """Draw the scores over all steps: full bars of states, empty bars of frames."""
-    bars = list(_bars(scores))
-    width = 0.8 * len(facts_of(scores)) / len(bars)
-    for x, agent, source, score in bars:
+    for x, width, agent, source, score in _bars(scores):
         height = max(score.value, LOWEST)
         axis.bar(x, height, width, lw=1, **_look(source, colours[agent]))
         ends = style.whiskers(
             np.array([score.value]), np.array([score.low]), np.array([score.high])
         )
-        axis.errorbar(x, height, ends, fmt="none", ecolor=style.NEUTRAL, capsize=2, lw=1)
+        axis.errorbar(x, score.value, ends, fmt="none", ecolor=style.NEUTRAL, capsize=2, lw=1)
     facts = facts_of(scores)
     axis.set_xticks(range(len(facts)), facts)
     axis.axhline(0, color=style.NEUTRAL, lw=0.8)
@@ -253,11 +258,14 @@ def _note(agents: Mapping[str, Sequence[measure.Beliefs]], options: BeliefsOptio
         share = f"{100 * options.confidence:g} %"
         sample = f"n = 1 seed; bars and bands: {share} bootstrap interval over scored episodes"
     note = (
-        f"{sample}; {options.episodes} episodes each, half fit the linear probe, a quarter choose "
-        "its penalty, a quarter are scored;\nclasses: share of the way from the most frequent "
+        f"{sample};\n{options.episodes} episodes: half fit the linear probe, a quarter choose its "
+        "penalty, a quarter are scored;\nclasses: share of the way from the most frequent "
         "class to 1, numbers: R2"
     )
-    empty = [agent for agent, seeds in agents.items() if not any(s.state_width for s in seeds)]
+    empty = list[str]()
+    for agent, seeds in agents.items():
+        if not max(seed.state_width for seed in seeds):
+            empty.append(agent)
     return f"{note}; without memory: {', '.join(empty)}" if empty else note
 
 
