@@ -16,6 +16,7 @@ PAGES = {
     "results/gpu-aot.md": "results/gpu-aot.md",
     "results/probe.md": "results/probe.md",
     "results/recipe.md": "results/recipe.md",
+    "results/memory_tests.md": "results/memory_tests.md",
     "examples/notebooks": "notebooks.md",
 }
 """Repository path to place on the site, for what does not lie in docs/."""
