@@ -18,7 +18,6 @@ PAGES = {
     "results/memory.md": "results/memory.md",
     "results/memory_tests.md": "results/memory_tests.md",
     "results/recipe.md": "results/recipe.md",
-    "results/memory_tests.md": "results/memory_tests.md",
     "examples/notebooks": "notebooks.md",
 }
 """Repository path to place on the site, for what does not lie in docs/."""
