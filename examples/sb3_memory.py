@@ -1,8 +1,8 @@
 """Stable-Baselines3's ``RecurrentPPO`` with its own LSTM and with memories of this package.
 
     pip install '.[sb3]'
-    python examples/sb3_memory.py --task cartpole --memory lstm lru mingru
-    python examples/sb3_memory.py --task signpost --memory lstm lru
+    python examples/sb3_memory.py --task cartpole --memory sb3_lstm lru mingru
+    python examples/sb3_memory.py --task signpost --memory sb3_lstm lru
 
 ``cartpole`` is Gymnasium's CartPole without its velocities, ``signpost`` our SignpostEasy whose
 sign is hidden after the first frame (without memory .25 is the most that can be expected). Prints
@@ -26,6 +26,7 @@ from arcade_torch.gym import register_games
 from arcade_torch.models import SmallEncoder
 from arcade_torch.models.sb3 import CnnMemoryPolicy, MemoryPolicy
 
+OWN = "sb3_lstm"  # the LSTM of RecurrentPPO itself; "lstm" is this package's
 FRAMES = {"cartpole": 100_000, "signpost": 40_000}
 
 
@@ -66,14 +67,14 @@ def signpost() -> gym.Env[Any, Any]:
 def make_agent(task: str, memory: str, seed: int) -> RecurrentPPO:
     """The agent and its sixteen envs."""
     settings: dict[str, Any] = {"lstm_hidden_size": 64}
-    policy: Any = "MlpLstmPolicy" if memory == "lstm" else MemoryPolicy
+    policy: Any = "MlpLstmPolicy" if memory == OWN else MemoryPolicy
     make_env: Callable[[], Any] = NoVelocities
     if task == "signpost":
         make_env = signpost
-        policy = "CnnLstmPolicy" if memory == "lstm" else CnnMemoryPolicy
+        policy = "CnnLstmPolicy" if memory == OWN else CnnMemoryPolicy
         settings["features_extractor_class"] = Features
         settings["normalize_images"] = False
-    if memory != "lstm":
+    if memory != OWN:
         settings["memory"] = memory
     envs = DummyVecEnv([lambda: Monitor(make_env())] * 16)
     envs.seed(seed)
@@ -110,7 +111,7 @@ if __name__ == "__main__":
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--task", choices=sorted(FRAMES), default="cartpole")
-    parser.add_argument("--memory", nargs="+", default=["lstm", "lru"])
+    parser.add_argument("--memory", nargs="+", default=[OWN, "lru"])
     parser.add_argument("--frames", type=int)
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
