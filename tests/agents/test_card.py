@@ -16,7 +16,7 @@ from arcade_torch.agents import preset
 from arcade_torch.agents.cuda_graph import WARM_UPS, GraphedFunction, GraphedPolicy
 from arcade_torch.agents.policy import EpsilonGreedy, make_policy
 from arcade_torch.agents.training import Trainer, own_random_numbers
-from arcade_torch.models import make_network
+from arcade_torch.models import make_network, memory_names
 
 from .fake_device import prepare
 from .repeated import Repeated
@@ -34,7 +34,7 @@ def test_on_a_fake_device_nothing_runs_on_the_cpu_is_copied_or_waits() -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines() if line.startswith("| ")]
-    assert len(rows) == 1 + 3 * 8 * 3
+    assert len(rows) == 1 + 3 * len(memory_names()) * 3
     for row in rows[1:]:
         assert [int(number) for number in row[4:]] == [0, 0, 0], done.stdout
 
