@@ -28,6 +28,19 @@ class Interval(NamedTuple):
         """Whether there is an interval and zero lies outside it."""
         return bool(self.low > 0 or self.high < 0)
 
+    def text(self) -> str:
+        """The number and its interval for a table; a dash where there is no number.
+
+        Example:
+            >>> Interval(0.5, 0.25, 0.75).text()
+            '0.50 [0.25, 0.75]'
+        """
+        if math.isnan(self.value):
+            return "-"
+        if not self.exists:
+            return f"{self.value:.2f}"
+        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
 
 def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> list[Array]:
     """The seeds of each task, float64 [n_seeds], resampled with replacement to [draws, n_seeds]."""

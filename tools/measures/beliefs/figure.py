@@ -65,9 +65,7 @@ def _table(measured: Sequence[tuple[Label, measure.Beliefs]], confidence: float)
     rows = list[tuple[Any, ...]]()
     for label, probes in measured:
         for place, fact in enumerate(probes.names.tolist()):
-            cells = [
-                interval_text(probes.score(fact, source, confidence)) for source in measure.SOURCES
-            ]
+            cells = [probes.score(fact, source, confidence).text() for source in measure.SOURCES]
             is_class = bool(probes.is_class[place])
             rows.append((label, fact, probes.cells[place], KINDS[is_class], *cells))
     head = ("run", "fact", "cells", "score", *SOURCES.values())
@@ -83,7 +81,7 @@ def _patched_table(patched: Sequence[tuple[Label, Patches]], confidence: float) 
     """Whose decision follows an exchanged state, one row a run."""
     rows = list[tuple[Any, ...]]()
     for label, patches in patched:
-        cells = [interval_text(patches.share(outcome, confidence)) for outcome in OUTCOMES]
+        cells = [patches.share(outcome, confidence).text() for outcome in OUTCOMES]
         rows.append((label, int(patches.differs.sum()), *cells))
     caption = (
         "decisions on the own frame with the recurrent state of another episode at the same step, "
@@ -92,15 +90,6 @@ def _patched_table(patched: Sequence[tuple[Label, Patches]], confidence: float) 
     )
     head = ("run", "exchanges", *OUTCOMES)
     return Table("whose decision an exchanged state brings", head, rows, caption)
-
-
-def interval_text(interval: Interval) -> str:
-    """A score with its interval; a dash where there is nothing to read."""
-    if np.isnan(interval.value):
-        return "-"
-    if not interval.exists:
-        return f"{interval.value:.2f}"
-    return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def scores_of(seeds: Sequence[measure.Beliefs], confidence: float = 0.95) -> OfAgent:

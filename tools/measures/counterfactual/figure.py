@@ -68,7 +68,7 @@ def _table(measured: Sequence[tuple[Label, measure.Counterfactual]], confidence:
         for differing in (False, True):
             memory = exchanges.memory_reliance("flip", differing, confidence)
             observation = exchanges.observation_reliance("flip", differing, confidence)
-            cells += [interval_text(memory), interval_text(observation)]
+            cells += [memory.text(), observation.text()]
         certainty = f"{exchanges.certainty.mean():.4f}"
         rows.append((label, len(exchanges.lengths), *cells, certainty))
     head = (
@@ -81,15 +81,6 @@ def _table(measured: Sequence[tuple[Label, measure.Counterfactual]], confidence:
         f"with {100 * confidence:g} % intervals over episodes; probability: of the action taken"
     )
     return Table("reliance on memory and observation", head, rows, caption)
-
-
-def interval_text(interval: Interval) -> str:
-    """A share with its interval; a dash where nothing could be exchanged."""
-    if np.isnan(interval.value):
-        return "-"
-    if not interval.exists:
-        return f"{interval.value:.2f}"
-    return f"{interval.value:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 def profiles_of(
