@@ -69,10 +69,11 @@ def test_settings_figures_and_environment_of_the_user_stay(tmp_path: Path) -> No
 
 
 def test_our_figures_are_none_of_pyplot() -> None:
+    before = plt.get_fignums()
     with drawing("light") as ours:
         figure, axes = ours.subplots(1, 2, figsize=(3, 2), sharey=True, width_ratios=[1, 2])
     assert isinstance(axes, np.ndarray) and tuple(figure.get_size_inches()) == (3, 2)
-    assert not plt.get_fignums()
+    assert plt.get_fignums() == before
 
 
 INLINE = "module://matplotlib_inline.backend_inline"
