@@ -17,6 +17,7 @@ from torchrl.modules import set_recurrent_mode
 
 from arcade_torch.models.memory import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.rollout_buffer import final_key
 
 Key = str | tuple[str, ...]
 
@@ -275,8 +276,9 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
     """
     if key == "is_init":
         return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
-    if key == "pixels" and "final_pixels" in batch:
-        return batch["final_pixels"]  # type: ignore[no-any-return]
+    final = batch.get(final_key(key), None)
+    if final is not None:
+        return final  # type: ignore[no-any-return]
     value = batch.get(unravel_key(("next", key)), None)
     if value is None and key == "last_action":
         value = batch.get("action", None)
@@ -284,8 +286,8 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
         value = batch.get(key, None)
     if value is None:
         raise KeyError(
-            f"no next observations: neither 'final_pixels' nor ('next', {key!r}); take collect() "
-            "or 'all'"
+            f"no next observations: neither {final_key(key)!r} nor ('next', {key!r}); take "
+            "collect() or 'all'"
         )
     return _rows(value, steps)
 

@@ -1,4 +1,4 @@
-"""``ArcadeCollector``: windows of experience from one ``ArcadeEnv``, every frame written once."""
+"""``ArcadeCollector``: windows of experience from one env, every observation written once."""
 
 import functools
 from collections import OrderedDict, deque
@@ -10,13 +10,15 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector
+from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.jax_env import JaxEnv
 from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner
-from arcade_torch.rollout_buffer import FinalFrames, RolloutBuffer
+from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.validation import check_flags, whole
 
 
@@ -35,7 +37,9 @@ class ArcadeCollector(BaseCollector):
     episodes that had ended.
 
     Args:
-        env: The env, not wrapped (TorchRL's ``Collector`` is for transformed envs).
+        env: An ``ArcadeEnv``, or the env of another suite that ``from_jax`` gave; not wrapped
+            (TorchRL's ``Collector`` is for transformed envs). Where "frames" and ``pixels`` stand
+            in the following, of another suite's env its observation is meant, under its own keys.
         policy: A TensorDict module or a callable that reads root keys and writes ``action``; None
             for random actions. Its recurrent state (primers of ``make_tensordict_primer``) is
             carried from ``("next", key)`` to ``key``. A module that reads ``is_init`` begins anew
@@ -46,7 +50,8 @@ class ArcadeCollector(BaseCollector):
         overlap: Steps of the previous window that stand in front of ``collect``'s sequences. Their
             ``initial_state`` is the one that was theirs when they were acted.
         compress: uint8 [N, S, S, 3] -> uint8 [N, ...], what is stored of a frame. The policy sees
-            the compressed frame too, so that acting and learning see the same.
+            the compressed frame too, so that acting and learning see the same. For envs that
+            observe one array.
         final_frames: Which final frames are drawn: ``"all"``, and batches hold dense ``("next",
             "pixels")``; those of steps that were ``"truncated"`` and not terminated (a bootstrap
             needs no others), as ``final_pixels`` of sequences; or ``"none"``. Iterated batches hold
@@ -65,7 +70,8 @@ class ArcadeCollector(BaseCollector):
         post_collect_hook: Called with every iterated batch.
 
     Raises:
-        TypeError: ``env`` is not an ``ArcadeEnv``, or ``policy`` nothing that can act.
+        TypeError: ``env`` is neither an ``ArcadeEnv`` nor a ``JaxEnv``, or ``policy`` nothing that
+            can act.
         ValueError: Sizes that do not fit, or an unknown choice.
 
     Example:
@@ -78,7 +84,7 @@ class ArcadeCollector(BaseCollector):
 
     def __init__(
         self,
-        env: ArcadeEnv,
+        env: ArcadeEnv | JaxEnv,
         policy: Policy | None = None,
         frames_per_batch: int = 2048,
         total_frames: int = -1,
@@ -104,7 +110,8 @@ class ArcadeCollector(BaseCollector):
             "return_same_td compact_obs store_states", (return_same_td, compact_obs, store_states)
         )
         _check_arguments(env, policy, frames_per_batch, overlap, final_frames)
-        self.env: ArcadeEnv = env
+        _check_compress(env, compress)
+        self.env: ArcadeEnv | JaxEnv = env
         self.policy = policy
         self.frames_per_batch = frames_per_batch
         self.requested_frames_per_batch = frames_per_batch
@@ -125,7 +132,9 @@ class ArcadeCollector(BaseCollector):
         self._generator = torch.Generator(env.device)
         self._generator.manual_seed(int(torch.randint(2**31, (), device="cpu")))
         self._finals = env.final_observations(self._overlap + self._steps)
-        self._runner = PolicyRunner(policy, env.num_envs, env.device, store, store_states)
+        self._runner = PolicyRunner(
+            policy, env.num_envs, env.device, env.observation_keys, store, store_states
+        )
         self._buffer: RolloutBuffer | None = None
         self._frames = 0
         self._iter = -1
@@ -137,7 +146,7 @@ class ArcadeCollector(BaseCollector):
 
     def reset(self) -> None:
         """Start over: the next window begins with new episodes, which get new numbers."""
-        self._obs: dict[str, torch.Tensor] | None = None
+        self._obs: dict[NestedKey, torch.Tensor] | None = None
         self._seen = (-1, -1)  # the env's generation that the observation is of
         self._acted = 0  # steps since the first reset
         self._state = TensorDict({}, batch_size=[self._num_envs])
@@ -222,17 +231,20 @@ class ArcadeCollector(BaseCollector):
         self._buffer = None
         self._obs = {}  # nothing holds the first frames
         first = buffer.begin(carry=not first_window, reuse=self.return_same_td, dense=dense)
-        began_with = {key: value for key, value in obs.items() if key != "pixels"}
+        began_with = {key: value for key, value in obs.items() if key in ROOT_KEYS}
         random = random or self.policy is None or self._frames < self.init_random_frames
         # of the whole process: threads must not take turns
         as_wanted = exploration_type() is self.exploration_type
         with nullcontext() if as_wanted else set_exploration_type(self.exploration_type):
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
-        wanted = buffer.finish(began_with, obs["pixels"])
-        for rows, steps, drawn in self._finals.draw(wanted):
-            frames = to_torch(drawn, self.env.device)[: len(rows)]
-            buffer.write_final(rows, steps, self._compressed(frames))
+        last = {key: obs[key] for key in self.env.observation_keys}
+        wanted = buffer.finish(began_with, last)
+        for rows, steps, drawn, counting in self._finals.draw(wanted):
+            final = {}
+            for key, array in drawn.items():
+                final[key] = to_torch(array, self.env.device)[counting]
+            buffer.write_final(rows, steps, self._compressed(final))
         initial_state = self._window_starts.popleft()
         self._frames += self._num_envs * self._steps
         self._iter += 1
@@ -241,7 +253,7 @@ class ArcadeCollector(BaseCollector):
         self._seen = self.env.generation
         return buffer, initial_state
 
-    def _look(self) -> tuple[RolloutBuffer, dict[str, torch.Tensor]]:
+    def _look(self) -> tuple[RolloutBuffer, dict[NestedKey, torch.Tensor]]:
         """Have a current observation and a place to store it, whatever happened to the env since
         the last window.
         """
@@ -258,31 +270,48 @@ class ArcadeCollector(BaseCollector):
             self._state = self._runner.initial_state()
             self._window_starts.clear()
         assert self._obs is not None
-        if self._buffer is None:  # there is none yet, or what it held was a window that was lost
-            self._buffer = RolloutBuffer(
-                self._num_envs,
-                self._overlap,
-                self._steps,
-                frame_shape=self._obs["pixels"].shape[1:],
-                device=self.env.device,
-                final_frames=self._final_frames,
-                max_steps=min(game.max_steps for game in self.env.games),
-                task=self.env.task if self.env.task_in_td else None,
-            )
+        # there is none yet, or what it held was a window that was lost
+        if self._buffer is None:
+            self._buffer = self._new_buffer(self._obs)
         return self._buffer, self._obs
+
+    def _new_buffer(self, obs: dict[NestedKey, torch.Tensor]) -> RolloutBuffer:
+        """A place to store observations such as this one."""
+        env = self.env
+        observation = {}
+        for key in env.observation_keys:
+            observation[key] = Entry(tuple(obs[key].shape[1:]), obs[key].dtype)
+        of_games = isinstance(env, ArcadeEnv)
+        limits = [game.max_steps for game in env.games] if of_games else [env.max_steps or 1]
+        return RolloutBuffer(
+            self._num_envs,
+            self._overlap,
+            self._steps,
+            observation=observation,
+            action=Entry(tuple(env.action_spec.shape[1:]), env.action_spec.dtype),
+            device=env.device,
+            final_frames=self._final_frames,
+            max_steps=min(limits),
+            task=env.task if of_games and env.task_in_td else None,
+        )
 
     def _observe(self, root: TensorDictBase) -> None:
         """Take over a root tensordict as what is acted on next."""
         self._obs = {key: root[key] for key in ROOT_KEYS if key in root}
-        self._obs["pixels"] = self._compressed(self._obs["pixels"])
+        self._obs.update(self._compressed({key: root[key] for key in self.env.observation_keys}))
         self._seen = self.env.generation
 
-    def _compressed(self, frames: torch.Tensor) -> torch.Tensor:
-        return frames if self._compress is None else self._compress(frames)
+    def _compressed(
+        self, observation: dict[NestedKey, torch.Tensor]
+    ) -> dict[NestedKey, torch.Tensor]:
+        """An observation as it is stored."""
+        if self._compress is None:
+            return observation
+        return {key: self._compress(frames) for key, frames in observation.items()}
 
     def _advance(
-        self, buffer: RolloutBuffer, obs: dict[str, torch.Tensor], step: int, random: bool
-    ) -> dict[str, torch.Tensor]:
+        self, buffer: RolloutBuffer, obs: dict[NestedKey, torch.Tensor], step: int, random: bool
+    ) -> dict[NestedKey, torch.Tensor]:
         """Act, step and store; what is not drawn into the storage is copied while JAX computes the
         step.
         """
@@ -290,25 +319,21 @@ class ArcadeCollector(BaseCollector):
             self._window_starts.append(self._runner.begin_anew(self._state, obs["is_init"]).clone())
         action, extras, self._state = self._runner(obs, self._state)
         if random or action is None:
-            num_actions = self.env.game.num_actions
-            device = self.env.device
-            action = torch.randint(
-                num_actions, (self._num_envs,), generator=self._generator, device=device
-            )
-        store_action = functools.partial(buffer.write_action, step, obs["pixels"], action)
+            action = _random_actions(self.env.action_spec, self._generator)
+        store_action = functools.partial(buffer.write_action, step, obs, action)
         into = buffer.place(step + 1) if self._draws_in_place else None
         raw = self.env.step_raw(action, while_computing=store_action, into=into)
         buffer.write_outcome(step, raw.numbers)
         buffer.write_extras(step, extras)
         if self._final_frames != "none" and self._may_have_ended(raw.numbers):
-            self._finals.add(step, *raw.final)
+            self._finals.add(step, raw.final)
         self._acted += 1
         reads = ROOT_KEYS if step == buffer.length - 1 else self._runner.reads
-        following = {"pixels": self._compressed(raw.pixels)}
+        following = dict(self._compressed(raw.observation))
         following.update(raw.root_numbers(reads))
         if "last_action" in reads:
-            following["last_action"] = action.to(torch.int64, copy=True)
-        if "task" in reads and self.env.task_in_td:
+            following["last_action"] = action.to(self.env.action_spec.dtype, copy=True)
+        if "task" in reads and isinstance(self.env, ArcadeEnv) and self.env.task_in_td:
             following["task"] = self.env.task
         return following
 
@@ -461,7 +486,31 @@ class ArcadeCollector(BaseCollector):
     def __repr__(self) -> str:
         """Sizes and env."""
         sizes = f"envs={self._num_envs}, steps={self._steps}, overlap={self._overlap}"
-        return f"ArcadeCollector({self.env.game!r}, {sizes})"
+        played = self.env.game if isinstance(self.env, ArcadeEnv) else self.env
+        return f"ArcadeCollector({played!r}, {sizes})"
+
+
+def _check_compress(env: ArcadeEnv | JaxEnv, compress: Any) -> None:
+    """Refuse to compress an observation of several arrays."""
+    if compress is not None and len(env.observation_keys) > 1:
+        names = ", ".join(map(str, env.observation_keys))
+        raise ValueError(f"compress takes one array, and the env observes several: {names}")
+
+
+def _random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor:
+    """Actions of all envs: any integer that is allowed, numbers between the bounds, and numbers of
+    mean 0 and deviation 1 where there are none.
+    """
+    shape = spec.shape
+    device = spec.device
+    if isinstance(spec, Categorical):
+        return torch.randint(spec.space.n, shape, generator=generator, device=device)
+    if not isinstance(spec, Bounded):
+        return torch.randn(shape, generator=generator, device=device, dtype=spec.dtype)
+    low: torch.Tensor = spec.space.low
+    share = torch.rand(shape, generator=generator, device=device, dtype=spec.dtype)
+    action: torch.Tensor = low + share * (spec.space.high - low)
+    return action
 
 
 def _layout(td: TensorDictBase) -> dict[NestedKey, tuple[torch.dtype, torch.Size]]:
@@ -473,12 +522,12 @@ def _check_arguments(
     env: Any, policy: Any, frames_per_batch: int, overlap: int, final_frames: str
 ) -> None:
     """Refuse what cannot work, before anything is allocated."""
-    if not isinstance(env, ArcadeEnv):
+    if not isinstance(env, ArcadeEnv | JaxEnv):
         raise TypeError(
-            f"env is a {type(env).__name__}, expected an ArcadeEnv; others go with torchrl's "
-            "Collector"
+            f"env is a {type(env).__name__}, expected an ArcadeEnv or what from_jax gives; others "
+            "go with torchrl's Collector"
         )
-    if env.one_hot:
+    if isinstance(env, ArcadeEnv) and env.one_hot:
         raise ValueError(
             "ArcadeCollector stores actions as integers: make the env with categorical_actions=True"
         )

@@ -86,7 +86,9 @@ class CompiledGame:
     def _step(self, batch: Batch, action: jax.Array, spare: Spare = None) -> Step:
         """Step, begin anew where an episode ended, draw once, and pack."""
         root, stepped, outcome, pixels = self.batched.step_autoreset(batch, action)
-        return Step(self.batched.without_ends(root), stepped.state, pixels, _pack(stepped, outcome))
+        return Step(
+            self.batched.without_ends(root), stepped.state, pixels, pack_numbers(stepped, outcome)
+        )
 
     def step_into(self, canvas: Canvas, at: int, batch: Batch, action: Any) -> Step:
         """Step as ``step`` does and draw into ``canvas[:, at]``; whatever interrupts, the canvas
@@ -148,7 +150,7 @@ class CompiledGame:
             self.batched.with_ends(batch, *ended), action
         )
         flags = (outcome.terminated, outcome.truncated)
-        return self.batched.without_ends(stepped), flags, pixels, _pack(stepped, outcome)
+        return self.batched.without_ends(stepped), flags, pixels, pack_numbers(stepped, outcome)
 
     def _reset_or_step(
         self, batch: Batch, action: jax.Array, ended: jax.Array
@@ -164,8 +166,13 @@ class CompiledGame:
         return root, choose_rows(ended, jax.tree.map(jnp.zeros_like, outcome), outcome)
 
 
-def _pack(stepped: Batch, outcome: Outcome) -> jax.Array:
-    """``Step.numbers``: the columns, as int32."""
+def pack_numbers(stepped: Any, outcome: Any) -> jax.Array:
+    """``Step.numbers``: the columns, as int32.
+
+    Args:
+        stepped: Has ``episode_reward`` and ``step_count`` [N], before any reset.
+        outcome: Has ``reward``, ``terminated``, ``truncated`` [N].
+    """
     columns = [
         _bits(outcome.reward),
         _bits(stepped.episode_reward),

@@ -2,9 +2,9 @@
 JAX wrote.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -27,13 +27,12 @@ from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.envs_jax.validation import check_fits, check_num_envs
 from arcade_torch.final_observations import FinalObservations
-from arcade_torch.frame_memory import Canvas, FrameMemory
+from arcade_torch.frame_memory import FrameMemory
 from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.process import check_process
+from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import Snapshots
 from arcade_torch.specs import make_specs
-
-Place = tuple[Canvas, int, torch.Tensor]
 
 
 @dataclass
@@ -45,33 +44,6 @@ class Live:
     ends: torch.Tensor  # bool [N, 2], what a root says: where its last step terminated or truncated
     generation: int = 0  # changes of the state
     view: int = 0  # changes of the observability
-
-
-class RawStep(NamedTuple):
-    """What one fused step gives."""
-
-    # uint8 [N, S, S, 3], the frames to act on next (new episodes have begun); read only
-    pixels: torch.Tensor
-    numbers: torch.Tensor  # int32 [N, 5], see ``Step.numbers``
-    # the games' states before the resets, and who saw the partial view
-    final: tuple[Any, jax.Array]
-
-    def root_numbers(self, keys: Collection[str]) -> dict[str, torch.Tensor]:
-        """What the next root says: ``is_init``, ``step_count`` and ``episode_reward`` [N, 1], if
-        asked for.
-        """
-        numbers = self.numbers
-        out = {}
-        done = numbers[:, TERMINATED:].any(-1, keepdim=True)
-        if "is_init" in keys:
-            out["is_init"] = done
-        if "step_count" in keys:
-            out["step_count"] = numbers[:, STEP_COUNT, None].masked_fill(done, 0).to(torch.int64)
-        if "episode_reward" in keys:
-            out["episode_reward"] = (
-                numbers[:, EPISODE_REWARD, None].view(torch.float32).masked_fill(done, 0)
-            )
-        return out
 
 
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
@@ -364,7 +336,12 @@ class ArcadeEnv(EnvBase):
         self._go_on(step.root)  # on the CPU the step is done; argument lives until here
         numbers = to_torch(step.numbers, self.device)
         final = (step.final_state, step.root.partial)
-        return RawStep(frames, numbers, final)
+        return RawStep({"pixels": frames}, numbers, final)
+
+    @property
+    def observation_keys(self) -> tuple[str, ...]:
+        """Keys of the observation."""
+        return ("pixels",)
 
     def draws_safely(self) -> bool:
         """Whether steps may draw into memory that tensors lie over: a step that fails would take it

@@ -39,14 +39,17 @@ class FinalObservations:
         self._states: dict[int, tuple[Any, ...]] = {}
         self._partial: jax.Array | None = None
 
-    def add(self, index: int, final_state: Any, partial: jax.Array) -> None:
-        """Keep the state that a step led to, before the resets, under a number."""
+    def add(self, index: int, final: tuple[Any, jax.Array]) -> None:
+        """Keep the state that a step led to, before the resets, under a number; and who saw the
+        partial view.
+        """
+        (final_state, partial) = final
         self._states[index] = self._split_states(final_state)
         self._partial = partial
 
     def draw(
         self, wanted: np.ndarray
-    ) -> list[tuple[np.ndarray, np.ndarray, jax.Array | np.ndarray]]:
+    ) -> list[tuple[np.ndarray, np.ndarray, dict[str, jax.Array | np.ndarray], slice]]:
         """Draw the observations that are wanted, and forget all steps.
 
         Args:
@@ -54,9 +57,9 @@ class FinalObservations:
                 added.
 
         Returns:
-            Portions: int64 [n] rows, int64 [n] steps, and frames uint8 [m, S, S, 3] on the device,
-            of which the first n count. All at once, for on a GPU JAX would draw into memory that
-            was given back and is still being read.
+            Portions: int64 [n] rows, int64 [n] steps, ``pixels`` uint8 [m, S, S, 3] on the device,
+            and which of these count, the first n. All at once, for on a GPU JAX would draw into
+            memory that was given back and is still being read.
         """
         steps, rows = np.nonzero(wanted.T)
         portions = []
@@ -67,7 +70,7 @@ class FinalObservations:
                 states = [self._states[index][number] for index in indices.tolist()]
                 place = np.searchsorted(indices, some_steps)
                 frames = game.draw(states, self._partial, place, some_rows)
-                portions.append((some_rows, some_steps, frames))
+                portions.append((some_rows, some_steps, {"pixels": frames}, slice(len(some_rows))))
         self._states.clear()
         return portions
 

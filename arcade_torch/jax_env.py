@@ -1,6 +1,6 @@
 """``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,11 +12,13 @@ from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Un
 from torchrl.envs import EnvBase
 
 from arcade_torch import validation
+from arcade_torch.compiled import pack_numbers
 from arcade_torch.devices import pick_devices, wait_for_torch
 from arcade_torch.dlpack import is_host, to_jax, to_torch
 from arcade_torch.envs_jax.batch import choose_rows, env_keys
 from arcade_torch.envs_jax.validation import check_num_envs
 from arcade_torch.process import check_process
+from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import TreeSnapshots
 
 __all__ = ["JaxEnv", "from_jax"]
@@ -193,7 +195,10 @@ class JaxEnv(EnvBase):
         self._reset_rows = jax.jit(self._begin_anew)
         self._step_alone = jax.jit(self._advance)
         self._step_fused = jax.jit(self._advance_and_begin_anew)
+        self._step_packed = jax.jit(self._advance_and_pack)
         self._live: Episodes
+        self._ends: torch.Tensor | None
+        self._count = 0
         self._set_seed(seed)
         self._obs_key = obs_key
         names = _leaf_names(self._live.obs, obs_key)
@@ -243,8 +248,96 @@ class JaxEnv(EnvBase):
             ValueError: The state of another env or batch size.
             TypeError: No tensordict.
         """
-        self._live = self._snapshots.load(state)
+        self._go_on(self._snapshots.load(state))
         return self._root()
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The env's part of ``state_dict``: its state, and which episodes have ended."""
+        return {**self.get_state().to_dict(), "ends": self._ended()}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Load the env's part of a ``state_dict``."""
+        saved = TensorDict(state, batch_size=self.batch_size, device=self.device)
+        ends = saved.get("ends", None)
+        self._go_on(
+            self._snapshots.load(saved), ends.clone() if ends is not None and ends.any() else None
+        )
+
+    # What an ArcadeCollector needs beside TorchRL's methods.
+
+    @property
+    def observation_keys(self) -> tuple[Any, ...]:
+        """Keys of the observation, strings or tuples of strings."""
+        return tuple(self._obs_names)
+
+    @property
+    def generation(self) -> tuple[int, int]:
+        """Changes of the state (steps, resets, loads), so that a collector notices others'; and 0,
+        for there is no other view.
+        """
+        return self._count, 0
+
+    def observe(self) -> TensorDict:
+        """Show the live state.
+
+        Returns:
+            The root tensordict; ``done`` where an episode has ended and waits for a reset.
+        """
+        root = self._root()
+        ends = self._ended().unsqueeze(-1)
+        root["terminated"] = ends[:, 0]
+        root["truncated"] = ends[:, 1]
+        root["done"] = ends.any(1)
+        return root
+
+    def step_raw(
+        self,
+        action: torch.Tensor,
+        while_computing: Callable[[], object] | None = None,
+        into: Place | None = None,
+    ) -> RawStep:
+        """Step, and begin anew where an episode ended: one compiled call and no tensordict.
+
+        Args:
+            action: As ``action_spec`` has it; not read after the return.
+            while_computing: Called while JAX computes, for work that needs no result of this step.
+            into: None; only our own games are drawn into somebody's memory.
+
+        Returns:
+            The step.
+
+        Raises:
+            ValueError: Actions of a wrong shape or out of range.
+        """
+        live, final, numbers = self._step_packed(self._live, self._argument(action))
+        if while_computing is not None:
+            while_computing()
+        self._go_on(live)
+        return RawStep(self._observation(live.obs), to_torch(numbers, self.device), final)
+
+    def draws_safely(self) -> bool:
+        """Whether steps may draw into memory that tensors lie over: they may not."""
+        return False
+
+    def final_observations(self, max_steps: int) -> "KeptObservations":
+        """Something that keeps the observations that steps led to, before the resets."""
+        return KeptObservations(self._obs_names)
+
+    def _go_on(self, live: Episodes, ends: torch.Tensor | None = None) -> None:
+        """Put another state in place, all at once.
+
+        Args:
+            live: The episodes.
+            ends: bool [N, 2], where they have terminated or been truncated and wait for a reset;
+                None: nowhere.
+        """
+        self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
+
+    def _ended(self) -> torch.Tensor:
+        """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
+        if self._ends is not None:
+            return self._ends.clone()
+        return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
 
     def _flag(self) -> Categorical:
         return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
@@ -304,6 +397,15 @@ class JaxEnv(EnvBase):
         root = self._begin_anew(after, outcome.terminated | outcome.truncated)
         return root, after._replace(key=None, reset_key=None, state=None), outcome
 
+    def _advance_and_pack(
+        self, live: Episodes, action: jax.Array
+    ) -> tuple[Episodes, Any, jax.Array]:
+        """The same for a collector: what to go on with, the observation that the step led to, and
+        all numbers in one array.
+        """
+        root, after, outcome = self._advance_and_begin_anew(live, action)
+        return root, after.obs, pack_numbers(after, outcome)
+
     def _set_seed(self, seed: int | None) -> None:
         """Draw all episodes anew."""
         if seed is None:
@@ -311,7 +413,7 @@ class JaxEnv(EnvBase):
         wait_for_torch(self.device, self._jax_device)
         with jax.default_device(self._jax_device):  # on another GPU than the first one, too
             keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-            self._live = jax.jit(self._first)(keys)
+            self._go_on(jax.jit(self._first)(keys))
 
     def _first(self, keys: jax.Array) -> Episodes:
         """Episodes that begin."""
@@ -326,20 +428,25 @@ class JaxEnv(EnvBase):
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         wait_for_torch(self.device, self._jax_device)
-        self._live = self._reset_rows(self._live, rows)
+        ends = self._ends
+        if ends is not None:
+            ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
+        self._go_on(self._reset_rows(self._live, rows), ends)
         return self._root()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
         after, outcome = self._step_alone(self._live, self._argument(action))
         following: TensorDictBase = self._next(after, outcome, action)
+        ends = torch.cat([following["terminated"], following["truncated"]], dim=1)
         if "_step" in tensordict:
             marked = validation.mask(tensordict, "_step", self.num_envs)
             validation.check_merge(tensordict, following)
             rows = jax.device_put(marked.cpu().numpy(), self._jax_device)
             after = choose_rows(rows, after, self._live)
             following = validation.only_marked(tensordict, following, marked)
-        self._live = after
+            ends = torch.where(marked.reshape(-1, 1), ends, self._ended())
+        self._go_on(after, ends)
         return following
 
     def _step_and_maybe_reset(
@@ -351,7 +458,7 @@ class JaxEnv(EnvBase):
             return stock
         action = validation.tensor(tensordict, "action")
         live, after, outcome = self._step_fused(self._live, self._argument(action))
-        self._live = live
+        self._go_on(live)
         following = self._next(after, outcome, action)
         validation.keep_what_was_written(tensordict, following)
         tensordict.set("next", following)
@@ -384,7 +491,7 @@ class JaxEnv(EnvBase):
         live = self._live
         step_count = to_torch(live.step_count, self.device).to(torch.int64).unsqueeze(-1)
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        entries = self._observation(live)
+        entries = self._observation(live.obs)
         last_action = to_torch(live.last_action, self.device)
         entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
         entries["is_init"] = step_count == 0
@@ -401,7 +508,7 @@ class JaxEnv(EnvBase):
         terminated = to_torch(outcome.terminated, self.device).unsqueeze(-1).clone()
         truncated = to_torch(outcome.truncated, self.device).unsqueeze(-1).clone()
         step_count = to_torch(after.step_count, self.device).to(torch.int64)
-        entries = self._observation(after)
+        entries = self._observation(after.obs)
         entries["last_action"] = action.to(self.action_spec.dtype, copy=True)
         entries["is_init"] = torch.zeros_like(terminated)
         entries["step_count"] = step_count.unsqueeze(-1)
@@ -413,10 +520,10 @@ class JaxEnv(EnvBase):
         entries["truncated"] = truncated
         return self._tensordict(entries)
 
-    def _observation(self, episodes: Episodes) -> dict[Any, torch.Tensor]:
-        """The observation by name, zero copy."""
+    def _observation(self, obs: Any) -> dict[Any, torch.Tensor]:
+        """An observation by name, zero copy."""
         entries = {}
-        for name, leaf in zip(self._obs_names, jax.tree.leaves(episodes.obs), strict=True):
+        for name, leaf in zip(self._obs_names, jax.tree.leaves(obs), strict=True):
             entries[name] = to_torch(leaf, self.device)
         return entries
 
@@ -428,6 +535,45 @@ class JaxEnv(EnvBase):
         for name, value in entries.items():
             td.set(name, value)
         return td
+
+
+class KeptObservations:
+    """The observations that steps led to, for the ends among them; what ``FinalObservations`` is
+    for our games.
+
+    Args:
+        names: Keys of the observation's leaves.
+    """
+
+    def __init__(self, names: Sequence[Any]) -> None:
+        self._names = tuple(names)
+        self._steps: dict[int, Any] = {}
+
+    def add(self, index: int, final_obs: Any) -> None:
+        """Keep the observation that a step led to, leaves [N, ...], under a number."""
+        self._steps[index] = final_obs
+
+    def draw(
+        self, wanted: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray, dict[Any, jax.Array], np.ndarray]]:
+        """Give the observations that are wanted, and forget all steps.
+
+        Args:
+            wanted: bool [N, L], by env and by the number of the step; those steps must have been
+                added.
+
+        Returns:
+            A portion for each step: int64 [n] rows, int64 [n] steps, arrays [N, ...] by key, and
+            the rows of those that count.
+        """
+        portions = []
+        for step in np.flatnonzero(wanted.any(0)).tolist():
+            rows = np.flatnonzero(wanted[:, step])
+            leaves = jax.tree.leaves(self._steps[step])
+            arrays = dict(zip(self._names, leaves, strict=True))
+            portions.append((rows, np.full(len(rows), step), arrays, rows))
+        self._steps.clear()
+        return portions
 
 
 def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -523,7 +669,7 @@ def from_jax(
         debug: Whether actions are checked on CUDA too.
 
     Returns:
-        The env, for TorchRL's transforms and collectors; ``ArcadeCollector`` is for our games.
+        The env, for TorchRL's transforms and collectors, and for ``ArcadeCollector``.
 
     Raises:
         TypeError: The env lacks a function, or its step gives something else.

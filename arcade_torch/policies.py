@@ -12,8 +12,8 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-# task: if there are several
-ROOT_KEYS = ("pixels", "last_action", "is_init", "step_count", "episode_reward", "task")
+# beside the observation; task: if there are several
+ROOT_KEYS = ("last_action", "is_init", "step_count", "episode_reward", "task")
 
 
 class PolicyRunner:
@@ -24,6 +24,7 @@ class PolicyRunner:
             None writes nothing.
         batch_size: N.
         device: Device of the state.
+        observation_keys: Root keys of the env's observation.
         store: Keys to store (a prefix stands for all below it); None for everything the policy
             writes.
         store_states: Whether the recurrent state of every step may be stored.
@@ -34,6 +35,7 @@ class PolicyRunner:
         policy: Policy | None,
         batch_size: int,
         device: torch.device,
+        observation_keys: Iterable[NestedKey],
         store: Iterable[NestedKey] | None,
         store_states: bool,
     ) -> None:
@@ -42,8 +44,12 @@ class PolicyRunner:
         self._device = device
         self._store = None if store is None else [path_of(key) for key in store]
         self._store_states = store_states
-        reads = () if policy is None else getattr(policy, "in_keys", ROOT_KEYS)
-        self.reads = tuple(key for key in ROOT_KEYS if key in reads or key == "is_init")
+        root_keys = (*observation_keys, *ROOT_KEYS)
+        reads = () if policy is None else getattr(policy, "in_keys", root_keys)
+        prefixes = [path_of(key) for key in reads] + [("is_init",)]
+        self.reads = tuple(key for key in root_keys if _is_below(path_of(key), prefixes))
+        # what is never stored as something that the policy wrote
+        self._known = {path_of(key)[0] for key in root_keys} | {"action"}
         # A module that reads is_init begins anew by itself. Stored states show what it begins with.
         self._sets_initial = store_states or "is_init" not in reads
         self._initial = TensorDict({}, batch_size=self._size, device=device)
@@ -89,7 +95,7 @@ class PolicyRunner:
         return out
 
     def __call__(
-        self, obs: dict[str, torch.Tensor], state: TensorDict
+        self, obs: dict[NestedKey, torch.Tensor], state: TensorDict
     ) -> tuple[torch.Tensor | None, dict[NestedKey, torch.Tensor], TensorDict]:
         """Run one step from root entries and the state that the last call returned.
 
@@ -113,7 +119,7 @@ class PolicyRunner:
             if path[0] == "next":
                 carried[path[1:]] = value
             is_state = path[0] == "next" or path in states
-            if path[0] not in (*ROOT_KEYS, "action") and self._keeps(path, is_state):
+            if path[0] not in self._known and self._keeps(path, is_state):
                 stored[key] = value
         return td["action"], stored, carried
 
@@ -121,7 +127,12 @@ class PolicyRunner:
         """Whether an entry is stored."""
         if is_state and not self._store_states:
             return False
-        return self._store is None or any(path[: len(prefix)] == prefix for prefix in self._store)
+        return self._store is None or _is_below(path, self._store)
+
+
+def _is_below(path: tuple[str, ...], prefixes: Iterable[tuple[str, ...]]) -> bool:
+    """Whether a key is one of some, or stands below one."""
+    return any(path[: len(prefix)] == prefix for prefix in prefixes)
 
 
 def path_of(key: NestedKey) -> tuple[str, ...]:

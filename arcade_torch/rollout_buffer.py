@@ -1,8 +1,10 @@
-"""The storage of a collector: one window of L = overlap + T steps, every frame written once."""
+"""The storage of a collector: one window of L = overlap + T steps, every observation written
+once.
+"""
 
 import functools
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -18,36 +20,52 @@ from arcade_torch.compiled import (
     TRUNCATED,
 )
 from arcade_torch.dlpack import is_host, upload
-from arcade_torch.env import Place
 from arcade_torch.frame_memory import Canvas, Reused, draws_in_place
 from arcade_torch.policies import path_of
+from arcade_torch.raw_step import Place
 
 FinalFrames = Literal["all", "truncated", "none"]
 
 _ROOT_COLUMNS: dict[str, torch.dtype] = {
-    "last_action": torch.int64,
     "is_init": torch.bool,
     "step_count": torch.int64,
     "episode_reward": torch.float32,
 }
 
 
+class Entry(NamedTuple):
+    """Of what kind an entry is."""
+
+    shape: tuple[int, ...]  # of one env
+    dtype: torch.dtype
+
+
+def final_key(key: NestedKey) -> NestedKey:
+    """The key of final observations in sequences: ``"final_pixels"`` for ``"pixels"``."""
+    first, *rest = path_of(key)
+    return (f"final_{first}", *rest) if rest else f"final_{first}"
+
+
 class TensorMemory:
     """Gives tensors, in memory of earlier ones that nobody can see any more; see ``Reused``."""
 
-    def __init__(self, shape: tuple[int, ...], device: torch.device) -> None:
-        self._shape = shape
+    def __init__(self, size: tuple[int, ...], entry: Entry, device: torch.device) -> None:
+        self._shape = (*size, *entry.shape)
+        self._dtype = entry.dtype
         self._device = device
         self._reused = Reused(most=2)  # what is in use, and the one before it
         # under the last tensor, on the CPU: steps may draw into it
         self.canvas: Canvas | None = None
 
     def take(self) -> torch.Tensor:
-        """uint8 of the shape, with any content."""
+        """A tensor of the shape and type, with any content."""
         if not is_host(self._device):  # torch's allocator for GPUs keeps memory by itself
-            return torch.empty(self._shape, dtype=torch.uint8, device=self._device)
-        self.canvas = self._reused.take(functools.partial(Canvas, self._shape))
-        return torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
+            return torch.empty(self._shape, dtype=self._dtype, device=self._device)
+        is_bytes = self._dtype is torch.uint8
+        shape = self._shape if is_bytes else (*self._shape, self._dtype.itemsize)
+        self.canvas = self._reused.take(functools.partial(Canvas, shape))
+        memory = torch.from_numpy(self._reused.hand_out(self.canvas, np.asarray(self.canvas)))
+        return memory if is_bytes else memory.view(self._dtype).squeeze(-1)
 
 
 class RolloutBuffer:
@@ -62,7 +80,8 @@ class RolloutBuffer:
         num_envs: N.
         overlap: Steps of the previous window that stand in front.
         steps: T, new steps a window.
-        frame_shape: Of a stored frame.
+        observation: The entries of an observation as it is stored, by key.
+        action: Of what kind an action is.
         device: Of the storage.
         final_frames: See ``ArcadeCollector``.
         max_steps: The shortest time limit of the games.
@@ -74,7 +93,8 @@ class RolloutBuffer:
         num_envs: int,
         overlap: int,
         steps: int,
-        frame_shape: torch.Size,
+        observation: Mapping[NestedKey, Entry],
+        action: Entry,
         device: torch.device,
         final_frames: FinalFrames = "all",
         max_steps: int = 1,
@@ -86,15 +106,20 @@ class RolloutBuffer:
         self.length = overlap + steps
         self.device = device
         self.final_frames = final_frames
-        self._frame_shape = frame_shape
-        window = (num_envs, self.length, *frame_shape)
-        self._new_pixels = TensorMemory(window, device)
-        self._new_dense = TensorMemory(window, device)
+        self._action_kind = action
         # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step
         # has its own place.
         inside = -(-(self.length - 1) // max_steps) if final_frames == "truncated" else 0
         self._places = 1 + inside
-        self._new_final = TensorMemory((num_envs, self._places, *frame_shape), device)
+        window = (num_envs, self.length)
+        places = (num_envs, self._places)
+        self._new_observation: dict[NestedKey, TensorMemory] = {}
+        self._new_dense: dict[NestedKey, TensorMemory] = {}
+        self._new_final: dict[NestedKey, TensorMemory] = {}
+        for key, entry in observation.items():
+            self._new_observation[key] = TensorMemory(window, entry, device)
+            self._new_dense[key] = TensorMemory(window, entry, device)
+            self._new_final[key] = TensorMemory(places, entry, device)
         self._extra_shapes: dict[NestedKey, tuple[tuple[int, ...], torch.dtype]] = {}
         self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
         # whose final observation is kept
@@ -106,8 +131,10 @@ class RolloutBuffer:
     def _allocate(self) -> None:
         size = (self.num_envs, self.length)
         device = self.device
-        self.pixels = self._new_pixels.take()
-        self._action = torch.zeros(size, dtype=torch.int64, device=device)
+        self.observation = _taken(self._new_observation)
+        shape, dtype = self._action_kind
+        self._action = torch.zeros((*size, *shape), dtype=dtype, device=device)
+        self._last_action = torch.zeros_like(self._action)
         self._numbers = torch.zeros((*size, NUM_NUMBERS), dtype=torch.int32, device=device)
         self._root = {
             key: torch.zeros(size, dtype=dtype, device=device)
@@ -118,9 +145,10 @@ class RolloutBuffer:
             for key, (shape, dtype) in self._extra_shapes.items()
         }
         # the observation after every step, made when it is asked for
-        self._dense: torch.Tensor | None = None
-        self._final = self._new_final.take()
-        self._final[:, :-1].zero_()  # the last place is written in every window
+        self._dense: dict[NestedKey, torch.Tensor] | None = None
+        self._final = _taken(self._new_final)
+        for places in self._final.values():
+            places[:, :-1].zero_()  # the last place is written in every window
 
     @property
     def done(self) -> torch.Tensor:
@@ -147,7 +175,7 @@ class RolloutBuffer:
         # the next window begins with it
         self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")
         if self._fills_dense and self._dense is None:
-            self._dense = self._new_dense.take()
+            self._dense = _taken(self._new_dense)
         if not carry:
             return self._first
         for key, target in self._buffers().items():
@@ -165,14 +193,15 @@ class RolloutBuffer:
             row = upload(rows, self.device)
             target_place = upload(now, self.device)
             source_place = upload(then, self.device)
-            self._final[row, target_place] = final[row, source_place]
+            for key, places in self._final.items():
+                places[row, target_place] = final[key][row, source_place]
         return self._first
 
     def place(self, step: int) -> Place | None:
-        """Where the frames that a step sees may be drawn; None on a GPU, or if the window ends
+        """Where the ``pixels`` that a step sees may be drawn; None on a GPU, or if the window ends
         before it.
         """
-        canvas = self._new_pixels.canvas
+        canvas = self._new_observation["pixels"].canvas
         if canvas is None or step == self.length:
             return None
         config = cast(Any, jax.config)
@@ -180,19 +209,23 @@ class RolloutBuffer:
             return None
         if not draws_in_place():
             return None
-        if self.pixels.data_ptr() != canvas.address:  # share_memory_ has moved it
+        pixels = self.observation["pixels"]
+        if pixels.data_ptr() != canvas.address:  # share_memory_ has moved it
             return None
-        return canvas, step, self.pixels[:, step]
+        return canvas, step, pixels[:, step]
 
-    def write_action(self, step: int, frames: torch.Tensor, action: torch.Tensor) -> None:
-        """Write what was seen and done. Copy the frames, unless JAX has drawn them into the buffer
+    def write_action(
+        self, step: int, obs: Mapping[NestedKey, torch.Tensor], action: torch.Tensor
+    ) -> None:
+        """Write what was seen and done. Copy what was seen, unless JAX has drawn it into the buffer
         already.
         """
-        target = self.pixels[:, step]
-        if frames.data_ptr() != target.data_ptr():
-            target.copy_(frames)
-        if self._dense is not None and self._fills_dense and step > self._first:
-            self._dense[:, step - 1].copy_(frames)
+        for key, stored in self.observation.items():
+            target = stored[:, step]
+            if obs[key].data_ptr() != target.data_ptr():
+                target.copy_(obs[key])
+            if self._dense is not None and self._fills_dense and step > self._first:
+                self._dense[key][:, step - 1].copy_(obs[key])
         _write(self._action, np.s_[:, step], action)
 
     def write_outcome(self, step: int, numbers: torch.Tensor) -> None:
@@ -212,13 +245,15 @@ class RolloutBuffer:
             (self.num_envs, self.length, *shape), dtype=dtype, device=self.device
         )
 
-    def finish(self, root: Mapping[str, torch.Tensor], last: torch.Tensor) -> np.ndarray:
+    def finish(
+        self, root: Mapping[NestedKey, torch.Tensor], last: Mapping[NestedKey, torch.Tensor]
+    ) -> np.ndarray:
         """Work out what each step began with. The host waits here, once a window.
 
         Args:
-            root: What the first new step began with: last_action [N], is_init, step_count,
+            root: What the first new step began with: last_action [N, ...], is_init, step_count,
                 episode_reward [N, 1].
-            last: What follows the last step, uint8 [N, ...].
+            last: The observation that follows the last step, [N, ...] by key.
 
         Returns:
             bool [N, L], the new steps whose final observations are to be drawn; see
@@ -230,19 +265,21 @@ class RolloutBuffer:
         first = self._first
         for key, column in self._root.items():
             column[:, first] = root[key].reshape(self.num_envs)
+        self._last_action[:, first] = root["last_action"]
         before = slice(first, self.length - 1)
         after = slice(first + 1, self.length)
         done = self.done[:, before]
         numbers = self._numbers[:, before]
-        self._root["last_action"][:, after] = self._action[:, before]
+        self._last_action[:, after] = self._action[:, before]
         self._root["is_init"][:, after] = done
         step_count = numbers[..., STEP_COUNT].to(torch.int64)
         self._root["step_count"][:, after] = step_count.masked_fill(done, 0)
         episode_reward = numbers[..., EPISODE_REWARD].view(torch.float32)
         self._root["episode_reward"][:, after] = episode_reward.masked_fill(done, 0)
-        self._final[:, -1] = last
-        if self._dense is not None and self._fills_dense:
-            self._dense[:, -1] = last
+        for key, value in last.items():
+            self._final[key][:, -1] = value
+            if self._dense is not None and self._fills_dense:
+                self._dense[key][:, -1] = value
         if self.final_frames == "none" or (self.final_frames == "all" and not self._fills_dense):
             return np.zeros_like(self._wanted)
         flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
@@ -260,15 +297,18 @@ class RolloutBuffer:
         new[:, :first] = False
         return new
 
-    def write_final(self, rows: np.ndarray, steps: np.ndarray, frames: torch.Tensor) -> None:
-        """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): uint8 [n,
-        ...].
+    def write_final(
+        self, rows: np.ndarray, steps: np.ndarray, obs: Mapping[NestedKey, torch.Tensor]
+    ) -> None:
+        """Write what really followed steps (int64 [n]) of envs (``rows`` int64 [n]): [n, ...] by
+        key.
         """
         places = self._place_of(self._wanted, rows, steps)
-        if self._dense is not None:  # as one axis: a frame is copied whole, and not byte by byte
-            _write(self._dense.flatten(0, 1), rows * self.length + steps, frames)
-        if self.final_frames == "truncated":
-            _write(self._final.flatten(0, 1), rows * self._places + places, frames)
+        for key, value in obs.items():
+            if self._dense is not None:  # as one axis: a frame is copied whole, not byte by byte
+                _write(self._dense[key].flatten(0, 1), rows * self.length + steps, value)
+            if self.final_frames == "truncated":
+                _write(self._final[key].flatten(0, 1), rows * self._places + places, value)
 
     def _place_of(self, wanted: np.ndarray, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
         """The places of the final observations of some envs and steps."""
@@ -282,27 +322,30 @@ class RolloutBuffer:
         out = self._entries(0, [self.num_envs])
         out["initial_state"] = initial_state
         if self.final_frames == "all":
-            out["next", "pixels"] = self._dense
+            assert self._dense is not None
+            for key, dense in self._dense.items():
+                out["next", *path_of(key)] = dense
             return out
         index = np.full((self.num_envs, self._places), self.length - 1)
         mask = np.zeros((self.num_envs, self._places), np.bool_)
         rows, steps = np.nonzero(self._wanted[:, :-1])
-        places = self._place_of(self._wanted, rows, steps)
-        index[rows, places] = steps
-        mask[rows, places] = True
+        place = self._place_of(self._wanted, rows, steps)
+        index[rows, place] = steps
+        mask[rows, place] = True
         used = upload(mask, self.device)
         if self.final_frames == "truncated":
             used[:, -1] = self._numbers[:, -1, TERMINATED] == 0
         else:
             used[:, -1] = ~self.done[:, -1]
-        out["final_pixels"] = self._final
+        for key, places in self._final.items():
+            out[final_key(key)] = places
         out["final_mask"] = used
         out["final_index"] = upload(index, self.device)
         return out
 
     def transitions(self, compact: bool) -> TensorDict:
-        """The T new steps as TensorDict [N, T] in TorchRL's layout; without ``("next", "pixels")``
-        if ``compact``.
+        """The T new steps as TensorDict [N, T] in TorchRL's layout; without the observations in
+        ``"next"`` if ``compact``.
         """
         size = [self.num_envs, self.steps]
         out = self._entries(self.overlap, size)
@@ -312,7 +355,8 @@ class RolloutBuffer:
         if self._task is not None:
             out["next", "task"] = out["task"]
         if not compact and self._dense is not None:
-            out["next", "pixels"] = self._dense[:, self.overlap :]
+            for key, dense in self._dense.items():
+                out["next", *path_of(key)] = dense[:, self.overlap :]
         out.names = [None, "time"]
         return out
 
@@ -321,9 +365,8 @@ class RolloutBuffer:
         numbers = self._numbers[:, first:]
         out = TensorDict({}, batch_size=batch_size, device=self.device)
         entries: dict[NestedKey, torch.Tensor] = {
-            "pixels": self.pixels[:, first:],
             "action": self._action[:, first:],
-            "last_action": self._root["last_action"][:, first:],
+            "last_action": self._last_action[:, first:],
             "is_init": self._root["is_init"][:, first:, None],
             "step_count": self._root["step_count"][:, first:, None],
             "episode_reward": self._root["episode_reward"][:, first:, None],
@@ -334,7 +377,7 @@ class RolloutBuffer:
             ("next", "truncated"): numbers[..., TRUNCATED, None] > 0,
             ("next", "done"): self.done[:, first:, None],
         }
-        for key, buffer in self._extras.items():
+        for key, buffer in (self.observation | self._extras).items():
             entries[key] = buffer[:, first:]
         if self._task is not None:
             entries["task"] = self._task[:, first:]
@@ -345,13 +388,16 @@ class RolloutBuffer:
     def _buffers(self) -> dict[NestedKey, torch.Tensor]:
         """All buffers with axes [N, L, ...]."""
         buffers: dict[NestedKey, torch.Tensor] = {
-            "pixels": self.pixels,
             "action": self._action,
+            "last_action": self._last_action,
             "outcomes": self._numbers,
         }
         buffers.update(self._root)
+        for key, stored in self.observation.items():
+            buffers["observation", *path_of(key)] = stored
         if self._dense is not None and self.final_frames == "all":
-            buffers["dense"] = self._dense
+            for key, dense in self._dense.items():
+                buffers["dense", *path_of(key)] = dense
         for key, buffer in self._extras.items():
             buffers["extras", *path_of(key)] = buffer
         return buffers
@@ -363,13 +409,17 @@ class RolloutBuffer:
             buffers["/".join(path_of(key))] = buffer[:, self.steps :]
         return buffers
 
+    def _final_buffers(self) -> dict[str, torch.Tensor]:
+        """The places for final observations, by path."""
+        return {"/".join(("final", *path_of(key))): value for key, value in self._final.items()}
+
     def overlap_state(self) -> dict[str, Any]:
         """What the next window needs of this one, as plain tensors: nothing without an overlap."""
         if not self.overlap:
             return {}
         return {
             "buffers": {name: steps.clone() for name, steps in self._overlap_buffers().items()},
-            "final": self._final.clone(),
+            "final": {name: places.clone() for name, places in self._final_buffers().items()},
             "wanted": torch.from_numpy(self._wanted).clone(),
         }
 
@@ -379,15 +429,16 @@ class RolloutBuffer:
         """
         if not state:
             return
+        state = _of_today(state)
         for name, buffer in state["buffers"].items():
             kind, *path = name.split("/")
             if kind == "extras" and tuple(path) not in map(path_of, self._extras):
                 key = tuple(path) if len(path) > 1 else path[0]
                 self._add_extra(key, buffer.shape[2:], buffer.dtype)
         if self.final_frames == "all":
-            self._dense = self._new_dense.take()
-        ours = {**self._overlap_buffers(), "final": self._final}
-        saved = {**state["buffers"], "final": state["final"]}
+            self._dense = _taken(self._new_dense)
+        ours = self._overlap_buffers() | self._final_buffers()
+        saved = state["buffers"] | state["final"]
         for name in ours | saved:
             our_shape = tuple(ours[name].shape) if name in ours else None
             saved_shape = tuple(saved[name].shape) if name in saved else None
@@ -412,3 +463,17 @@ def _write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
         target.numpy()[index] = values.numpy()
     else:
         target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values
+
+
+def _taken(memories: Mapping[NestedKey, TensorMemory]) -> dict[NestedKey, torch.Tensor]:
+    """Tensors of all memories."""
+    return {key: memory.take() for key, memory in memories.items()}
+
+
+def _of_today(state: dict[str, Any]) -> dict[str, Any]:
+    """An overlap's state in the layout of this version: version 0.2.0 knew frames alone."""
+    if isinstance(state["final"], dict):
+        return state
+    newer = {"pixels": "observation/pixels", "dense": "dense/pixels"}
+    buffers = {newer.get(name, name): buffer for name, buffer in state["buffers"].items()}
+    return state | {"buffers": buffers, "final": {"final/pixels": state["final"]}}

@@ -191,8 +191,9 @@ class NumpyBatch:
         paid = reward.view(np.float32).astype(np.float64)
         stepped = Stepped(paid, terminated > 0, truncated > 0, info)
         ended = stepped.terminated | stepped.truncated
-        self._finals.add(0, step.final_state, step.root.partial)
+        self._finals.add(0, (step.final_state, step.root.partial))
         drawn = [
-            np.asarray(final)[: len(rows)] for rows, _, final in self._finals.draw(ended[:, None])
+            np.asarray(drawn["pixels"])[counting]
+            for _, _, drawn, counting in self._finals.draw(ended[:, None])
         ]
         return stepped, frames, np.flatnonzero(ended), np.concatenate([frames[:0], *drawn])

@@ -666,7 +666,7 @@ def test_wrong_arguments_are_explained(
 
 def test_wrong_envs_are_explained() -> None:
     with pytest.raises(
-        TypeError, match=r"env is a TransformedEnv, expected an ArcadeEnv; others go with torchrl"
+        TypeError, match=r"TransformedEnv, expected an ArcadeEnv or what from_jax gives; others go"
     ):
         ArcadeCollector(TransformedEnv(stub_env()), scripted, N * T)
     with pytest.raises(ValueError, match="make the env with categorical_actions=True"):
