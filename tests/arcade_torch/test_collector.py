@@ -677,7 +677,7 @@ def test_wrong_envs_are_explained() -> None:
 def test_an_overlap_without_the_next_frames_that_batches_show_is_refused(mode: Any) -> None:
     collector = stub_collector(scripted, overlap=2, final_frames=mode)
     collector.collect()
-    with pytest.raises(ValueError, match="saved overlap 'dense' is None"):
+    with pytest.raises(ValueError, match="saved overlap 'dense/pixels' is None"):
         stub_collector(scripted, overlap=2).load_state_dict(collector.state_dict())
 
 
