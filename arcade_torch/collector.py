@@ -4,20 +4,20 @@ import functools
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector
-from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
+from arcade_torch.collector_arguments import check_arguments
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.jax_env import JaxEnv
-from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner
+from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner, random_actions
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.validation import check_flags, whole
 
@@ -109,8 +109,7 @@ class ArcadeCollector(BaseCollector):
         check_flags(
             "return_same_td compact_obs store_states", (return_same_td, compact_obs, store_states)
         )
-        _check_arguments(env, policy, frames_per_batch, overlap, final_frames)
-        _check_compress(env, compress)
+        check_arguments(env, policy, frames_per_batch, overlap, final_frames, compress)
         self.env: ArcadeEnv | JaxEnv = env
         self.policy = policy
         self.frames_per_batch = frames_per_batch
@@ -319,7 +318,7 @@ class ArcadeCollector(BaseCollector):
             self._window_starts.append(self._runner.begin_anew(self._state, obs["is_init"]).clone())
         action, extras, self._state = self._runner(obs, self._state)
         if random or action is None:
-            action = _random_actions(self.env.action_spec, self._generator)
+            action = random_actions(self.env.action_spec, self._generator)
         store_action = functools.partial(buffer.write_action, step, obs, action)
         into = buffer.place(step + 1) if self._draws_in_place else None
         raw = self.env.step_raw(action, while_computing=store_action, into=into)
@@ -490,62 +489,6 @@ class ArcadeCollector(BaseCollector):
         return f"ArcadeCollector({played!r}, {sizes})"
 
 
-def _check_compress(env: ArcadeEnv | JaxEnv, compress: Any) -> None:
-    """Refuse to compress an observation of several arrays."""
-    if compress is not None and len(env.observation_keys) > 1:
-        names = ", ".join(map(str, env.observation_keys))
-        raise ValueError(f"compress takes one array, and the env observes several: {names}")
-
-
-def _random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor:
-    """Actions of all envs: any integer that is allowed, numbers between the bounds, and numbers of
-    mean 0 and deviation 1 where there are none.
-    """
-    shape = spec.shape
-    device = spec.device
-    if isinstance(spec, Categorical):
-        return torch.randint(spec.space.n, shape, generator=generator, device=device)
-    if not isinstance(spec, Bounded):
-        return torch.randn(shape, generator=generator, device=device, dtype=spec.dtype)
-    low: torch.Tensor = spec.space.low
-    share = torch.rand(shape, generator=generator, device=device, dtype=spec.dtype)
-    action: torch.Tensor = low + share * (spec.space.high - low)
-    return action
-
-
 def _layout(td: TensorDictBase) -> dict[NestedKey, tuple[torch.dtype, torch.Size]]:
     """Type and shape of every entry."""
     return {key: (value.dtype, value.shape) for key, value in td.items(True, True)}
-
-
-def _check_arguments(
-    env: Any, policy: Any, frames_per_batch: int, overlap: int, final_frames: str
-) -> None:
-    """Refuse what cannot work, before anything is allocated."""
-    if not isinstance(env, ArcadeEnv | JaxEnv):
-        raise TypeError(
-            f"env is a {type(env).__name__}, expected an ArcadeEnv or what from_jax gives; others "
-            "go with torchrl's Collector"
-        )
-    if isinstance(env, ArcadeEnv) and env.one_hot:
-        raise ValueError(
-            "ArcadeCollector stores actions as integers: make the env with categorical_actions=True"
-        )
-    if policy is not None and not callable(policy):
-        raise TypeError(
-            f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or "
-            "None for random actions"
-        )
-    num_envs = env.num_envs
-    if frames_per_batch < num_envs or frames_per_batch % num_envs:
-        raise ValueError(
-            f"frames_per_batch is {frames_per_batch}, expected an int multiple of num_envs "
-            f"({num_envs})"
-        )
-    if overlap < 0:
-        raise ValueError(f"overlap is {overlap}, expected an int of 0 or more")
-    if final_frames not in get_args(FinalFrames):
-        raise ValueError(
-            f"final_frames is {final_frames!r}, allowed: "
-            f"{', '.join(map(repr, get_args(FinalFrames)))}"
-        )

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import nn
+from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
@@ -133,6 +134,22 @@ class PolicyRunner:
 def _is_below(path: tuple[str, ...], prefixes: Iterable[tuple[str, ...]]) -> bool:
     """Whether a key is one of some, or stands below one."""
     return any(path[: len(prefix)] == prefix for prefix in prefixes)
+
+
+def random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor:
+    """Actions of all envs: any integer that is allowed, numbers between the bounds, and numbers of
+    mean 0 and deviation 1 where there are none.
+    """
+    shape = spec.shape
+    device = spec.device
+    if isinstance(spec, Categorical):
+        return torch.randint(spec.space.n, shape, generator=generator, device=device)
+    if not isinstance(spec, Bounded):
+        return torch.randn(shape, generator=generator, device=device, dtype=spec.dtype)
+    low: torch.Tensor = spec.space.low
+    share = torch.rand(shape, generator=generator, device=device, dtype=spec.dtype)
+    action: torch.Tensor = low + share * (spec.space.high - low)
+    return action
 
 
 def path_of(key: NestedKey) -> tuple[str, ...]:
