@@ -17,7 +17,7 @@ FASTEST = 0.5  # largest initial decay a step
 
 
 class FFM(Memory):
-    """S_t = exp(-alpha + i omega) S_{t-1} + u_t, u_t = l1(x_t) sigmoid(l2(x_t)), and
+    """S_t = exp(-\\|alpha\\| + i omega) S_{t-1} + u_t, u_t = l1(x_t) sigmoid(l2(x_t)), and
     y_t = LN(l3(S_t)) sigmoid(l4(x_t)) + l5(x_t) (1 - sigmoid(l4(x_t))).
 
     S is complex [m, c]: trace j decays at alpha_j, context k turns at omega_k, and every context
@@ -26,12 +26,12 @@ class FFM(Memory):
 
     The published code multiplies by exp(alpha t) over a whole sequence and divides again, which
     needs double precision and bounds alpha by the length; here every step decays what is there, so
-    nothing grows, and alpha is any positive number.
+    nothing grows, and alpha is any number.
 
     Args:
         input_size: D.
         hidden_size: H.
-        trace_size: m; None is H / 8, rounded, so that the state has about H numbers.
+        trace_size: m; None is H / 8, rounded, and at least 2: a state of about H numbers.
         context_size: c.
 
     Raises:
@@ -52,7 +52,7 @@ class FFM(Memory):
         context_size: int = 4,
     ) -> None:
         super().__init__(input_size, hidden_size)
-        traces = max(1, round(hidden_size / 8)) if trace_size is None else trace_size
+        traces = max(2, round(hidden_size / 8)) if trace_size is None else trace_size
         if traces < 1 or context_size < 1:
             raise ValueError(
                 f"trace_size and context_size must be positive, got {trace_size} and {context_size}"
@@ -61,7 +61,8 @@ class FFM(Memory):
         self.context_size = context_size
         self.state_shape = (traces, context_size, 2)
         slowest = math.log(1 / FORGOTTEN) / PERIOD
-        self.log_alpha = nn.Parameter(torch.linspace(math.log(slowest), math.log(FASTEST), traces))
+        decays = torch.linspace(math.log(slowest), math.log(FASTEST), traces)
+        self.alpha = nn.Parameter(torch.exp(decays))
         self.omega = nn.Parameter(2 * math.pi / torch.linspace(1, PERIOD, context_size))
         self.write = nn.Linear(input_size, 2 * traces)
         self.mix = nn.Linear(2 * traces * context_size, hidden_size)
@@ -71,7 +72,7 @@ class FFM(Memory):
         """See :meth:`Memory.run`; the state is [..., m, c, 2]."""
         exact = torch.promote_types(x.dtype, torch.float32)  # complex numbers are no smaller
         shape = self.state_shape[:2]
-        size = torch.exp(-torch.exp(self.log_alpha.to(exact)))
+        size = torch.exp(-self.alpha.to(exact).abs())
         decay = torch.polar(size[:, None].expand(shape), self.omega.to(exact).expand(shape))
         value, gate = self.write(x).chunk(2, dim=-1)
         written = (value * torch.sigmoid(gate)).to(exact)[..., None].expand(*x.shape[:2], *shape)

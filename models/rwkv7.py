@@ -55,11 +55,11 @@ class RWKV7(Memory):
         bound = 1 / math.sqrt(input_size)
         self.weight = nn.Parameter(torch.empty(PARTS, size, input_size).uniform_(-bound, bound))
         self.mix = nn.Parameter(torch.full((PARTS, 1, input_size), 0.5))
-        self.bias = nn.Parameter(torch.linspace(-6, -1, size))  # of w: from slow to fast
+        self.bias = nn.Parameter(torch.linspace(-6, 0, size))  # of w: from slow to fast
         self.bias_a = nn.Parameter(torch.zeros(size))
         self.xi = nn.Parameter(torch.ones(size))
         self.alpha = nn.Parameter(torch.ones(size))
-        self.rho = nn.Parameter(torch.full((size,), 0.1))
+        self.rho = nn.Parameter(torch.zeros(size))
         self.norm = nn.LayerNorm(size)
         self.output = nn.Linear(size, hidden_size)
 

@@ -27,7 +27,7 @@ def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(
         ("lstm", 16, 64, 8 * 8 * 8),
         ("frame_stack", 24, 96, 4 * 8 * 8),
         ("lru", 16, 64, 4 * 8 * 8),
-        ("ffm", 8, 32, 2 * 8 + 8 * 8 + 2 * 8 * 8),
+        ("ffm", 16, 64, 4 * 8 + 16 * 8 + 2 * 8 * 8),
         ("shm", 10, 44, 8 * 13 + 3 * 3 + 3 * 8),
         ("rtu", 16, 64, 4 * 8 * 8),
         ("deltaproduct", 9, 36, 8 * (5 * 3 + 3) + 6 * 3 * 3 + 3 * 8),
