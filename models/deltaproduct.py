@@ -90,8 +90,8 @@ class DeltaProduct(GatedDeltaNet):
         self, steps: MatrixSteps, is_init: Tensor, stored: Tensor
     ) -> tuple[Tensor, Tensor]:
         """See :meth:`FastWeights.scan_stored`."""
-        each = stored.repeat_interleave(self.householders, dim=1)
-        o, states = matrix_scan_stored(steps, self._at_first_writes(is_init), each)
+        at_writes = stored.repeat_interleave(self.householders, dim=1)
+        o, states = matrix_scan_stored(steps, self._at_first_writes(is_init), at_writes)
         return self._after_last_writes(o), self._after_last_writes(states)
 
     def _at_first_writes(self, is_init: Tensor) -> Tensor:

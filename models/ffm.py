@@ -71,7 +71,7 @@ class FFM(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., m, c, 2]."""
         exact = torch.promote_types(x.dtype, torch.float32)  # complex numbers are no smaller
-        shape = self.state_shape[:2]
+        shape = (self.trace_size, self.context_size)
         size = torch.exp(-self.alpha.to(exact).abs())
         decay = torch.polar(size[:, None].expand(shape), self.omega.to(exact).expand(shape))
         value, gate = self.write(x).chunk(2, dim=-1)

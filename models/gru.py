@@ -42,7 +42,7 @@ class GRU(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`."""
         steps = self.from_input(x)
-        start, stored = start_and_stored(h0, is_init, self.state_shape, steps.dtype)
+        start, stored = start_and_stored(h0, is_init, 1, steps.dtype)
         scan: Any = gru_loop if x.shape[1] == 1 else gru_scan
         weights = self.gates_from_state.weight, self.candidate_from_state.weight
         y = scan(steps, *(weight.to(steps.dtype) for weight in weights), start, stored)[0]

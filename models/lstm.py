@@ -47,7 +47,7 @@ class LSTM(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 2, H]."""
         steps = self.from_input(x)
-        start, stored = start_and_stored(h0, is_init, self.state_shape, steps.dtype)
+        start, stored = start_and_stored(h0, is_init, 2, steps.dtype)
         scan: Any = lstm_loop if x.shape[1] == 1 else lstm_scan
         states = scan(steps, self.from_state.weight.to(steps.dtype), start, stored)[0]
         return states[:, :, 0], states

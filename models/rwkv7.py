@@ -82,7 +82,7 @@ class RWKV7(Memory):
 
     def _read(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """Outputs, and the matrix after each step."""
-        start, stored = start_and_stored(state["x"], is_init, (self.input_size,), x.dtype)
+        start, stored = start_and_stored(state["x"], is_init, 1, x.dtype)
         one_before = F.pad(x, (0, 0, 1, 0))[:, :-1]
         loaded = F.pad(stored, (0, 0, 0, x.shape[1] - stored.shape[1]))
         change = torch.where(start.unsqueeze(-1), loaded, one_before) - x
@@ -94,7 +94,7 @@ class RWKV7(Memory):
         a = torch.sigmoid(a + self.bias_a)
         n = unit_length(k * self.xi)
         k = k * (1 + self.alpha * (a - 1))
-        start, stored = start_and_stored(state["h"], is_init, self.state_shape, x.dtype)
+        start, stored = start_and_stored(state["h"], is_init, 2, x.dtype)
         scan: Any = dplr_loop if x.shape[1] == 1 else dplr_scan
         h = scan(w, a * n, n, k, v, start, stored)
         read = self.norm((r.unsqueeze(-2) @ h).squeeze(-2))

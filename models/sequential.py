@@ -11,7 +11,7 @@ __all__ = ["Loads", "one_by_one", "start_and_stored"]
 
 
 def start_and_stored(
-    h0: Tensor, is_init: Tensor, state_shape: tuple[int, ...], dtype: torch.dtype
+    h0: Tensor, is_init: Tensor, state_ndim: int, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
     """Where a sequence loads a state, and what it loads.
 
@@ -19,7 +19,7 @@ def start_and_stored(
         h0: as in ``Memory.run``: [B, \\*S], the state before index 0, or [B, T, \\*S], one for each
             step.
         is_init: bool [B, T].
-        state_shape: S.
+        state_ndim: dimensions of one state, without the batch: the length of S.
         dtype: of the recurrence.
 
     Returns:
@@ -28,8 +28,8 @@ def start_and_stored(
     """
     start = is_init | (torch.arange(is_init.shape[1], device=is_init.device) == 0)
     stored = h0.to(dtype)
-    if h0.ndim == 1 + len(state_shape):
-        begins = is_init[:, 0].reshape(-1, *(1 for _ in state_shape))
+    if h0.ndim == 1 + state_ndim:
+        begins = is_init[:, 0].reshape(-1, *(1,) * state_ndim)
         stored = torch.where(begins, 0, stored).unsqueeze(1)
     return start, stored
 
@@ -47,12 +47,12 @@ class Loads:
         self.start = start
         self.stored = stored
         self.first = stored[:, 0]
-        # a card does not wait for the answer: there every step may be a start
-        some = None if start.is_cuda else start.any(0).tolist()
+        # nobody waits for an answer of a card: there every step may be a start
+        some = start.any(0).tolist() if start.device.type == "cpu" else None
         self.masks: dict[int, Tensor] = {}
         for t in range(1, start.shape[1]):
             if some is None or some[t]:
-                self.masks[t] = start[:, t].reshape(-1, *(1 for _ in self.first.shape[1:]))
+                self.masks[t] = start[:, t].reshape(-1, *(1,) * (self.first.ndim - 1))
 
     def apply(self, t: int, state: Tensor) -> Tensor:
         """The state that step t reads, from the one after step t - 1."""
