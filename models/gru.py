@@ -7,8 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
+from arcade_torch.models.sequential import Loads, one_by_one, start_and_stored
 
-__all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward", "one_by_one"]
+__all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward"]
 
 
 class GRU(Memory):
@@ -41,23 +42,16 @@ class GRU(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`."""
         steps = self.from_input(x)
-        if h0.ndim < x.ndim:  # every start but index 0 loads zeros
-            first = torch.where(is_init[:, :1], 0, h0)
-            stored = F.pad(first.unsqueeze(1), (0, 0, 0, x.shape[1] - 1))
-        else:
-            stored = h0
-        start = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
+        start, stored = start_and_stored(h0, is_init, 1, steps.dtype)
         scan: Any = gru_loop if x.shape[1] == 1 else gru_scan
         weights = self.gates_from_state.weight, self.candidate_from_state.weight
-        y = scan(
-            steps, *(weight.to(steps.dtype) for weight in weights), start, stored.to(steps.dtype)
-        )[0]
+        y = scan(steps, *(weight.to(steps.dtype) for weight in weights), start, stored)[0]
         return y, y
 
 
 def gru_loop(
     steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """The recurrence in plain torch operators: what acting runs, and the oracle of
     :func:`gru_scan`.
 
@@ -65,44 +59,64 @@ def gru_loop(
         steps: float [B, T, 3 H], what the input adds to z, r and c.
         gates_weight: U, [2 H, H].
         candidate_weight: U_h, [H, H].
-        start: bool [B, T], where the state is loaded; set at index 0.
-        stored: [B, T, H], the state to load there; not looked at elsewhere.
+        start: bool [B, T], where a state is loaded; set at index 0.
+        stored: what is loaded, [B, T, H] or [B, 1, H]; see :class:`Loads`.
 
     Returns:
-        (the state after each step [B, T, H], z and r [B, T, 2 H], c [B, T, H]).
+        (the state after each step [B, T, H], z, r and c [B, T, 3 H]).
     """
     size = candidate_weight.shape[0]
-    to_gates, to_candidate = steps.split([2 * size, size], dim=-1)
-    to_gates_of_step = to_gates.unbind(1)
-    to_candidate_of_step = to_candidate.unbind(1)
     begins = start.unsqueeze(-1).unbind(1)
-    fresh = stored.unbind(1)
-
+    fresh = (
+        stored.expand_as(steps[..., :size])
+        if stored.shape[1] > 1
+        else F.pad(stored, (0, 0, 0, steps.shape[1] - 1))
+    )
     states = []
     gates = []
-    candidates = []
     h = stored[:, 0]
-    for t in range(steps.shape[1]):
+    for t, from_input in enumerate(steps.unbind(1)):
         if t > 0:
-            h = torch.where(begins[t], fresh[t], h)
-        z_and_r = torch.sigmoid(torch.addmm(to_gates_of_step[t], h, gates_weight.t()))
+            h = torch.where(begins[t], fresh[:, t], h)
+        to_gates, to_candidate = from_input.split([2 * size, size], dim=-1)
+        z_and_r = torch.sigmoid(torch.addmm(to_gates, h, gates_weight.t()))
         z, r = z_and_r.chunk(2, dim=-1)
-        c = torch.tanh(torch.addmm(to_candidate_of_step[t], r * h, candidate_weight.t()))
+        c = torch.tanh(torch.addmm(to_candidate, r * h, candidate_weight.t()))
         h = torch.lerp(h, c, z)
         states.append(h)
-        gates.append(z_and_r)
-        candidates.append(c)
-    return torch.stack(states, dim=1), torch.stack(gates, dim=1), torch.stack(candidates, dim=1)
+        gates.append(torch.cat([z_and_r, c], dim=-1))
+    return torch.stack(states, dim=1), torch.stack(gates, dim=1)
+
+
+def _by_step(x: Tensor, width: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """The first ``width`` features of every step, and the rest: views, made once for a loop."""
+    return x[..., :width].unbind(1), x[..., width:].unbind(1)
 
 
 @torch.library.custom_op("arcade_torch::gru_scan", mutates_args=())
 def gru_scan(
     steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """:func:`gru_loop` as one operator; gradients flow from the states, not from the gates and
-    candidates.
-    """
-    return gru_loop(steps, gates_weight, candidate_weight, start, stored)
+) -> tuple[Tensor, Tensor]:
+    """:func:`gru_loop` as one operator; gradients flow from the states, not from z, r and c."""
+    size = candidate_weight.shape[0]
+    to_z_and_r = gates_weight.t()
+    to_c = candidate_weight.t()
+    loads = Loads(start, stored)
+    states = steps.new_empty(*steps.shape[:2], size)
+    gates = torch.empty_like(steps, memory_format=torch.contiguous_format)
+    reset = torch.empty_like(states[:, 0])
+    h = loads.first
+    columns = zip(
+        *_by_step(steps, 2 * size), *_by_step(gates, 2 * size), *_by_step(gates, size), strict=True
+    )
+    after = states.unbind(1)
+    for t, (input_of_gates, input_of_c, z_and_r, c, z, _) in enumerate(columns):
+        h = loads.apply(t, h)
+        torch.addmm(input_of_gates, h, to_z_and_r, out=z_and_r).sigmoid_()
+        torch.mul(z_and_r[:, size:], h, out=reset)
+        torch.addmm(input_of_c, reset, to_c, out=c).tanh_()
+        h = torch.lerp(h, c, z, out=after[t])
+    return states, gates
 
 
 @torch.library.custom_op("arcade_torch::gru_scan_backward", mutates_args=())
@@ -113,89 +127,73 @@ def gru_scan_backward(
     stored: Tensor,
     states: Tensor,
     gates: Tensor,
-    candidates: Tensor,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of :func:`gru_scan` with respect to its float arguments, from what it took and
     returned, and the gradient [B, T, H] that arrives at the states.
     """
     size = candidate_weight.shape[0]
-    begins = start.unsqueeze(-1)
-    before = torch.where(begins, stored, torch.cat([stored[:, :1], states[:, :-1]], dim=1))
-    z, r = gates.chunk(2, dim=-1)
-    # What does not depend on the gradient from later steps, for all steps at once.
-    to_c = z * (1 - candidates * candidates)
-    to_gates = gates * (1 - gates)
-    to_gates[..., :size] *= candidates - before
-    to_gates[..., size:] *= before
-    columns = [x.unbind(1) for x in (to_c, to_gates, 1 - z, r, begins, grad)]
-    by_step = list(zip(*columns, strict=True))
-    grad_steps = grad.new_empty(*grad.shape[:2], 3 * size)
-    grad_before = torch.empty_like(states)
-    carried = torch.zeros_like(states[:, 0])
-    for t in range(grad.shape[1] - 1, -1, -1):
-        to_c_t, to_gates_t, keep, r_t, begins_t, grad_t = by_step[t]
-        d_h = grad_t + carried
-        d_c = d_h * to_c_t
-        d_reset = d_c @ candidate_weight
-        d_gates = torch.cat([d_h, d_reset], dim=-1) * to_gates_t
-        d_before = torch.addmm(d_h * keep + d_reset * r_t, d_gates, gates_weight)
-        grad_steps[:, t, : 2 * size] = d_gates
-        grad_steps[:, t, 2 * size :] = d_c
-        grad_before[:, t] = d_before
-        carried = d_before.masked_fill(begins_t, 0)
-    d_gates, d_c = grad_steps.split([2 * size, size], dim=-1)
-    grad_gates_weight = d_gates.flatten(0, 1).t() @ before.flatten(0, 1)
-    grad_candidate_weight = d_c.flatten(0, 1).t() @ (r * before).flatten(0, 1)
-    grad_stored = grad_before.masked_fill(~begins, 0)
-    return grad_steps, grad_gates_weight, grad_candidate_weight, grad_stored
+    loads = Loads(start, stored)
+    before = loads.before(states)
+    d_steps = torch.empty_like(gates)
+    d_stored = stored.new_zeros(stored.shape)
+    d_h = torch.empty_like(states[:, 0])
+    d_reset = torch.empty_like(d_h)
+    d_candidate = torch.empty_like(d_h)
+    d_gates = gates.new_empty(d_h.shape[0], 2 * size)
+    d_z, d_r = d_gates.split(size, dim=1)
+    carried = torch.zeros_like(d_h)
+    z, r, c = (x.unbind(1) for x in gates.split(size, dim=-1))
+    z_and_r = gates[..., : 2 * size].unbind(1)
+    to_gates, to_c = _by_step(d_steps, 2 * size)
+    arrives = grad.unbind(1)
+    read = before.unbind(1)
+    for t in range(len(arrives) - 1, -1, -1):
+        torch.add(arrives[t], carried, out=d_h)
+        torch.mul(d_h, z[t], out=d_candidate)
+        torch.ops.aten.tanh_backward.grad_input(d_candidate, c[t], grad_input=to_c[t])
+        torch.mm(to_c[t], candidate_weight, out=d_reset)
+        torch.sub(c[t], read[t], out=d_z).mul_(d_h)
+        torch.mul(d_reset, read[t], out=d_r)
+        torch.ops.aten.sigmoid_backward.grad_input(d_gates, z_and_r[t], grad_input=to_gates[t])
+        torch.sub(d_h, d_candidate, out=carried).addcmul_(d_reset, r[t])
+        carried.addmm_(to_gates[t], gates_weight)
+        loads.collect(t, carried, d_stored)
+    rows = d_steps.flatten(0, 1)
+    reset = gates[:, :, size : 2 * size] * before
+    d_gates_weight = rows[:, : 2 * size].t() @ before.flatten(0, 1)
+    d_candidate_weight = rows[:, 2 * size :].t() @ reset.flatten(0, 1)
+    return d_steps, d_gates_weight, d_candidate_weight, d_stored
 
 
 @gru_scan.register_fake
 def _(
     steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
 ) -> Any:
-    batch, length, size = stored.shape
-    return tuple(steps.new_empty(batch, length, width) for width in (size, 2 * size, size))
+    states = steps.new_empty(*steps.shape[:2], candidate_weight.shape[0])
+    return states, torch.empty_like(steps, memory_format=torch.contiguous_format)
 
 
 @gru_scan_backward.register_fake
 def _(
     gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor, *rest: Tensor
 ) -> Any:
-    grad_steps = stored.new_empty(*stored.shape[:2], 3 * stored.shape[2])
-    return grad_steps, *(x.new_empty(x.shape) for x in (gates_weight, candidate_weight, stored))
+    weights = (gates_weight, candidate_weight, stored)
+    return torch.empty_like(rest[1]), *(x.new_empty(x.shape) for x in weights)
 
 
 def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs[1:], *output)
 
 
-def _differentiate(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+def _differentiate(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    if grad is None:
+        return (None,) * 5
     to_steps, to_gates, to_candidate, to_stored = gru_scan_backward(*ctx.saved_tensors, grad)
     return to_steps, to_gates, to_candidate, None, to_stored
 
 
 gru_scan.register_autograd(_differentiate, setup_context=_save)
-
-
-def one_by_one(op: Any) -> Any:
-    """A vmap rule: the operator once for each entry of the mapped dimension (the weights may
-    differ).
-    """
-
-    def rule(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> Any:
-        rows = [
-            [x] * info.batch_size if d is None else x.unbind(d)
-            for x, d in zip(args, in_dims, strict=True)
-        ]
-        results = [op(*row) for row in zip(*rows, strict=True)]
-        return tuple(torch.stack(parts) for parts in zip(*results, strict=True)), (0,) * len(
-            results[0]
-        )
-
-    return rule
-
-
 gru_scan.register_vmap(one_by_one(gru_scan))
 gru_scan_backward.register_vmap(one_by_one(gru_scan_backward))

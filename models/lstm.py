@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from arcade_torch.models.gru import one_by_one
 from arcade_torch.models.memory import Memory
+from arcade_torch.models.sequential import Loads, one_by_one, start_and_stored
 
 __all__ = ["LSTM", "lstm_loop", "lstm_scan", "lstm_scan_backward"]
 
@@ -47,11 +47,7 @@ class LSTM(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 2, H]."""
         steps = self.from_input(x)
-        stored = h0.to(steps.dtype)
-        if h0.ndim == x.ndim:  # every start but index 0 loads zeros
-            first = torch.where(is_init[:, :1, None], 0, stored)
-            stored = F.pad(first.unsqueeze(1), (0, 0, 0, 0, 0, x.shape[1] - 1))
-        start = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
+        start, stored = start_and_stored(h0, is_init, 2, steps.dtype)
         scan: Any = lstm_loop if x.shape[1] == 1 else lstm_scan
         states = scan(steps, self.from_state.weight.to(steps.dtype), start, stored)[0]
         return states[:, :, 0], states
@@ -66,13 +62,15 @@ def lstm_loop(
     Args:
         steps: float [B, T, 4 H], what the input adds to i, f, g and o.
         weight: U, [4 H, H].
-        start: bool [B, T], where the state is loaded; set at index 0.
-        stored: [B, T, 2, H], h and c to load there; not looked at elsewhere.
+        start: bool [B, T], where a state is loaded; set at index 0.
+        stored: h and c to load there, [B, T, 2, H] or [B, 1, 2, H]; see :class:`Loads`.
 
     Returns:
         (h and c after each step [B, T, 2, H], the gates i, f, g and o [B, T, 4 H]).
     """
     begins = start[..., None, None].unbind(1)
+    if stored.shape[1] < start.shape[1]:
+        stored = F.pad(stored, (0, 0, 0, 0, 0, start.shape[1] - 1))
     fresh = stored.unbind(1)
     states = []
     gates = []
@@ -98,7 +96,27 @@ def lstm_scan(
     steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor
 ) -> tuple[Tensor, Tensor]:
     """:func:`lstm_loop` as one operator; gradients flow from the states, not from the gates."""
-    return lstm_loop(steps, weight, start, stored)
+    size = weight.shape[1]
+    loads = Loads(start, stored)
+    states = steps.new_empty(*steps.shape[:2], 2, size)
+    gates = torch.empty_like(steps, memory_format=torch.contiguous_format)
+    from_state = weight.t()
+    i_and_f = gates[..., : 2 * size].unbind(1)
+    i, f, g, o = (x.unbind(1) for x in gates.split(size, dim=-1))
+    after = states.unbind(1)
+    of_step = gates.unbind(1)
+    state = loads.first
+    for t, from_input in enumerate(steps.unbind(1)):
+        state = loads.apply(t, state)
+        torch.addmm(from_input, state[:, 0], from_state, out=of_step[t])
+        i_and_f[t].sigmoid_()
+        g[t].tanh_()
+        o[t].sigmoid_()
+        h, c = after[t].unbind(1)
+        torch.mul(f[t], state[:, 1], out=c).addcmul_(i[t], g[t])
+        torch.tanh(c, out=h).mul_(o[t])
+        state = after[t]
+    return states, gates
 
 
 @torch.library.custom_op("arcade_torch::lstm_scan_backward", mutates_args=())
@@ -108,53 +126,60 @@ def lstm_scan_backward(
     """Gradients of :func:`lstm_scan` with respect to its float arguments, from what it took and
     returned, and the gradient [B, T, 2, H] that arrives at the states.
     """
-    begins = start[..., None, None]
-    before = torch.where(begins, stored, torch.cat([stored[:, :1], states[:, :-1]], dim=1))
-    i, f, g, o = gates.chunk(4, dim=-1)
-    squashed = torch.tanh(states[:, :, 1])
-    # What does not depend on the gradient from later steps, for all steps at once.
-    of_i = g * i * (1 - i)
-    of_f = before[:, :, 1] * f * (1 - f)
-    of_g = i * (1 - g * g)
-    of_o = squashed * o * (1 - o)
-    to_gates = torch.cat([of_i, of_f, of_g, of_o], dim=-1).unbind(1)
-    to_c = (o * (1 - squashed * squashed)).unbind(1)
-    keep = f.unbind(1)
-    load = begins.unbind(1)
-    grad_of_step = grad.unbind(1)
-
-    grad_steps = torch.empty_like(gates)
-    grad_before = torch.empty_like(states)
+    size = weight.shape[1]
+    loads = Loads(start, stored)
+    before = loads.before(states)
+    d_steps = torch.empty_like(gates)
+    d_stored = stored.new_zeros(stored.shape)
+    i, f, g, o = (x.unbind(1) for x in gates.split(size, dim=-1))
+    to_i, to_f, to_g, to_o = (x.unbind(1) for x in d_steps.split(size, dim=-1))
+    arrives = grad.unbind(1)
+    to_gates = d_steps.unbind(1)
+    sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
+    tanh_backward = torch.ops.aten.tanh_backward.grad_input
     carried = torch.zeros_like(states[:, 0])
-    for t in range(grad.shape[1] - 1, -1, -1):
-        d_h, d_c = (grad_of_step[t] + carried).unbind(1)
-        d_c = d_c + d_h * to_c[t]
-        d_gates = torch.cat([d_c, d_c, d_c, d_h], dim=-1) * to_gates[t]
-        d_before = torch.stack([d_gates @ weight, d_c * keep[t]], dim=1)
-        grad_steps[:, t] = d_gates
-        grad_before[:, t] = d_before
-        carried = d_before.masked_fill(load[t], 0)
-    grad_weight = grad_steps.flatten(0, 1).t() @ before[:, :, 0].flatten(0, 1)
-    return grad_steps, grad_weight, grad_before.masked_fill(~begins, 0)
+    d_state = torch.empty_like(carried)
+    d_h, d_c = d_state.unbind(1)
+    squashed = torch.empty_like(d_h)
+    part = torch.empty_like(d_h)
+    for t in range(len(arrives) - 1, -1, -1):
+        torch.add(arrives[t], carried, out=d_state)
+        torch.tanh(states[:, t, 1], out=squashed)
+        torch.mul(d_h, squashed, out=part)
+        sigmoid_backward(part, o[t], grad_input=to_o[t])
+        torch.mul(d_h, o[t], out=part)
+        d_c += tanh_backward(part, squashed, grad_input=squashed)
+        sigmoid_backward(torch.mul(d_c, g[t], out=part), i[t], grad_input=to_i[t])
+        sigmoid_backward(torch.mul(d_c, before[:, t, 1], out=part), f[t], grad_input=to_f[t])
+        tanh_backward(torch.mul(d_c, i[t], out=part), g[t], grad_input=to_g[t])
+        torch.mm(to_gates[t], weight, out=carried[:, 0])
+        torch.mul(d_c, f[t], out=carried[:, 1])
+        loads.collect(t, carried, d_stored)
+    d_weight = d_steps.flatten(0, 1).t() @ before[:, :, 0].flatten(0, 1)
+    return d_steps, d_weight, d_stored
 
 
 @lstm_scan.register_fake
 def _(steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor) -> Any:
-    return steps.new_empty(stored.shape), steps.new_empty(steps.shape)
+    states = steps.new_empty(*steps.shape[:2], 2, weight.shape[1])
+    return states, torch.empty_like(steps, memory_format=torch.contiguous_format)
 
 
 @lstm_scan_backward.register_fake
 def _(
     weight: Tensor, start: Tensor, stored: Tensor, states: Tensor, gates: Tensor, grad: Tensor
 ) -> Any:
-    return tuple(x.new_empty(x.shape) for x in (gates, weight, stored))
+    return torch.empty_like(gates), *(x.new_empty(x.shape) for x in (weight, stored))
 
 
 def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*inputs[1:], *output)
 
 
-def _differentiate(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+def _differentiate(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    if grad is None:
+        return (None,) * 4
     to_steps, to_weight, to_stored = lstm_scan_backward(*ctx.saved_tensors, grad)
     return to_steps, to_weight, None, to_stored
 

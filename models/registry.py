@@ -8,6 +8,8 @@ from typing import Any
 from torch import nn
 
 from arcade_torch.models.attention import Attention
+from arcade_torch.models.deltaproduct import DeltaProduct
+from arcade_torch.models.ffm import FFM
 from arcade_torch.models.frame_stack import FrameStack
 from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
@@ -15,6 +17,9 @@ from arcade_torch.models.linear_transformer import LinearTransformer
 from arcade_torch.models.lru import LRU
 from arcade_torch.models.lstm import LSTM
 from arcade_torch.models.mingru import MinGRU
+from arcade_torch.models.rtu import RTU
+from arcade_torch.models.rwkv7 import RWKV7
+from arcade_torch.models.shm import StableHadamardMemory
 from arcade_torch.models.stateless import Stateless
 from arcade_torch.models.ttt import TTTLinear
 
@@ -33,6 +38,11 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "ttt": TTTLinear,
     "lstm": LSTM,
     "frame_stack": FrameStack,
+    "ffm": FFM,
+    "shm": StableHadamardMemory,
+    "rtu": RTU,
+    "deltaproduct": DeltaProduct,
+    "rwkv7": RWKV7,
 }
 
 ALIASES = {"fart": "linear_transformer"}

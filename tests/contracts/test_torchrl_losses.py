@@ -51,6 +51,11 @@ MEMORIES = (
     "lstm",
     "frame_stack",
     "mlp",
+    "ffm",
+    "shm",
+    "rtu",
+    "deltaproduct",
+    "rwkv7",
 )
 
 

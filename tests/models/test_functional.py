@@ -218,7 +218,13 @@ def test_two_hundred_calls_of_one_shape_compile_once(name):
     assert compilations(block, [problem(block, 12)] * 200) == 1
 
 
-@pytest.mark.parametrize("name", NAMES)
+# half a minute: the chunks of gdn, twice as long
+SLOW_TO_COMPILE = pytest.param("deltaproduct", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    "name", [SLOW_TO_COMPILE if name == "deltaproduct" else name for name in NAMES]
+)
 def test_twenty_lengths_compile_no_more_than_three_times(name):
     block = MemoryBlock(4, 8, name)
     assert compilations(block, [problem(block, steps) for steps in range(6, 26)]) <= 3

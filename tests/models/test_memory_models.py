@@ -31,6 +31,17 @@ MODELS = [
     ("frame_stack", {}),
     ("frame_stack", {"frames": 2}),
     ("frame_stack", {"frames": 9}),
+    ("ffm", {}),
+    ("ffm", {"trace_size": 3, "context_size": 1}),
+    ("shm", {}),
+    ("shm", {"key_size": 3, "rows": 2}),
+    ("rtu", {}),
+    ("rtu", {"r_min": 0.9, "r_max": 0.999, "max_phase": 0.3}),
+    ("deltaproduct", {}),
+    ("deltaproduct", {"householders": 1}),
+    ("deltaproduct", {"householders": 3, "gate_alpha": False, "beta_range": 1.0}),
+    ("rwkv7", {}),
+    ("rwkv7", {"key_size": 3}),
 ]
 NAMES = memory_names()
 LENGTHS = [1, 2, 3, 7, 128, 132, 1000]
@@ -61,6 +72,11 @@ def test_every_model_satisfies_the_protocols(name):
         ("ttt", 48_658),  # our own variant, unpublished
         ("lstm", 2_099_200),  # torch.nn.LSTM without the second of its biases
         ("frame_stack", 1_049_088),
+        ("ffm", 853_700),  # of which 525,312 are the output gate and the skip
+        ("shm", 63_872),
+        ("rtu", 1_050_112),
+        ("deltaproduct", 72_707),
+        ("rwkv7", 86_177),
     ],
 )
 def test_parameter_counts_at_width_512_are_the_published_ones(name, count):
@@ -349,7 +365,7 @@ def test_wrong_inputs_get_one_clear_line(name):
         memory(torch.zeros(2, 5, 3, dtype=torch.float64), memory.initial_state(2), flags)
     with pytest.raises(ValueError, match="at least one step"):
         memory(torch.zeros(2, 0, 3), memory.initial_state(2), flags[:, :0])
-    other = make_memory("lru" if name != "lru" else "gru", 3, 4).initial_state(2)
+    other = make_memory("gru" if name in ("lru", "rtu") else "lru", 3, 4).initial_state(2)
     with pytest.raises(
         ValueError, match=r"the state of \w+ must be .* another model or batch size"
     ):

@@ -35,6 +35,11 @@ AGENT_COLOURS = {
     "tttl": "#5e3c10",
     "lstm": "#117733",
     "frame_stack": "#882255",
+    "ffm": "#0d0d8c",
+    "shm": "#1acc4c",
+    "rtu": "#5973e6",
+    "deltaproduct": "#739933",
+    "rwkv7": "#4c0d59",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
