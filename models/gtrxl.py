@@ -8,12 +8,12 @@ from torch.nn import functional as F
 from arcade_torch.models.attention import Attention
 from arcade_torch.models.memory import Memory, replay_by_steps
 
-__all__ = ["GTrXL", "GRUGate"]
+__all__ = ["GRUGate", "GTrXL"]
 
 
 class GTrXL(Memory):
-    """a = g(x, relu(attention(norm(x)))), y = g'(a, relu(W_2 relu(W_1 norm(a)))), with the gate g of
-    :class:`GRUGate` in the place of a sum.
+    """a = g(x, relu(attention(norm(x)))), y = g'(a, relu(W_2 relu(W_1 norm(a)))), with gates g of
+    :class:`GRUGate` in the place of sums.
 
     The attention is :class:`Attention`: one head, the last W steps, positions by rotation (RoPE,
     where the paper adds terms that are learned). Its state is the state: keys and values of the

@@ -22,9 +22,9 @@ class Mamba(Memory):
     = silu(a causal convolution of P x over the last steps), z = Q x.
 
     Delta = softplus(W_2 W_1 u + b) is one number a channel, B and C are linear in u and shared by
-    the channels; A = -exp(.) is [E, N] and begins with -1, ..., -N in every channel.
+    the channels; A = -exp(.) is [N, E] and begins with -1, ..., -N in every channel.
 
-    The state is ``"h"`` [E, N] and, because of the convolution, ``"conv"``, the last inputs of it
+    The state is ``"h"`` [N, E] and, because of the convolution, ``"conv"``, the last inputs of it
     [k - 1, E], the newest first. Published code for inference carries both; a convolution that
     begins with zeros in every chunk, or runs on across a start, is another function.
 
@@ -77,14 +77,14 @@ class Mamba(Memory):
         first = torch.exp(low + (high - low) * torch.rand(self.width)).clamp_min(DT_LEAST)
         with torch.no_grad():  # softplus of it is ``first``
             self.step.bias.copy_(first + torch.log(-torch.expm1(-first)))
-        rates = torch.arange(1.0, state_size + 1).expand(self.width, -1)
+        rates = torch.arange(1.0, state_size + 1).unsqueeze(-1).expand(-1, self.width)
         self.log_rate = nn.Parameter(rates.log().clone())
         self.skip = nn.Parameter(torch.ones(self.width))
         self.output = nn.Linear(self.width, hidden_size, bias=False)
 
     def state_leaves(self) -> dict[str, tuple[tuple[int, ...], torch.dtype | None]]:
         """See ``Memory.state_leaves``."""
-        h = (self.width, self.state_size)
+        h = (self.state_size, self.width)
         return {"h": (h, None), "conv": ((self.conv - 1, self.width), None)}
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
@@ -101,10 +101,8 @@ class Mamba(Memory):
         states = {"h": h.to(x.dtype), "conv": window[:, :, :-1]}
         return y, TensorDict(states, batch_size=x.shape[:2])
 
-    def _read(
-        self, x: Tensor, state: TensorDict, is_init: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """(y [B, T, H], h after each step [B, T, E, N], what the convolution saw [B, T, k, E])."""
+    def _read(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(y [B, T, H], h after each step [B, T, N, E], what the convolution saw [B, T, k, E])."""
         exact = torch.promote_types(x.dtype, torch.float32)  # products of many factors
         signal, gate = self.signal_and_gate(x).chunk(2, dim=-1)
         window = last_inputs(signal, state["conv"], is_init)
@@ -112,10 +110,10 @@ class Mamba(Memory):
         sizes = [self.rank, self.state_size, self.state_size]
         low, to_state, from_state = self.selection(u).split(sizes, dim=-1)
         delta = F.softplus(self.step(low)).to(exact)
-        decay = torch.exp(delta.unsqueeze(-1) * -torch.exp(self.log_rate.to(exact)))
-        given = (delta * u).unsqueeze(-1) * to_state.to(exact).unsqueeze(-2)
+        decay = torch.exp(delta.unsqueeze(-2) * -torch.exp(self.log_rate.to(exact)))
+        given = to_state.to(exact).unsqueeze(-1) * (delta * u).unsqueeze(-2)
         h = self.scan(decay, given, is_init, state["h"].to(exact))
-        y = (h @ from_state.to(exact).unsqueeze(-1)).squeeze(-1).to(x.dtype) + self.skip * u
+        y = (from_state.to(exact).unsqueeze(-2) @ h).squeeze(-2).to(x.dtype) + self.skip * u
         return self.output(y * F.silu(gate)), h, window
 
     def extra_repr(self) -> str:

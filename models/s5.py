@@ -20,7 +20,7 @@ class S5(Memory):
     Lambda = -exp(a) + i w is diagonal, so that nothing can explode; it begins with the eigenvalues
     of the normal part of HiPPO-LegS, one of every conjugate pair (hence the 2). Every pair has a
     step Delta of its own, learned, at first between ``dt_min`` and ``dt_max``. B and C begin with
-    the random numbers that the eigenvectors, a unitary matrix, would make of a real Gaussian matrix.
+    what the eigenvectors, a unitary matrix, make of real Gaussian matrices.
 
     The state ``"h"`` is complex and kept as its real and its imaginary part, [2, N]. The paper's
     layer has an activation behind y; here the network has one.

@@ -25,8 +25,8 @@ class SLSTM(Memory):
 
     The state ``"h"`` is h, c, n and m in one tensor [4, H]. Where n is 0 nothing is held yet, and m
     is log i whatever it was: the authors' code asks whether *all* n in the batch are 0, so there an
-    environment that begins alone is begun with m = 0. The loop over time is one operator, so a graph
-    that ``torch.compile`` makes does not depend on the length. It has first derivatives only.
+    environment that begins alone is begun with m = 0. The loop over time is one operator, so a
+    graph that ``torch.compile`` makes does not depend on the length. It has first derivatives only.
 
     Args:
         input_size: D.

@@ -51,6 +51,11 @@ MEMORIES = (
     "lstm",
     "frame_stack",
     "mlp",
+    "s5",
+    "mamba",
+    "slstm",
+    "mlstm",
+    "gtrxl",
 )
 
 
