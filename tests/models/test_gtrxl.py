@@ -1,4 +1,4 @@
-"""GTrXL is the paper's layer with rotated positions and others' gate; its numbers are pinned."""
+"""GTrXL is the paper's layer with rotated positions; its numbers are pinned."""
 
 import pytest
 import torch
@@ -59,21 +59,6 @@ def oracle(memory: nn.Module, x: Tensor) -> Tensor:
 def test_it_is_the_papers_layer(sizes: tuple[int, int], window: int) -> None:
     memory = make_memory("gtrxl", *sizes, window=window, gate_bias=0.5).double()
     assert_each_episode(memory, lambda x: oracle(memory, x))
-
-
-def test_the_gate_is_that_of_di_engine() -> None:
-    """Version 0.5.3. Its attention has other positions and a window without starts."""
-    theirs = pytest.importorskip(
-        "ding.torch_utils.network.gtrxl", reason="needs pip install di-engine"
-    )
-    ours = GRUGate(5, 2.0).double()
-    unit = theirs.GRUGatingUnit(5, 2.0).double()
-    new = dict(zip(("Wr", "Wz", "Wg"), ours.from_new.weight.chunk(3), strict=True))
-    old = dict(zip(("Ur", "Uz"), ours.from_old.weight.chunk(2), strict=True))
-    weights = {f"{name}.weight": value for name, value in (new | old).items()}
-    unit.load_state_dict(weights | {"Ug.weight": ours.candidate_from_old.weight, "bg": ours.bias})
-    x, y = torch.randn(2, 7, 5, dtype=F64)
-    torch.testing.assert_close(ours(x, y), unit(x, y), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("window", [1, 2, 5])

@@ -35,6 +35,11 @@ AGENT_COLOURS = {
     "tttl": "#5e3c10",
     "lstm": "#117733",
     "frame_stack": "#882255",
+    "s5": "#332288",
+    "mamba": "#aa4499",
+    "slstm": "#44aa99",
+    "mlstm": "#999933",
+    "gtrxl": "#cc6677",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
