@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
 
-__all__ = ["FrameStack"]
+__all__ = ["FrameStack", "last_inputs"]
 
 
 class FrameStack(Memory):
@@ -42,20 +42,34 @@ class FrameStack(Memory):
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., k - 1, D]."""
-        stored = h0.to(x.dtype)
-        if h0.ndim == x.ndim:  # every start but index 0 loads zeros
-            first = torch.where(is_init[:, :1, None], 0, stored)
-            stored = F.pad(first.unsqueeze(1), (0, 0, 0, 0, 0, x.shape[1] - 1))
-        load = (is_init | (torch.arange(x.shape[1], device=x.device) == 0)).unsqueeze(-1)
-
-        inputs = [x]
-        for age in range(self.frames - 1):
-            # what was one step younger one step ago, or what was stored
-            one_step_ago = F.pad(inputs[-1], (0, 0, 1, 0))[:, :-1]
-            inputs.append(torch.where(load, stored[:, :, age], one_step_ago))
-        window = torch.stack(inputs, dim=2)
+        window = last_inputs(x, h0, is_init)
         return F.leaky_relu(self.linear(window.flatten(2))), window[:, :, :-1]
 
     def extra_repr(self) -> str:
         """Sizes and options, for printing."""
         return f"{super().extra_repr()}, frames={self.frames}"
+
+
+def last_inputs(x: Tensor, before: Tensor, is_init: Tensor) -> Tensor:
+    """At every step the input and the k - 1 before it in the episode, zeros where there are none.
+
+    Args:
+        x: float [B, T, D].
+        before: the inputs before index 0, the newest first, [B, k - 1, D]; or [B, T, k - 1, D],
+            those before each step, loaded at index 0 and wherever ``is_init`` is set.
+        is_init: bool [B, T].
+
+    Returns:
+        [B, T, k, D], the newest first.
+    """
+    stored = before.to(x.dtype)
+    if before.ndim == x.ndim:  # every start but index 0 loads zeros
+        first = torch.where(is_init[:, :1, None], 0, stored)
+        stored = F.pad(first.unsqueeze(1), (0, 0, 0, 0, 0, x.shape[1] - 1))
+    load = (is_init | (torch.arange(x.shape[1], device=x.device) == 0)).unsqueeze(-1)
+    inputs = [x]
+    for age in range(stored.shape[2]):
+        # what was one step younger one step ago, or what was stored
+        one_step_ago = F.pad(inputs[-1], (0, 0, 1, 0))[:, :-1]
+        inputs.append(torch.where(load, stored[:, :, age], one_step_ago))
+    return torch.stack(inputs, dim=2)

@@ -13,13 +13,18 @@ from arcade_torch.models.ffm import FFM
 from arcade_torch.models.frame_stack import FrameStack
 from arcade_torch.models.gdn import GatedDeltaNet
 from arcade_torch.models.gru import GRU
+from arcade_torch.models.gtrxl import GTrXL
 from arcade_torch.models.linear_transformer import LinearTransformer
 from arcade_torch.models.lru import LRU
 from arcade_torch.models.lstm import LSTM
+from arcade_torch.models.mamba import Mamba
 from arcade_torch.models.mingru import MinGRU
+from arcade_torch.models.mlstm import MLSTM
 from arcade_torch.models.rtu import RTU
 from arcade_torch.models.rwkv7 import RWKV7
+from arcade_torch.models.s5 import S5
 from arcade_torch.models.shm import StableHadamardMemory
+from arcade_torch.models.slstm import SLSTM
 from arcade_torch.models.stateless import Stateless
 from arcade_torch.models.ttt import TTTLinear
 
@@ -43,6 +48,11 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "rtu": RTU,
     "deltaproduct": DeltaProduct,
     "rwkv7": RWKV7,
+    "s5": S5,
+    "mamba": Mamba,
+    "slstm": SLSTM,
+    "mlstm": MLSTM,
+    "gtrxl": GTrXL,
 }
 
 ALIASES = {"fart": "linear_transformer"}

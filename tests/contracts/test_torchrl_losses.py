@@ -56,6 +56,11 @@ MEMORIES = (
     "rtu",
     "deltaproduct",
     "rwkv7",
+    "s5",
+    "mamba",
+    "slstm",
+    "mlstm",
+    "gtrxl",
 )
 
 

@@ -19,6 +19,7 @@ from arcade_torch.models import MemoryBlock, MemoryModule, make_memory, memory_n
 from tests.arcade_torch.stub import GAME
 from tests.models.test_memory_module import Countdown
 
+WINDOWS = ("attention", "gtrxl")
 REMEMBERING = [name for name in memory_names() if name != "mlp"]
 N, T = 6, 16
 
@@ -44,10 +45,9 @@ def rollout(critic, steps):
 @pytest.mark.parametrize(
     ("name", "hidden", "store"),
     [
-        *((name, 512, "step") for name in memory_names() if name != "attention"),
-        ("attention", 8, "step"),
-        ("attention", 128, "sequence"),
-        ("attention", 512, "sequence"),
+        *((name, 512, "step") for name in memory_names() if name not in WINDOWS),
+        *((name, 8, "step") for name in WINDOWS),
+        *((name, hidden, "sequence") for name in WINDOWS for hidden in (128, 512)),
     ],
 )
 def test_only_states_larger_than_a_frame_are_kept_once_a_sequence(name, hidden, store):

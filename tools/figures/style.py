@@ -40,6 +40,11 @@ AGENT_COLOURS = {
     "rtu": "#5973e6",
     "deltaproduct": "#739933",
     "rwkv7": "#4c0d59",
+    "s5": "#332288",
+    "mamba": "#aa4499",
+    "slstm": "#44aa99",
+    "mlstm": "#999933",
+    "gtrxl": "#cc6677",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""
