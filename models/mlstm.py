@@ -1,6 +1,7 @@
 """mLSTM: a matrix memory with exponential gates, stabilised, in chunks."""
 
 import math
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -84,9 +85,13 @@ class MLSTM(Memory):
         begins = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
         with torch.no_grad():
             # what is not finite is lost in matrix_scan, and has no part in the maximum
-            decay, given, loaded = [x.nan_to_num(0, 0, 0) for x in (log_f, log_i, stored)]
+            decay = log_f.nan_to_num(0, 0, 0)
+            given = log_i.nan_to_num(0, 0, 0)
+            loaded = stored.nan_to_num(0, 0, 0)
             given = torch.where(begins, given.maximum(decay + loaded), given)
-            m = decayed_max(decay, given.clamp_min(0), begins)
+            m = given.clamp_min(0)
+            if x.shape[1] > 1:  # not acting
+                m = decayed_max(decay, m, begins)
         before = torch.where(begins, stored, F.pad(m, (1, 0))[:, :-1])
         weight = (log_i - m).exp().unsqueeze(-1)
         value = weight * F.pad(value, (0, 1), value=1.0)
@@ -108,8 +113,11 @@ class MLSTM(Memory):
         return {"h": h.to(dtype), "m": rounded.clone()}
 
 
+@torch.library.custom_op("arcade_torch::decayed_max", mutates_args=())
 def decayed_max(decay: Tensor, given: Tensor, start: Tensor) -> Tensor:
     """m_t = max(decay_t + m_{t-1}, given_t), and given_t where ``start`` is set; log2(T) passes.
+
+    One operator, so that a compiled graph does not depend on the length; it has no derivative.
 
     Args:
         decay: float [B, T].
@@ -119,12 +127,28 @@ def decayed_max(decay: Tensor, given: Tensor, start: Tensor) -> Tensor:
     Returns:
         m [B, T].
     """
+    m = given.clone()
     shift = 1
-    while shift < given.shape[1]:
-        joined = given[:, shift:].maximum(decay[:, shift:] + given[:, :-shift])
-        joined = torch.where(start[:, shift:], given[:, shift:], joined)
-        given = torch.cat([given[:, :shift], joined], dim=1)
+    while shift < m.shape[1]:
+        joined = m[:, shift:].maximum(decay[:, shift:] + m[:, :-shift])
+        joined = torch.where(start[:, shift:], m[:, shift:], joined)
+        m = torch.cat([m[:, :shift], joined], dim=1)
         decay = torch.cat([decay[:, :shift], decay[:, shift:] + decay[:, :-shift]], dim=1)
         start = torch.cat([start[:, :shift], start[:, shift:] | start[:, :-shift]], dim=1)
         shift *= 2
-    return given
+    return m
+
+
+@decayed_max.register_fake
+def _(decay: Tensor, given: Tensor, start: Tensor) -> Tensor:
+    return given.new_empty(given.shape)
+
+
+@decayed_max.register_vmap
+def _(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> tuple[Tensor, int]:
+    size = info.batch_size
+    rows = []
+    for x, dim in zip(args, in_dims, strict=True):
+        mapped = x.expand(size, *x.shape) if dim is None else x.movedim(dim, 0)
+        rows.append(mapped.flatten(0, 1))
+    return decayed_max(*rows).unflatten(0, (size, -1)), 0
