@@ -58,6 +58,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "a memory model of yours against others: a small study of some minutes, and its report",
     ),
     "report": ("study.Report", "write the HTML page of a study"),
+    "card": (
+        "card.Card",
+        "what there is to say of a memory model: laws, cost, reach and recall, on one page",
+    ),
     **{
         f"analyze {name}": ("figure.Figure", entry.summary)
         for name, entry in FIGURES.items()
