@@ -217,6 +217,25 @@ def _ratios(found: dict[str, Any]) -> dict[str, dict[str, float]]:
     return ratios(found)
 
 
+def agents(_: str) -> str:
+    """The agents that the package ships, a line each."""
+    heads = ["agent", "learner", "frames", "mean return", "without rounding", "bytes"]
+    lines = [f"| {' | '.join(heads)} |", "|---|---" + "|--:" * 4 + "|"]
+    for path in sorted((ROOT / "agents/shipped").glob("*/results.json")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        size = (path.parent / "model.safetensors").stat().st_size
+        cells = [
+            f"`{path.parent.name}`",
+            found["algorithm"].upper(),
+            f"{found['frames']:,}",
+            f"{found['mean_reward']:.3f}",
+            f"{found['mean_reward_float32']:.3f}",
+            f"{size:,}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def picture(words: str) -> str:
     """A picture that a notebook drew: its name, the number of the picture, and what it shows."""
     stem, number, says = words.split(maxsplit=2)
@@ -235,6 +254,7 @@ KINDS = {
     "recall": recall,
     "cost": cost,
     "laws": laws,
+    "agents": agents,
     "card": card,
     "cards": cards,
     "picture": picture,
