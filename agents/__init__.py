@@ -20,12 +20,14 @@ _MODULES = {
     "policy": ("Agent", "build_network", "load", "make_policy"),
     "ppo": ("PPO", "PPOLoss", "make_actor"),
     "pqn": ("PQN", "PQNLoss"),
+    "pretrained": ("from_pretrained",),
     "presets": ("preset", "preset_names"),
     "replay": ("SequenceReplay",),
     "replay_check": ("check_replay",),
     "returns": ("QLambdaEstimator", "SequenceGAE", "gae", "q_lambda_return"),
     "runs.files": ("CheckpointError",),
     "runs.folder": ("RunFolderError",),
+    "runs.shipped": ("pretrained_names",),
     "training": ("TrainResult", "Trainer", "train"),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
@@ -40,19 +42,22 @@ if TYPE_CHECKING:
     from arcade_torch.agents.ppo import PPO, PPOLoss, make_actor
     from arcade_torch.agents.pqn import PQN, PQNLoss
     from arcade_torch.agents.presets import preset, preset_names
+    from arcade_torch.agents.pretrained import from_pretrained
     from arcade_torch.agents.replay import SequenceReplay
     from arcade_torch.agents.replay_check import check_replay
     from arcade_torch.agents.returns import QLambdaEstimator, SequenceGAE, gae, q_lambda_return
     from arcade_torch.agents.runs.files import CheckpointError
     from arcade_torch.agents.runs.folder import RunFolderError
+    from arcade_torch.agents.runs.shipped import pretrained_names
     from arcade_torch.agents.training import Trainer, TrainResult, train
 
 __all__ = [
     "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult",
     "NonFiniteError", "PPOConfig", "PPOLoss", "PQNConfig", "PQNLoss", "QLambdaEstimator",
     "RunFolderError", "SequenceGAE", "SequenceReplay", "TrainConfig", "TrainResult", "Trainer",
-    "build_network", "check_replay", "evaluate", "gae", "held_out_seed", "load", "make_actor",
-    "make_policy", "paper_score", "preset", "preset_names", "q_lambda_return", "train",
+    "build_network", "check_replay", "evaluate", "from_pretrained", "gae", "held_out_seed", "load",
+    "make_actor", "make_policy", "paper_score", "preset", "preset_names", "pretrained_names",
+    "q_lambda_return", "train",
 ]  # fmt: skip
 
 

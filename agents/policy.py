@@ -18,7 +18,8 @@ from torchrl.modules import EGreedyModule, QValueModule
 from arcade_torch.agents.config import TrainConfig, require
 from arcade_torch.agents.forward import evaluating, last_outputs
 from arcade_torch.agents.ppo import make_actor
-from arcade_torch.agents.runs.checkpoint import find_checkpoint
+from arcade_torch.agents.runs.bundle import find_checkpoint
+from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.models.actor_critic import (
     ActorCriticNetwork,
@@ -265,8 +266,8 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     """Load an agent.
 
     Args:
-        path: a run folder (its newest whole checkpoint), its ``checkpoints`` folder, or one
-            checkpoint folder.
+        path: a run folder (its newest whole checkpoint), its ``checkpoints`` folder, one
+            checkpoint folder, or a folder with an agent that was shared.
         device: where to put the network; default the device of the run if it is there, else the
             CPU.
 
@@ -278,7 +279,11 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
         CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was
             found.
     """
-    checkpoint = find_checkpoint(Path(path))
+    return agent_of(find_checkpoint(Path(path)), device)
+
+
+def agent_of(checkpoint: Checkpoint, device: str | torch.device | None = None) -> Agent:
+    """The agent of a checkpoint, in evaluation mode; see `load`."""
     config = checkpoint.config
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
     weights = checkpoint.weights

@@ -8,7 +8,7 @@ before which everything is forgotten.
 * :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru
   gru mlp linear_transformer attention gdn ttt lstm frame_stack s5 mamba slstm mlstm gtrxl``).
 * :func:`check_memory`: check that a module, ours or yours, is a correct memory model;
-  :class:`MemoryLawError` says what is wrong with it.
+  :class:`MemoryLawError` says what is wrong with it, :func:`law_results` checks on behind it.
 * :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of
   ``LSTMModule``.
 * :func:`make_network`, :class:`MemoryNetwork`: pixels to Q-values, presets "paper" and "small".
@@ -34,6 +34,7 @@ Example:
 from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
 from arcade_torch.models.checks import MemoryLawError, check_memory
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
+from arcade_torch.models.law_results import LawResult, law_results
 from arcade_torch.models.memory import Memory, MemoryContract, MemoryModule, ReplayableMemory
 from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
 from arcade_torch.models.presets import make_network
@@ -44,6 +45,7 @@ from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_sca
 __all__ = [
     "ActorCriticNetwork",
     "Encoder",
+    "LawResult",
     "MatrixSteps",
     "Memory",
     "MemoryBlock",
@@ -55,6 +57,7 @@ __all__ = [
     "ReplayableMemory",
     "SmallEncoder",
     "check_memory",
+    "law_results",
     "linear_scan",
     "make_actor_critic",
     "make_memory",

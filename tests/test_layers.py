@@ -37,6 +37,7 @@ LIBRARIES = {
         "scipy",
         "safetensors",
         "filelock",
+        "huggingface_hub",
     },
     "tools": {"torch", "torchrl", "tensordict", "jax", "numpy", "safetensors", *TOOLS_EXTRAS},
 }

@@ -58,6 +58,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "a memory model of yours against others: a small study of some minutes, and its report",
     ),
     "report": ("study.Report", "write the HTML page of a study"),
+    "card": (
+        "card.Card",
+        "what there is to say of a memory model: laws, cost, reach and recall, on one page",
+    ),
     **{
         f"analyze {name}": ("figure.Figure", entry.summary)
         for name, entry in FIGURES.items()
@@ -66,6 +70,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     **{f"figure {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items()},
     "play": ("play.Play", "play a game by hand, in a window or in the terminal"),
     "record": ("play.Record", "a GIF or MP4 of a random, scripted or trained player"),
+    "push": ("share.Push", "put a trained agent on the Hugging Face hub, or into a folder"),
+    "pull": ("share.Pull", "fetch an agent from the hub, or from a folder, and check it"),
     **{f"bench {name}": ("bench.Bench", summary) for name, summary in BENCHES.items()},
     "bench all": ("bench.BenchAll", "every benchmark into one file, and a page of its tables"),
     "bench compare": ("bench.BenchCompare", "what became better or worse between two such files"),

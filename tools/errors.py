@@ -21,6 +21,7 @@ EXTRA_OF = {
     "wandb": "loggers",
     "tensorboard": "loggers",
     "ray": "ray",
+    "huggingface_hub": "hub",
 }
 """Import name -> the extra of arcade-torch that brings it."""
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from arcade_torch.agents.runs.files import open_regular, read_text, write_atomic
 from arcade_torch.agents.runs.files import read_csv as read_csv
+from arcade_torch.agents.runs.shipped import is_shipped
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.text import csv_cell, markdown_cell, printable
 
@@ -245,8 +246,8 @@ def cached_arrays(
     others, or damaged.
 
     ``options`` are JSON values and everything that decides the numbers, the checkpoint included;
-    they stand as JSON in ``options`` of the arrays. What is no run folder (a single checkpoint), or
-    cannot be written, keeps nothing.
+    they stand as JSON in ``options`` of the arrays. What is no run folder (a single checkpoint, an
+    agent of this package), or cannot be written, keeps nothing.
     """
     text = json.dumps(dict(options), sort_keys=True)
     file = run / "analysis" / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.npz"
@@ -255,7 +256,8 @@ def cached_arrays(
         return kept
     arrays = compute()
     arrays["options"] = np.array(text)
-    if (run / "config.json").is_file() and os.access(run, os.W_OK) and not file.parent.is_symlink():
+    keeps = (run / "config.json").is_file() and not is_shipped(run)
+    if keeps and os.access(run, os.W_OK) and not file.parent.is_symlink():
         try:
             write_npz(file, arrays | {"layout": np.array(_layout(arrays))})
         # a full disk, for one: what took minutes to compute is still of use

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
+from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.errors import one_line
 
 if TYPE_CHECKING:
@@ -152,11 +153,15 @@ def import_again(path: Path) -> None:
 
 
 def load_agent(path: Path) -> "Agent":
-    """The agent of a run or a checkpoint, after `import_again`; raises as `agents.load` too."""
-    from arcade_torch.agents.policy import load
+    """The agent of a run, a checkpoint or one of this package by its name, after `import_again`;
+    raises as `agents.load` too.
+    """
+    from arcade_torch.agents.policy import agent_of
+    from arcade_torch.agents.pretrained import read_shared
 
-    import_again(path)
-    return load(path)
+    folder = agent_folder(path)
+    import_again(folder)
+    return agent_of(read_shared(folder))
 
 
 def remembered_imports(record: Any, file: Path) -> dict[str, str]:

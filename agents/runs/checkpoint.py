@@ -242,26 +242,6 @@ def refuse_format(subject: str, saved: Any) -> str | None:
     )
 
 
-def find_checkpoint(path: Path) -> Checkpoint:
-    """The weights of one checkpoint, or of a run or its ``checkpoints`` folder: the newest that is
-    whole.
-    """
-    hint = "give a run folder or one of its checkpoints"
-    try:
-        names = os.listdir(path)
-    # the last for names that no file can have
-    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
-        raise CheckpointError(f"{path} is not a folder; {hint}") from error
-    except OSError as error:
-        raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
-    if _META in names:
-        return load_checkpoint(path, weights_only=True)
-    for folder in (path / "checkpoints", path):
-        if list_checkpoints(folder):
-            return load_latest(folder, weights_only=True)
-    raise CheckpointError(f"{path} holds no checkpoint; {hint}")
-
-
 def _load_weights(file: Path) -> dict[str, Tensor]:
     return load(read_bytes(file, MOST_WEIGHTS))
 

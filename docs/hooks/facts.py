@@ -4,11 +4,14 @@
 In the repository the mark is invisible, and the sentence beside it links to the owner.
 """
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 MARK = re.compile(r"^<!-- insert: (?P<kind>\w+) (?P<name>[^>\n]*?) -->$", re.MULTILINE)
+CARDS = "results/cards"
 LEVELS = ("Easy", "Medium", "Hard")
 
 
@@ -150,6 +153,89 @@ def laws(name: str) -> str:
     )
 
 
+def card(name: str) -> str:
+    """What the card of a memory model says, from its JSON file."""
+    found = _card(name)
+    context = found["context"]
+    reach = found["reach"]
+    rows = [
+        ("context length, before training", context["text"]),
+        ("gradient reach, a tenth of the largest", f"{reach['tenth']} steps"),
+        ("gradient reach, a hundredth of the largest", f"{reach['hundredth']} steps"),
+    ]
+    for rival, ratio in _ratios(found).items():
+        rows.append((f"time of learning, `{rival}` is 1", f"{ratio['learning_us']:.2f}"))
+        rows.append((f"time of acting, `{rival}` is 1", f"{ratio['acting_us']:.2f}"))
+    for words, new in (("that it learned", False), ("beyond those", True)):
+        cells = [row["verdict"] == "solved" for row in found["tests"] if row["new"] == new]
+        if cells:
+            rows.append((f"tests solved, at sizes {words}", f"{sum(cells)} of {len(cells)}"))
+    lines = ["| card | |", "|---|--:|", *(f"| {title} | {value} |" for title, value in rows)]
+    return "\n".join(lines)
+
+
+def cards(_: str) -> str:
+    """The cards of all built-in memory models, a line each."""
+    heads = ["memory", "laws kept", "parameters", "state, bytes", "context length"]
+    heads += ["a tenth of the gradient", "learning, GRU is 1", "acting, GRU is 1"]
+    heads += ["solved, learned sizes", "solved, larger sizes"]
+    lines = [f"| {' | '.join(heads)} |", "|---" + "|--:" * (len(heads) - 1) + "|"]
+    for path in sorted((ROOT / CARDS).glob("*.json")):
+        found = _card(path.stem)
+        kept = [law["passed"] for law in found["laws"]]
+        size = found["cost"]["small"]
+        cells = [
+            f"`{path.stem}`",
+            f"{sum(kept)} of {len(kept)}",
+            f"{size['parameters']:,}",
+            f"{size['state_bytes']:,}",
+            found["context"]["text"],
+            f"{found['reach']['tenth']} steps",
+        ]
+        ratio = _ratios(found).get("gru", {"learning_us": 1.0, "acting_us": 1.0})
+        cells += [f"{ratio['learning_us']:.2f}", f"{ratio['acting_us']:.2f}"]
+        for new in (False, True):
+            solved = [row["verdict"] == "solved" for row in found["tests"] if row["new"] == new]
+            cells.append(f"{sum(solved)} of {len(solved)}" if solved else "")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _card(name: str) -> dict[str, Any]:
+    path = ROOT / CARDS / f"{name}.json"
+    if not path.is_file():
+        raise ValueError(
+            f"{CARDS} has no card of {name!r}: arcade-torch card {name} --no-html --out {CARDS}"
+        )
+    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return values
+
+
+def _ratios(found: dict[str, Any]) -> dict[str, dict[str, float]]:
+    from arcade_torch.tools.cards.page import ratios
+
+    return ratios(found)
+
+
+def agents(_: str) -> str:
+    """The agents that the package ships, a line each."""
+    heads = ["agent", "learner", "frames", "mean return", "without rounding", "bytes"]
+    lines = [f"| {' | '.join(heads)} |", "|---|---" + "|--:" * 4 + "|"]
+    for path in sorted((ROOT / "agents/shipped").glob("*/results.json")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        size = (path.parent / "model.safetensors").stat().st_size
+        cells = [
+            f"`{path.parent.name}`",
+            found["algorithm"].upper(),
+            f"{found['frames']:,}",
+            f"{found['mean_reward']:.3f}",
+            f"{found['mean_reward_float32']:.3f}",
+            f"{size:,}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def picture(words: str) -> str:
     """A picture that a notebook drew: its name, the number of the picture, and what it shows."""
     stem, number, says = words.split(maxsplit=2)
@@ -168,6 +254,9 @@ KINDS = {
     "recall": recall,
     "cost": cost,
     "laws": laws,
+    "agents": agents,
+    "card": card,
+    "cards": cards,
     "picture": picture,
 }
 """What can be inserted, and how it is found."""

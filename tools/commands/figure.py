@@ -1,7 +1,7 @@
 """``arcade-torch figure NAME`` and ``arcade-torch analyze NAME``: two words for one thing.
 
 They differ in where the files go by default: ``figure`` writes into ``figures``, ``analyze`` into
-the analysis folder of the first run.
+the analysis folder of the first run, or for an agent of this package into ``analysis``.
 """
 
 import sys
@@ -13,6 +13,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import tyro
 
+from arcade_torch.agents.runs.shipped import agent_folder, is_shipped
 from arcade_torch.tools.figures import Options
 from arcade_torch.tools.figures.catalogue import FIGURES, make_figure
 from arcade_torch.tools.files import csv_text
@@ -52,9 +53,11 @@ class Figure(Command):
             kind[entry.options], words, prog, description=f"{summary}\n\n{example}"
         )
         options: Options = arguments.options
-        options = replace(options, runs=(*options.runs, *arguments.paths))
-        if group == "analyze" and options.out is None and options.runs and options.runs[0].is_dir():
-            options = replace(options, out=_run_folder(options.runs[0]) / "analysis")
+        runs = tuple(map(agent_folder, (*options.runs, *arguments.paths)))
+        options = replace(options, runs=runs)
+        if group == "analyze" and options.out is None and runs and runs[0].is_dir():
+            folder = Path() if is_shipped(runs[0]) else _run_folder(runs[0])
+            options = replace(options, out=folder / "analysis")
         return cls(name, options)
 
     def run(self) -> int:

@@ -1,5 +1,6 @@
 """``arcade-torch play`` and ``arcade-torch record``."""
 
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from arcade_torch.agents.config import require
+from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import import_again, load_agent
 from arcade_torch.tools.options import Command, at_least, at_most, name_and_value
 from arcade_torch.tools.progress import Bars
@@ -45,6 +47,8 @@ class Play(GameCommand):
     Arrows and space are the five actions; one key, one step. P changes between MDP and POMDP, also
     in mid-episode. R restarts the episode, Enter goes on after an end, Esc quits.
 
+    With --agent a trained agent plays and you watch: P, R, Enter and Esc still work.
+
     Example: arcade-torch play MineSweeperEasy --partial --episodes 3 --scores human.csv
     """
 
@@ -60,15 +64,22 @@ class Play(GameCommand):
     terminal: bool = False  # Play in the terminal.
     scores: Path | None = None  # CSV file that every episode is added to: return, seed, actions.
     player: str = ""  # Your name in that file.
+    agent: str = ""  # Watch it play: an agent of this package, or a run folder.
+    fps: float = 5.0  # Actions a second of that agent.
 
     def run(self) -> int:
         """Play."""
         from arcade_torch.compiled import compiled_game
-        from arcade_torch.tools.play import scores, screens
+        from arcade_torch.tools.play import recording, scores, screens
         from arcade_torch.tools.play.session import LEGEND, Session
 
-        at_least(self, key_repeat=0)
+        at_least(self, key_repeat=0, fps=0.1)
+        at_most(self, fps=screens.FPS)
         self.check_scale()
+        watched = None
+        if self.agent:
+            agent = self.take_agent()
+            watched = screens.Watched(recording.trained(agent, None), self.fps)
         fits = self.scores is None or self.scores.suffix == ".csv"
         require(fits, "--scores", str(self.scores), "a file that ends in .csv")
         options = self.game_options()
@@ -94,13 +105,24 @@ class Play(GameCommand):
             on_attempt=keep,
         )
         if self.plays_in_terminal():
-            screens.play_in_terminal(session)
+            screens.play_in_terminal(session, watched)
         else:
             print(LEGEND)
-            screens.play_in_window(session, self.scale, self.key_repeat)
+            screens.play_in_window(session, self.scale, self.key_repeat, watched)
         for line in said or ["no episode was played"]:
             say(line)
         return 0
+
+    def take_agent(self) -> Any:
+        """The agent that plays; what it was trained on decides frames, rules and options."""
+        if self.scores is not None:
+            raise ValueError("--scores is for people: leave it out with --agent")
+        scene = scene_of_agent(self.game, agent_folder(self.agent), self.game_options())
+        self.obs_size = scene.obs_size
+        self.rules = scene.rules
+        self.partial = self.partial or scene.partial
+        self.env_option = tuple(f"{name}={json.dumps(v)}" for name, v in scene.options.items())
+        return scene.agent
 
     def plays_in_terminal(self) -> bool:
         """Whether to play in the terminal, because it was asked for or because there is no window;
@@ -138,13 +160,15 @@ class Record(GameCommand):
     """Record episodes of a player as a GIF or, with the extra video, as an MP4.
 
     Players: random, state-oracle (sees the state), frames-oracle (sees the frames of the POMDP
-    twin), or the run folder of a trained agent.
+    twin), an agent of this package by its name, such as signpost-partial-lru, or the run folder of
+    another.
 
     Example: arcade-torch record MineSweeperEasy --player frames-oracle --both --out sweep.gif
     """
 
     out: Path  # File, .gif or .mp4; replaced if it exists.
-    player: str = "random"  # random, state-oracle, frames-oracle, or a run folder.
+    player: str = "random"
+    """random, state-oracle, frames-oracle, an agent of this package, or a run folder."""
     observability: Literal["full", "partial"] | None = None
     """Twin that is shown, and that an agent sees; by default its own, partial for the
     frames-oracle, otherwise full.
@@ -175,9 +199,9 @@ class Record(GameCommand):
             f"at least 0.01 and at most {fastest} for {self.out.suffix}",
         )
         if self.player not in recording.SCRIPTED:
-            import_again(Path(self.player))  # which may register the game, too
+            import_again(agent_folder(self.player))  # which may register the game, too
         game_id = resolve_id(self.game)
-        scene = self.scene(game_id)
+        scene = self.scene()
         game = compiled_game(game_id, scene.obs_size, scene.rules, scene.options)
         session = Session(
             game,
@@ -200,7 +224,7 @@ class Record(GameCommand):
         say(f"recording: {self.out}")
         return 0
 
-    def scene(self, game_id: str) -> Scene:
+    def scene(self) -> Scene:
         """What is recorded: as the options say, then as the agent was trained, then by default."""
         from arcade_torch.tools.play import recording
 
@@ -212,36 +236,52 @@ class Record(GameCommand):
                 options=self.game_options(),
             )
         else:
-            scene = self.scene_of_agent(game_id)
+            scene = self.scene_of_agent()
         if self.observability is not None:
             scene.partial = self.observability == "partial"
         return scene
 
-    def scene_of_agent(self, game_id: str) -> Scene:
-        """What is recorded of the agent in a run folder."""
-        from arcade_torch.envs_jax import resolve_id
+    def scene_of_agent(self) -> Scene:
+        """What is recorded of a trained agent."""
+        from arcade_torch.agents.runs.shipped import pretrained_names
         from arcade_torch.tools.play import recording
 
-        allowed = f"{', '.join(recording.SCRIPTED)}, or a run folder"
-        require(Path(self.player).is_dir(), "--player", self.player, allowed)
-        agent = load_agent(Path(self.player))
-        config = agent.config
-        if self.obs_size not in (None, config.obs_size):
+        folder = agent_folder(self.player)
+        names = ", ".join((*recording.SCRIPTED, *pretrained_names()))
+        require(folder.is_dir(), "--player", self.player, f"{names}, or a run folder")
+        scene = scene_of_agent(self.game, folder, self.game_options())
+        if self.obs_size not in (None, scene.obs_size):
             raise ValueError(
-                f"--obs-size is {self.obs_size}, but the agent sees frames of {config.obs_size}"
+                f"--obs-size is {self.obs_size}, but the agent sees frames of {scene.obs_size}"
             )
-        options = self.game_options()
-        if resolve_id(config.env) == game_id:
-            options = dict(config.env_options) | options
-        else:
-            say(f"note: this agent was trained on {config.env}")
-        return Scene(
-            obs_size=config.obs_size,
-            rules=self.rules or config.rules,
-            partial=config.observability != "full",
-            options=options,
-            agent=agent,
-        )
+        scene.rules = self.rules or scene.rules
+        return scene
+
+
+def scene_of_agent(game: str, folder: Path, options: dict[str, Any]) -> Scene:
+    """What the agent in a folder plays: as it was trained, with other options of the game.
+
+    Raises:
+        ValueError: there is no such game or folder.
+    """
+    from arcade_torch.agents.runs.shipped import pretrained_names
+    from arcade_torch.envs_jax import resolve_id
+
+    names = ", ".join(pretrained_names())
+    require(folder.is_dir(), "the agent", str(folder), f"a run folder, or one of {names}")
+    agent = load_agent(folder)
+    config = agent.config
+    if resolve_id(config.env) == resolve_id(game):
+        options = dict(config.env_options) | options
+    else:
+        say(f"note: this agent was trained on {config.env}")
+    return Scene(
+        obs_size=config.obs_size,
+        rules=config.rules,
+        partial=config.observability != "full",
+        options=options,
+        agent=agent,
+    )
 
 
 def _say_attempt(attempt: Any) -> None:

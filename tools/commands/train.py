@@ -140,7 +140,7 @@ class Evaluate(Command):
     Example: arcade-torch evaluate runs/one --episodes 256 --observability full
     """
 
-    # Run folder or checkpoint.
+    # Run folder, checkpoint, or an agent of this package by its name.
     run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]
     episodes: int = 128  # Number of episodes, each in an environment of its own.
     # Another twin than the agent was trained on.

@@ -53,8 +53,10 @@ def scripted(name: str, game: Any, seed: int) -> Chooser:
     return choose
 
 
-def trained(agent: Any, partial: bool) -> Chooser:
-    """A trained agent, greedy; it sees what it would see in an ``ArcadeEnv`` of one env."""
+def trained(agent: Any, partial: bool | None) -> Chooser:
+    """A trained agent, greedy; it sees what it would see in an ``ArcadeEnv`` of one env, of the
+    twin that the session shows where ``partial`` is None.
+    """
     import torch
     from tensordict import TensorDict
 
@@ -64,8 +66,9 @@ def trained(agent: Any, partial: bool) -> Chooser:
 
     def choose(session: Session) -> int:
         nonlocal state, last_action
+        twin = session.partial if partial is None else partial
         obs = {
-            "pixels": torch.from_numpy(session.view(partial)),
+            "pixels": torch.from_numpy(session.view(twin)),
             "last_action": torch.tensor([last_action]),
             "is_init": torch.tensor([[session.steps == 0]]),
             "step_count": torch.tensor([[session.steps]]),

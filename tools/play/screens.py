@@ -7,12 +7,14 @@ import re
 import select
 import shutil
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import groupby
 
 import numpy as np
 
+from arcade_torch.envs_jax import ACTION_NAMES
 from arcade_torch.gym.window import Window
 from arcade_torch.tools.errors import MissingPackage, need
 from arcade_torch.tools.play.session import LEGEND, NEXT, QUIT, RESTART, TOGGLE, Frame, Session
@@ -79,8 +81,50 @@ def why_no_window() -> str | None:
     return None
 
 
-def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> None:
-    """Show a session and hand it the keys, until it is closed."""
+class Watched:
+    """Somebody who plays while another watches: presses a key of a session when it is time.
+
+    Args:
+        choose: looks at a session and names an action, 0 to 4.
+        fps: actions a second; the last picture of an episode stays for a second.
+        clock: gives the time in seconds.
+    """
+
+    def __init__(
+        self,
+        choose: Callable[[Session], int],
+        fps: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._choose = choose
+        self._rest_s = 1 / fps
+        self._clock = clock
+        self._next_s = clock() + self._rest_s
+
+    @property
+    def wait_s(self) -> float:
+        """Seconds until the next key."""
+        return max(0.0, self._next_s - self._clock())
+
+    def press(self, session: Session) -> bool:
+        """Press a key if it is time; says whether it was."""
+        if session.closed or self.wait_s > 0:
+            return False
+        if session.end is None:
+            session.press(ACTION_NAMES[self._choose(session)])
+        else:
+            session.press(NEXT)
+        rest_s = self._rest_s if session.end is None else max(1.0, self._rest_s)
+        self._next_s = self._clock() + rest_s
+        return True
+
+
+def play_in_window(
+    session: Session, scale: int = 2, key_repeat_ms: int = 0, watched: Watched | None = None
+) -> None:
+    """Show a session and hand it the keys, until it is closed; of somebody who is ``watched``
+    too.
+    """
     window = Window(scale)
     pygame = window.pygame
     keys = {getattr(pygame, constant): name for constant, name in WINDOW_KEYS.items()}
@@ -96,13 +140,16 @@ def play_in_window(session: Session, scale: int = 2, key_repeat_ms: int = 0) -> 
                 if key is not None:
                     session.press(key)
                     window.show(session.picture, session.caption)
+            if watched is not None and watched.press(session):
+                window.show(session.picture, session.caption)
             window.tick(FPS)
     finally:
         window.close()
 
 
-def play_in_terminal(session: Session) -> None:
-    """Show a session in this process's terminal and hand it the keys, until it is closed.
+def play_in_terminal(session: Session, watched: Watched | None = None) -> None:
+    """Show a session in this process's terminal and hand it the keys, until it is closed; of
+    somebody who is ``watched`` too.
 
     Raises:
         ValueError: standard input or output is no terminal, or the terminal cannot move its cursor.
@@ -116,6 +163,9 @@ def play_in_terminal(session: Session) -> None:
         while not session.closed:
             size = shutil.get_terminal_size()
             print(screen(session, size.columns, size.lines), end="", flush=True)
+            if watched is not None and not select.select([source], [], [], watched.wait_s)[0]:
+                watched.press(session)
+                continue
             data = os.read(source, 64)
             while (
                 data.endswith((b"\x1b", b"\x1b[", b"\x1bO"))

@@ -82,7 +82,7 @@ def report(
         MissingPackage: jinja2 is not installed.
     """
     _check_options(metric, skip)
-    environment = _environment()
+    environment = page_environment()
     folder = StudyFolder(Path(root))
     study = folder.load()
     rows = folder.write_results(study)
@@ -144,7 +144,7 @@ def _stopped(runs: Runs) -> dict[str, str]:
     return {name: line for name, line in lines.items() if line}
 
 
-def _environment() -> Any:
+def page_environment() -> Any:
     """What jinja2 renders the page with; a name that the template lacks is an error."""
     jinja2 = need("jinja2")
     environment = jinja2.Environment(

@@ -1,0 +1,101 @@
+"""Agents that are trained already: those that this package ships, those of others in a folder or on
+the Hugging Face hub.
+"""
+
+import difflib
+import os
+from os import PathLike
+from pathlib import Path
+
+import torch
+
+from arcade_torch.agents import hub
+from arcade_torch.agents.policy import Agent, agent_of
+from arcade_torch.agents.runs.bundle import (
+    MOST_BYTES,
+    check_hash,
+    find_checkpoint,
+    is_bundle,
+    load_bundle,
+)
+from arcade_torch.agents.runs.checkpoint import Checkpoint
+from arcade_torch.agents.runs.files import CheckpointError
+from arcade_torch.agents.runs.shipped import agent_folder, pretrained_names
+from arcade_torch.models.presets import FEED_FORWARD
+from arcade_torch.models.registry import ALIASES, memory_names
+
+
+def from_pretrained(
+    name: str | PathLike[str],
+    revision: str | None = None,
+    sha256: str | None = None,
+    device: str | torch.device | None = None,
+) -> Agent:
+    """Load an agent that is trained already.
+
+    Nothing in it is code and nothing is unpickled. A memory model of somebody else's has to be
+    registered before: it is not fetched.
+
+    Args:
+        name: a folder with an agent, a run folder, one of :func:`pretrained_names`, or a repository
+            ``owner/name`` of the Hugging Face hub (the extra ``hub``).
+        revision: branch, tag or commit of the repository; the newest commit by default.
+        sha256: what the hash of ``model.safetensors`` has to be, checked before it is read.
+        device: where to put the network; default the device of the run if it is there, else the
+            CPU.
+
+    Returns:
+        The agent, in evaluation mode; see :func:`arcade_torch.agents.load`.
+
+    Raises:
+        ValueError: ``sha256`` is no hash, or ``revision`` is given for a folder.
+        CheckpointError: there is no such agent, it is damaged or another one, or its memory model
+            is not known here.
+        HubError: the hub cannot be reached, or refuses.
+
+    Example:
+        >>> agent = from_pretrained("signpost-partial-lru")
+        >>> agent.config.env, agent.config.memory
+        ('SignpostEasy', 'lru')
+    """
+    if sha256 is not None:
+        check_hash(sha256)
+    folder = agent_folder(name)
+    if not folder.is_dir() and hub.is_repo(os.fspath(name)):
+        folder = hub.download(os.fspath(name), MOST_BYTES, revision=revision)
+    elif revision is not None:
+        raise ValueError(f"revision = {revision!r}: {name} is a folder here, which has none")
+    return agent_of(read_shared(folder, sha256), device)
+
+
+def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
+    """The weights and settings in a folder, if its memory model is known; raises as
+    :func:`from_pretrained`.
+    """
+    if not folder.is_dir():
+        raise CheckpointError(f"{folder} is not a folder; {_near(folder)}")
+    if sha256 is not None and not is_bundle(folder):
+        raise CheckpointError(
+            f"{folder} has no model.safetensors: sha256 is for an agent that was shared"
+        )
+    if not is_bundle(folder):
+        return find_checkpoint(folder)
+    checkpoint = load_bundle(folder, sha256)
+    memory = checkpoint.config.memory
+    if memory not in (*memory_names(), *ALIASES, FEED_FORWARD):
+        raise CheckpointError(
+            f"the memory {memory!r} of the agent in {folder} is not known here, and no code is "
+            "taken from an agent: pass --import FILE.py with it, or register_memory before"
+        )
+    return checkpoint
+
+
+def _near(folder: Path) -> str:
+    """Which names there are."""
+    names = pretrained_names()
+    near = difflib.get_close_matches(folder.name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return (
+        f"{hint}give a run folder, one of its checkpoints, an agent that was shared, or one of "
+        f"this package: {', '.join(names)}"
+    )

@@ -1,0 +1,35 @@
+"""The folders of the agents that this package ships, by name; imports nothing heavy."""
+
+import os
+from os import PathLike
+from pathlib import Path
+
+SHIPPED = Path(__file__).resolve().parents[1] / "shipped"
+"""Where they are: a folder each."""
+
+
+def pretrained_names() -> list[str]:
+    """Names of the agents that this package ships, ``GAME-TWIN-MEMORY``, sorted.
+
+    Example:
+        >>> "signpost-partial-lru" in pretrained_names()
+        True
+    """
+    return sorted(path.parent.name for path in SHIPPED.glob("*/model.safetensors"))
+
+
+def is_shipped(path: Path) -> bool:
+    """Whether a path is the folder of an agent of this package, where nothing is written."""
+    return path.parent.absolute() == SHIPPED
+
+
+def agent_folder(name: str | PathLike[str]) -> Path:
+    """The folder that a user means: one that is there, or an agent of this package by its name.
+
+    Anything else is given back as it is, for whoever opens it to say that it is not there.
+    """
+    path = Path(name)
+    text = os.fspath(name)
+    if text in pretrained_names() and not path.exists():
+        return SHIPPED / text
+    return path

@@ -1,0 +1,126 @@
+"""``arcade-torch push`` and ``arcade-torch pull``: agents to and from others."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from arcade_torch.agents.config import require
+from arcade_torch.agents.runs.files import read_bytes, write_atomic
+from arcade_torch.agents.runs.shipped import agent_folder
+from arcade_torch.tools.imports import import_again
+from arcade_torch.tools.options import Command, at_least
+from arcade_torch.tools.text import say
+
+MOST_EXTRA = 64 * 2**20
+"""Bytes of the largest film, page or table of results that is fetched."""
+
+
+@dataclass(kw_only=True)
+class Push(Command):
+    """Put a trained agent on the Hugging Face hub, or into a local folder in the same form.
+
+    It writes config.json, model.safetensors, results.json, a model card with its metrics,
+    .eval_results and a film of an episode, and evaluates what was written. The hub needs the extra
+    hub and a login (hf auth login).
+
+    Example: arcade-torch push runs/one someone/ppo-lru-signposteasy-partial
+    """
+
+    run_folder: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[Path]]
+    """Run folder or checkpoint."""
+    repo: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
+    """Repository owner/name; or a folder: one that is there, or a name that begins with . or /"""
+    episodes: int = 1024  # Greedy ones, for the results.
+    half: bool = False  # Store the weights as float16; both returns stand in results.json.
+    film: bool = True  # Write a film of an episode.
+    private: bool = False  # Make a private repository.
+    message: str = "Add an agent"  # Of the commit.
+
+    def run(self) -> int:
+        """Write, evaluate, and upload unless it is a folder."""
+        from arcade_torch.agents import hub
+        from arcade_torch.tools.sharing import card
+        from arcade_torch.tools.sharing.share import share
+
+        at_least(self, episodes=1)
+        run = agent_folder(self.run_folder)
+        import_again(run)
+        into_folder = is_folder(self.repo)
+        allowed = "owner/name, or a folder that begins with ./ or /"
+        require(into_folder or hub.is_repo(self.repo), "the repository", self.repo, allowed)
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(self.repo).expanduser() if into_folder else Path(scratch) / "agent"
+            name = "" if into_folder else self.repo
+            results = share(run, folder, name, self.episodes, self.half, self.film)
+            place = str(folder)
+            if not into_folder:
+                place = hub.upload(folder, self.repo, self.message, self.private)
+        say(f"mean return {results['mean_reward']:.3f} over {self.episodes} episodes")
+        say(f"sha256 {results['sha256']['model.safetensors']}")
+        say(f"pushed: {place}")
+        if into_folder:
+            say(f"a name for the hub: OWNER/{card.suggested_name(results)}")
+        return 0
+
+
+@dataclass(kw_only=True)
+class Pull(Command):
+    """Fetch an agent from the Hugging Face hub, or from a local folder, and check it.
+
+    Its hash is checked before anything is read, nothing is unpickled, and no code is taken: where
+    the memory is somebody's own, pass --import with its file. What is fetched can stand wherever a
+    run folder can: play, record, evaluate, analyze, figure.
+
+    Example: arcade-torch pull someone/ppo-lru-signposteasy-partial --revision v1 --out agents/one
+    """
+
+    repo: tyro.conf.PositionalRequiredArgs[tyro.conf.Positional[str]]
+    """Repository owner/name, or a folder."""
+    revision: str | None = None  # Branch, tag or commit; the newest commit by default.
+    sha256: str | None = None  # What the hash of model.safetensors has to be.
+    out: Path | None = None  # Folder that it goes to; agents/NAME by default.
+
+    def run(self) -> int:
+        """Fetch, check, write."""
+        from arcade_torch.agents import hub
+        from arcade_torch.agents.policy import agent_of
+        from arcade_torch.agents.pretrained import read_shared
+        from arcade_torch.agents.runs.bundle import CONFIG, MOST_BYTES, WEIGHTS, check_hash
+        from arcade_torch.agents.runs.files import checksum
+        from arcade_torch.tools.sharing.share import EVALUATION, FILMS, README, RESULTS
+
+        if self.sha256 is not None:
+            check_hash(self.sha256)
+        extras = (README, RESULTS, EVALUATION, *FILMS)
+        sizes = MOST_BYTES | dict.fromkeys(extras, MOST_EXTRA)
+        source = agent_folder(Path(self.repo).expanduser())
+        if is_folder(self.repo) or source.is_dir():
+            require(self.revision is None, "--revision", self.revision, "left out: it is a folder")
+        else:
+            allowed = "owner/name, or a folder"
+            require(hub.is_repo(self.repo), "the repository", self.repo, allowed)
+            source = hub.download(self.repo, sizes, extras, self.revision)
+        agent = agent_of(read_shared(source, self.sha256), "cpu")
+        out = self.out or Path("agents") / source_name(self.repo)
+        if out.exists():
+            raise FileExistsError(f"{out} exists: choose another folder with --out")
+        for name in (CONFIG, WEIGHTS, *extras):
+            if (source / name).is_file():
+                write_atomic(out / name, read_bytes(source / name, sizes[name]))
+        config = agent.config
+        say(f"{config.algorithm}-{config.memory} on {config.env} ({config.observability})")
+        say(f"sha256 {checksum(out / WEIGHTS)}")
+        say(f"pulled: {out}")
+        return 0
+
+
+def is_folder(repo: str) -> bool:
+    """Whether somebody means a folder: one that is there, or a name that no repository has."""
+    return repo.startswith((".", "/", "~")) or Path(repo).is_dir()
+
+
+def source_name(repo: str) -> str:
+    """The last part of a repository's or a folder's name."""
+    return Path(repo).expanduser().resolve().name

@@ -1,0 +1,159 @@
+"""A run as a folder that can be shared: weights, settings, results, model card, film."""
+
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from arcade_torch.agents.evaluation import EvalResult, evaluate
+from arcade_torch.agents.policy import agent_of
+from arcade_torch.agents.runs.bundle import (
+    CONFIG,
+    WEIGHTS,
+    find_checkpoint,
+    is_bundle,
+    load_bundle,
+    write_bundle,
+)
+from arcade_torch.agents.runs.files import checksum, read_json, write_atomic, write_json
+from arcade_torch.tools.errors import MissingPackage
+from arcade_torch.tools.imports import remembered_imports
+from arcade_torch.tools.machine import versions
+from arcade_torch.tools.sharing import card
+
+RESULTS = "results.json"
+README = "README.md"
+EVALUATION = ".eval_results/arcade-torch.yaml"
+FILMS = ("replay.mp4", "replay.gif")
+MOST_STEPS = 500
+"""Of the episode in the film."""
+_WORDS_LEFT_OUT = ("--out", "--config")
+"""Options of a training that name places on somebody's machine."""
+
+
+def share(
+    run: Path,
+    folder: Path,
+    repo: str = "",
+    episodes: int = 1024,
+    half: bool = False,
+    film: bool = True,
+) -> dict[str, Any]:
+    """Write the agent of a run into a folder, and evaluate what was written.
+
+    Args:
+        run: run folder, checkpoint, or an agent that was shared.
+        folder: where to; made if it is missing.
+        repo: what it will be called; the folder's name by default.
+        episodes: greedy ones, for the results.
+        half: store the weights as float16.
+        film: write a film of one episode, as an MP4 with the extra video, else as a GIF.
+
+    Returns:
+        What ``results.json`` holds.
+
+    Raises:
+        CheckpointError: there is no agent at ``run``.
+        FileExistsError: the folder holds something else.
+    """
+    _check_free(folder)
+    checkpoint = find_checkpoint(run)
+    record = _record_of(run)
+    training = {"versions": record.get("versions", {}), "command": _command(record)}
+    needs = [Path(name).name for name in remembered_imports(record, run / CONFIG)]
+    write_bundle(folder, checkpoint, training | {"needs": needs}, half)
+    stored = load_bundle(folder)
+    result = _evaluated(stored, episodes)
+    results = _results(stored, result)
+    if half:
+        results["mean_reward_float32"] = round(_evaluated(checkpoint, episodes).mean, 6)
+    results |= {"training": training, "evaluated_with": versions()}
+    results["sha256"] = {name: checksum(folder / name) for name in (CONFIG, WEIGHTS)}
+    video = _film(stored, folder) if film else ""
+    write_json(folder / RESULTS, results)
+    write_atomic(folder / README, card.model_card(repo or folder.name, results, video))
+    write_atomic(folder / EVALUATION, card.eval_results(results))
+    return results
+
+
+def _check_free(folder: Path) -> None:
+    """Refuse a folder that holds anything but an agent that was shared."""
+    if folder.is_dir() and any(folder.iterdir()) and not is_bundle(folder):
+        raise FileExistsError(
+            f"{folder} is not empty and holds no shared agent: choose another folder"
+        )
+
+
+def _record_of(run: Path) -> dict[str, Any]:
+    """The ``config.json`` of a run, of the run of a checkpoint, or of a shared agent."""
+    for place in (run, run.parent, run.parent.parent):
+        if (place / CONFIG).is_file():
+            record = read_json(place / CONFIG)
+            return record if isinstance(record, dict) else {}
+    return {}
+
+
+def _command(record: dict[str, Any]) -> str:
+    """How the training was started, without names of places."""
+    words = record.get("command", [])
+    if isinstance(words, str):
+        return words
+    kept = ["arcade-torch"]
+    skips = False
+    for word in map(str, words[1:]):
+        if skips or word.partition("=")[0] in _WORDS_LEFT_OUT:
+            skips = not skips and "=" not in word
+        else:
+            kept.append(Path(word).name if "/" in word else word)
+    return " ".join(kept)
+
+
+def _evaluated(checkpoint: Any, episodes: int) -> EvalResult:
+    """Greedy episodes of a checkpoint, on the CPU."""
+    config = replace(checkpoint.config, device="cpu", cuda_graphs=False)
+    return evaluate(agent_of(replace(checkpoint, config=config), "cpu"), episodes=episodes)
+
+
+def _results(checkpoint: Any, result: EvalResult) -> dict[str, Any]:
+    """What an agent is and what it earned."""
+    config = checkpoint.config
+    return {
+        "env": config.env,
+        "observability": config.observability,
+        "algorithm": config.algorithm,
+        "memory": config.memory,
+        "seed": config.seed,
+        "frames": checkpoint.frames,
+        "mean_reward": round(result.mean, 6),
+        "std_reward": round(result.std, 6),
+        "half_width_95": result.half_width,
+        "is_deterministic": True,
+        "n_eval_episodes": len(result.returns),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+    }
+
+
+def _film(checkpoint: Any, folder: Path) -> str:
+    """Write a film of one episode; gives its name, empty where no extra writes films."""
+    from arcade_torch.compiled import compiled_game
+    from arcade_torch.tools.play import recording
+    from arcade_torch.tools.play.session import Session
+
+    config = checkpoint.config
+    game = compiled_game(config.env, config.obs_size, config.rules, dict(config.env_options))
+    for name in FILMS:
+        try:
+            write = recording.writer_for(folder / name)
+        except MissingPackage:
+            continue
+        partial = config.observability != "full"
+        session = Session(game, seed=recording.FILM_SEED, partial=partial, episodes=1)
+        player = recording.trained(agent_of(checkpoint, "cpu"), partial)
+        fps = recording.FILM_FPS
+        frames = recording.recorded_frames(session, player, max_steps=MOST_STEPS, hold=fps, scale=2)
+        with tempfile.TemporaryDirectory() as scratch:
+            made = write(Path(scratch) / name, frames, fps)
+            write_atomic(folder / name, made.read_bytes())
+        return name
+    return ""
