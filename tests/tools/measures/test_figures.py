@@ -535,6 +535,7 @@ def test_beliefs_of_checkpoints_are_drawn_with_their_numbers(
     text = " ".join(capsys.readouterr().out.split())
     assert "hidden facts that can be read" in text and "gru on" in text
     assert "whose decision an exchanged state brings" in text
+    assert "decisions that follow one fact" in text and "at random" in text
     name = tmp_path / "beliefs-MineSweeperEasy-v0-full"
     assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
     rows = read_csv(name.with_suffix(".csv"))

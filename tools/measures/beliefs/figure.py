@@ -11,6 +11,8 @@ from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.beliefs import BeliefsOptions, measure
 from arcade_torch.tools.measures.beliefs.patching import OUTCOMES, Patches, patching
+from arcade_torch.tools.measures.beliefs.recording import MIN_EPISODES
+from arcade_torch.tools.measures.beliefs.steering import ARMS, Steering, steering
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.options import at_least
@@ -36,11 +38,16 @@ OfAgent = Mapping[tuple[str, measure.Source], Scores]
 
 def by_fact(options: BeliefsOptions, progress: Progress | None) -> Made:
     """Figures ``beliefs-GAME-TWIN``, one a task."""
-    at_least(options, episodes=measure.MIN_EPISODES, max_steps=1, seed=0)
+    at_least(options, episodes=MIN_EPISODES, max_steps=1, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.beliefs, vars(options), progress)
     patched = measure_runs(paths, patching, vars(options), progress)
-    tables = [_table(measured, options.confidence), _patched_table(patched, options.confidence)]
+    steered = measure_runs(paths, steering, vars(options), progress)
+    tables = [
+        _table(measured, options.confidence),
+        _patched_table(patched, options.confidence),
+        _steered_table(steered, options.confidence),
+    ]
     result = Made([], notes, tables)
     result.notes += _notes(measured)
     for (game, twin), agents in style.agents_by_task(by_task(measured)).items():
@@ -90,6 +97,24 @@ def _patched_table(patched: Sequence[tuple[Label, Patches]], confidence: float) 
     )
     head = ("run", "exchanges", *OUTCOMES)
     return Table("whose decision an exchanged state brings", head, rows, caption)
+
+
+def _steered_table(steered: Sequence[tuple[Label, Steering]], confidence: float) -> Table:
+    """Whose decision follows a state that was moved for one fact, one row a run and fact."""
+    rows = list[tuple[Any, ...]]()
+    for label, moves in steered:
+        for fact in moves.names.tolist():
+            patches = moves.patches(fact)
+            cells = [moves.patches(fact, arm).share("follows", confidence).text() for arm in ARMS]
+            rows.append((label, fact, int(patches.differs.sum()), *cells))
+    caption = (
+        "the recurrent state is another episode's (whole state), or moved by what states with the "
+        "two values of the fact differ on average (the fact), or equally far at random; shares of "
+        "decisions that become those of the other episode, where it has another value of the fact "
+        f"and decides otherwise, with {100 * confidence:g} % intervals over episodes"
+    )
+    head = ("run", "fact", "moves", "whole state", "the fact", "at random")
+    return Table("decisions that follow one fact", head, rows, caption, left=2)
 
 
 def scores_of(seeds: Sequence[measure.Beliefs], confidence: float = 0.95) -> OfAgent:
