@@ -16,6 +16,7 @@ from arcade_torch.tools.measures.windows import held_out
 Ints = NDArray[np.int64]
 Floats = NDArray[np.floating[Any]]  # single precision as recorded: states may be wide
 MIN_EPISODES = 8
+NO_FACTS = "this game names no facts"
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
         playing &= ~step.get(("next", "done")).reshape(-1).cpu()
     states, all_features, all_facts = zip(*steps, strict=True)
     if not all_facts[0]:
-        raise ValueError("this game names no facts: give its class a method facts, see Game.facts")
+        raise ValueError(f"{NO_FACTS}: give its class a method facts, see Game.facts")
     by_name = dict[str, NDArray[Any]]()
     for name in all_facts[0]:
         by_name[name] = np.stack([facts[name] for facts in all_facts], axis=1)
