@@ -37,6 +37,8 @@ def forget_registered_memories(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run(name: str, frames: int | None) -> dict[str, Any]:
     """The namespace of a notebook after its last cell; some cell has drawn something."""
+    if name == "attribution":
+        pytest.importorskip("captum.attr", reason="needs Captum: pip install '.[captum]'")
     cells = build.read_cells(FOLDER / f"{name}.py")
     if frames is not None:
         cells = [cell._replace(text=cell.text.replace('"small"', '"smoke"')) for cell in cells]
@@ -54,6 +56,11 @@ def laws(name: str, namespace: dict[str, Any]) -> None:
     if name == "counterfactual":
         effect = namespace["effects"]["no memory, POMDP"]
         assert effect.memory_reliance().value == 0 == np.nanmax(effect.profile()[1:])
+    if name == "attribution":
+        shares = namespace["shares"]
+        assert all(share.shape == (namespace["steps"],) for share in shares.values())
+        for name in ("gradient", "integrated gradients", "occlusion"):
+            assert shares[name].sum() == pytest.approx(1)
     if name == "own_memory":
         shares = namespace["shares"]
         assert shares[0] > 0 and shares[-1] > 0 and (shares[1:-1] == 0).all()
@@ -78,6 +85,10 @@ def claims(name: str, namespace: dict[str, Any]) -> None:
         profile = namespace["effects"]["LRU, POMDP"].profile(differing=True)
         assert profile[-1] > 0.9 and np.nanmax(profile[:-1], initial=0) < 0.1
         assert namespace["effects"]["LRU, MDP"].memory_reliance().value < 0.1
+    if name == "attribution":
+        exchanged = namespace["shares"]["exchange"]
+        assert exchanged[0] > 0.9 and exchanged[1:].max() < 0.1
+        assert namespace["shares"]["gradient"][1:].sum() > 0.2
     if name == "own_memory":
         assert namespace["result"].evaluation.mean > 0.9
     if name == "contamination":

@@ -27,12 +27,14 @@ _PUBLIC = {
     "report": "reports",
     "saliency": "measures.saliency.measure",
     "saliency_figure": "measures.saliency.figure",
+    "steering": "measures.beliefs.steering",
     "study": "studies.runner",
 }
 
 if TYPE_CHECKING:
     from arcade_torch.tools.measures.beliefs.measure import beliefs
     from arcade_torch.tools.measures.beliefs.patching import patching
+    from arcade_torch.tools.measures.beliefs.steering import steering
     from arcade_torch.tools.measures.contamination.figure import (
         contamination_example_figure,
         contamination_figure,
@@ -58,7 +60,7 @@ __all__ = [
     "Policy", "Study", "as_policy", "beliefs", "contamination", "contamination_example",
     "contamination_example_figure", "contamination_figure", "counterfactual",
     "counterfactual_figure", "gap_and_bias", "greedy_window", "patching", "recall_density",
-    "recall_density_figure", "report", "saliency", "saliency_figure", "study",
+    "recall_density_figure", "report", "saliency", "saliency_figure", "steering", "study",
 ]  # fmt: skip
 
 

@@ -25,6 +25,7 @@ NAMES = (
     "saliency",
     "recall_density",
     "counterfactual",
+    "attribution",
     "contamination",
     "own_memory",
     "torchrl_pipeline",

@@ -72,7 +72,7 @@ def test_runs_without_metrics_or_of_unknown_games_are_left_alone(tmp_path: Path)
 
 def test_the_report_names_such_runs(tmp_path: Path) -> None:
     folder = write_study(tmp_path / "study", small_study())
-    skipped = ("references", "saliency", "recall", "counterfactual", "contamination")
+    skipped = ("references", "saliency", "recall", "counterfactual", "beliefs", "contamination")
     first = folder.run(small_study().runs()[0]).path
     write_metrics(first, [0.0, 0.01], [UNIFORM, 0.01])
     page = report(tmp_path / "study", tmp_path / "page.html", skip=skipped).read_text()

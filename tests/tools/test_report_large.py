@@ -72,7 +72,7 @@ def test_many_runs_become_small_multiples_and_tables(
 ) -> None:
     monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
     folder, _ = large_study(tmp_path / "s")
-    skip = ("saliency", "recall", "counterfactual", "contamination")
+    skip = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
     page = report(folder.root, skip=skip).read_text()
     assert len(page) < 400_000
     count = check(page).count
@@ -140,8 +140,9 @@ def test_columns_of_the_page_are_those_steps_that_their_headings_name(
     label = Label(AgentKey("pqn", "lru"), GAMES[0], "full", 0, Path("run"), "lru")
     monkeypatch.setattr(section, "measure_run", lambda *words: (label, found))
     dense = RecallDensity(
-        np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q"
-    )
+        np.array([0.1, 0.2, 0.3, 0.4]), np.array([4]), np.array([True]), 0, 0, "q",
+        np.ones(1), np.ones(1),
+    )  # fmt: skip
     with drawing("light"):
         (row,) = contamination.contamination_section({label.task: [label.path]}, ["lru"], None)[
             "rows"
@@ -208,9 +209,14 @@ def test_recall_and_contamination_stand_on_the_page_and_are_made_once(
     noise = page[page.index('id="contamination"') : page.index('id="repeat"')]
     free = [row.split("<td>")[1:] for row in noise.split("<tr>")[2:]][1]
     assert free[3].startswith("0.0 %") and free[4].startswith("0.0 %")
-    exchanges = page[page.index('id="counterfactual"') : page.index('id="contamination"')]
+    exchanges = page[page.index('id="counterfactual"') : page.index('id="beliefs"')]
     free = [row.split("<td>")[1:] for row in exchanges.split("<tr>")[2:]][1]
     assert free[2].startswith("0.00")  # no memory: no reliance on it
+    assert ("beliefs, lru on SignpostEasy-v0", 64, 64) in told
+    probes = page[page.index('id="beliefs"') : page.index('id="contamination"')]
+    held, nothing = probes.split("<tr>")[2:]
+    assert "sign" in held and "no state" not in held
+    assert "no state" in nothing  # no memory
     told.clear()
     report(trained, skip=("saliency", "references"), progress=lambda *step: told.append(step))
     assert told == []  # kept in the run folders
@@ -233,9 +239,9 @@ def test_each_analysis_can_be_skipped_from_the_command_line(
     assert (
         'id="contamination"' in page and 'id="recall"' not in page and 'id="saliency"' not in page
     )
-    assert 'id="counterfactual"' in page
-    assert cli.main([*ask, "contamination", "counterfactual"]) == cli.EXIT_OK
+    assert 'id="counterfactual"' in page and 'id="beliefs"' in page
+    assert cli.main([*ask, "contamination", "counterfactual", "beliefs"]) == cli.EXIT_OK
     page = (tmp_path / "r.html").read_text()
     assert 'id="contamination"' not in page and 'id="recall"' in page
-    assert 'id="counterfactual"' not in page
+    assert 'id="counterfactual"' not in page and 'id="beliefs"' not in page
     assert not (tmp_path / "analysis").exists() and read_csv(trained / "results.csv")

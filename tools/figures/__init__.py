@@ -11,7 +11,9 @@ from arcade_torch.tools.files import Table
 
 Progress = Callable[[str, int, int], None]
 # of a report; what may be left out
-Part = Literal["saliency", "recall", "counterfactual", "contamination", "references"]
+Part = Literal[
+    "saliency", "recall", "counterfactual", "beliefs", "contamination", "references"
+]  # fmt: skip
 PICTURES = (".pdf", ".png", ".svg")
 NUMBERS = (".csv",)
 

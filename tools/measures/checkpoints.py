@@ -113,7 +113,7 @@ def measure_run(
     settings["game"] = config.env
     settings["rules"] = config.rules
     settings["observability"] = twin
-    settings["format"] = 2
+    settings["format"] = 3
     settings["frames"] = agent.frames
     settings["weights"] = _hash_of_weights(agent.network)
     settings["version"] = arcade_torch.__version__

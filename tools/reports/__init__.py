@@ -18,6 +18,7 @@ from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import import_again
+from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.bootstrap import Interval, pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
 from arcade_torch.tools.measures.counterfactual import figure as counterfactual
@@ -46,6 +47,7 @@ _PROTOCOLS = {
     "density": recall_density.DENSITY,
     "bins": recall_density.BINS,
     "exchanges": counterfactual.EXCHANGES,
+    "probes": beliefs.PROBES,
     "noise": contamination.NOISE,
     "powerless_below": contamination.POWERLESS_BELOW,
 }
@@ -70,8 +72,8 @@ def report(
         root: folder of the study.
         out: the page; ``report.html`` in the folder by default.
         metric: score of a run that headline and table rest on, ``eval_final`` or ``train_max_ewm``.
-        skip: parts to leave out: saliency strips, recall density, counterfactual recall, state
-            contamination, returns of random policy and oracles.
+        skip: parts to leave out: saliency strips, recall density, counterfactual recall, beliefs,
+            state contamination, returns of random policy and oracles.
         subject: the agent, or its memory, that the page is about; by default that of the study, if
             it has one.
         progress: called with (what, done, total).
@@ -188,6 +190,7 @@ def _parts(
     parts["strips"] = []
     parts["recall"] = None
     parts["counterfactual"] = None
+    parts["beliefs"] = None
     parts["contamination"] = None
     if "saliency" not in skip:
         parts["strips"] = saliency.saliency_strips(cells, progress)
@@ -198,6 +201,9 @@ def _parts(
         section = counterfactual.counterfactual_section(cells, agents, progress, with_recall)
         parts["counterfactual"] = _unless_empty(section)
     parts["vanishing"] = _vanishing(parts["strips"], parts["counterfactual"])
+    if "beliefs" not in skip:
+        section = beliefs.beliefs_section(cells, agents, progress)
+        parts["beliefs"] = _unless_empty(section)
     if "contamination" not in skip:
         section = contamination.contamination_section(cells, agents, progress)
         parts["contamination"] = _unless_empty(section)

@@ -11,13 +11,8 @@ from torch import Tensor
 import arcade_torch
 from arcade_torch.models import make_network
 from arcade_torch.tools import Policy, beliefs
-from arcade_torch.tools.measures.beliefs.measure import (
-    Beliefs,
-    Recording,
-    Split,
-    beliefs_of,
-    flat_state,
-)
+from arcade_torch.tools.measures.beliefs.measure import Beliefs, Split, beliefs_of
+from arcade_torch.tools.measures.beliefs.recording import Recording, flat_state
 from arcade_torch.tools.measures.beliefs.ridge import Ridge
 from tests.tools.measures.toys import ToyEnv
 

@@ -180,7 +180,16 @@ def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch)
     agents = {("lru", "A"): 1, ("lru", "B"): 2, ("gru", "A"): 2}  # of so many twins
     labels = [Label(AgentKey("pqn", agent), game, twin, 0, Path("run"), agent)
               for (agent, game), twins in agents.items() for twin in ("full", "partial")[:twins]]  # fmt: skip
-    dense = RecallDensity(np.array([0.1, 0.2, 0.7]), np.array([3]), np.array([True]), 0, 0, "q")
+    dense = RecallDensity(
+        np.array([0.1, 0.2, 0.7]),
+        np.array([3]),
+        np.array([True]),
+        0,
+        0,
+        "q",
+        np.ones(1),
+        np.ones(1),
+    )
     monkeypatch.setattr(recall_density, "checkpoints_of", lambda paths: ([], []))
     monkeypatch.setattr(
         recall_density, "measure_runs", lambda *words: [(label, dense) for label in labels]
@@ -535,6 +544,7 @@ def test_beliefs_of_checkpoints_are_drawn_with_their_numbers(
     text = " ".join(capsys.readouterr().out.split())
     assert "hidden facts that can be read" in text and "gru on" in text
     assert "whose decision an exchanged state brings" in text
+    assert "decisions that follow one fact" in text and "at random" in text
     name = tmp_path / "beliefs-MineSweeperEasy-v0-full"
     assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
     rows = read_csv(name.with_suffix(".csv"))
@@ -645,8 +655,9 @@ def test_the_row_of_a_report_names_the_frame_that_matters_most_and_saturated_pol
         seed = exchanges([0.9, 0.0], 1.0, certainty=np.array([0.9999]), target=target)
         assert counterfactual._section_row([seed])["saturated"] == saturated
     density = RecallDensity(
-        np.array([0.1, 0.2, 0.7, 0.4, 0.6]), np.array([3, 2]), np.array([True, True]), 0, 0, "q"
-    )
+        np.array([0.1, 0.2, 0.7, 0.4, 0.6]), np.array([3, 2]), np.array([True, True]), 0, 0, "q",
+        np.ones(2), np.ones(2),
+    )  # fmt: skip
     np.testing.assert_allclose(counterfactual.share_by_lag([density], 3), [0.65, 0.3, 0.1])
 
 
@@ -720,7 +731,9 @@ def test_noise_that_cannot_matter_is_named_and_empty_panels_say_why() -> None:
         ([0.999, 0.001], 1e-3, "l2sq", "saturated, its best action has 0.99900"),
         ([0.6, 0.4], 1e-12, "l2sq", "all squared gradients sum to 2e-12"),
         ([0.999, 0.001], 1e-12, "l2sq", "0.99900, and all squared"),
-        ([0.6, 0.4], 1e-12, "l1", ""),
+        ([0.6, 0.4], 1e-12, "l2", ""),
+        ([0.6, 0.4], 1e-12, "l1", "all gradients sum to 2e-12"),
+        ([0.6, 0.4], 1e-2, "l1", ""),
         ([0.6, 0.4], 1e-3, "l2sq", ""),
     ],
 )
@@ -734,6 +747,20 @@ def test_saliency_says_where_gradients_vanish(
     warning = saliency_figures.no_gradient(episode, norm)
     assert words in warning if words else warning == ""
     assert "saturated" not in saliency_figures.no_gradient(replace(episode, target="q"), norm)
+
+
+def test_recall_density_says_in_one_line_where_gradients_vanish() -> None:
+    label = Label(AgentKey("ppo", "lru"), "SignpostEasy-v0", "partial", 0, Path("run"), "lru")
+    sure = RecallDensity(
+        np.array([0.1, 0.2, 0.7, 0.4, 0.6]), np.array([3, 2]), np.array([True, True]), 0, 0,
+        "probs", np.array([1e-12, 3e-12]), np.array([0.9999, 0.9997]),
+    )  # fmt: skip
+    (note,) = recall_density.vanishing_notes([(label, sure)])
+    assert "saturated, its best action has 0.99980, and all gradients sum to 2e-12" in note
+    assert "counterfactual recall" in note and "\n" not in note
+    unsure = replace(sure, sizes=np.array([0.5, 3.0]), certainty=np.array([0.5, 0.7]))
+    of_values = replace(sure, target="q", sizes=np.array([0.5, 3.0]))
+    assert not recall_density.vanishing_notes([(label, unsure), (label, of_values)])
 
 
 @dataclass
@@ -766,7 +793,10 @@ def test_the_confidence_that_is_asked_for_is_that_of_bands_and_bars(
         for seed in range(3)
     ]
     shares = [np.array([0.1 * seed, 0.3, 0.7 - 0.1 * seed]) for seed in range(3)]
-    dense = [RecallDensity(share, np.array([3]), np.array([True]), 0, 0, "q") for share in shares]
+    dense = [
+        RecallDensity(share, np.array([3]), np.array([True]), 0, 0, "q", np.ones(1), np.ones(1))
+        for share in shares
+    ]
     flips = [
         np.array([[[1.0, 0.4 * seed if seed else np.nan]]]) for seed in range(3)
     ]  # one episode ended before

@@ -11,14 +11,21 @@ from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.beliefs import BeliefsOptions, measure
 from arcade_torch.tools.measures.beliefs.patching import OUTCOMES, Patches, patching
+from arcade_torch.tools.measures.beliefs.recording import MIN_EPISODES, NO_FACTS
+from arcade_torch.tools.measures.beliefs.steering import ARMS, Steering, steering
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
+from arcade_torch.tools.measures.section import Cells, section
 from arcade_torch.tools.options import at_least
 
 SOURCES: Mapping[measure.Source, str] = {"state": "recurrent state", "frame": "frame alone"}
 KINDS = {True: "share of the way from chance to 1", False: "R2"}
 ALL = "all"  # of the steps
 LOWEST = -0.15  # of the axis: what is below is worse than a guess, however much
+
+
+PROBES: Mapping[str, Any] = {"episodes": 64, "max_steps": 96}
+"""Options of `beliefs` for a report."""
 
 
 class Scores(NamedTuple):
@@ -36,11 +43,16 @@ OfAgent = Mapping[tuple[str, measure.Source], Scores]
 
 def by_fact(options: BeliefsOptions, progress: Progress | None) -> Made:
     """Figures ``beliefs-GAME-TWIN``, one a task."""
-    at_least(options, episodes=measure.MIN_EPISODES, max_steps=1, seed=0)
+    at_least(options, episodes=MIN_EPISODES, max_steps=1, seed=0)
     paths, notes = checkpoints_of(options.runs)
     measured = measure_runs(paths, measure.beliefs, vars(options), progress)
     patched = measure_runs(paths, patching, vars(options), progress)
-    tables = [_table(measured, options.confidence), _patched_table(patched, options.confidence)]
+    steered = measure_runs(paths, steering, vars(options), progress)
+    tables = [
+        _table(measured, options.confidence),
+        _patched_table(patched, options.confidence),
+        _steered_table(steered, options.confidence),
+    ]
     result = Made([], notes, tables)
     result.notes += _notes(measured)
     for (game, twin), agents in style.agents_by_task(by_task(measured)).items():
@@ -90,6 +102,24 @@ def _patched_table(patched: Sequence[tuple[Label, Patches]], confidence: float) 
     )
     head = ("run", "exchanges", *OUTCOMES)
     return Table("whose decision an exchanged state brings", head, rows, caption)
+
+
+def _steered_table(steered: Sequence[tuple[Label, Steering]], confidence: float) -> Table:
+    """Whose decision follows a state that was moved for one fact, one row a run and fact."""
+    rows = list[tuple[Any, ...]]()
+    for label, moves in steered:
+        for fact in moves.names.tolist():
+            patches = moves.patches(fact)
+            cells = [moves.patches(fact, arm).share("follows", confidence).text() for arm in ARMS]
+            rows.append((label, fact, int(patches.differs.sum()), *cells))
+    caption = (
+        "the recurrent state is another episode's (whole state), or moved by what states with the "
+        "two values of the fact differ on average (the fact), or equally far at random; shares of "
+        "decisions that become those of the other episode, where it has another value of the fact "
+        f"and decides otherwise, with {100 * confidence:g} % intervals over episodes"
+    )
+    head = ("run", "fact", "moves", "whole state", "the fact", "at random")
+    return Table("decisions that follow one fact", head, rows, caption, left=2)
 
 
 def scores_of(seeds: Sequence[measure.Beliefs], confidence: float = 0.95) -> OfAgent:
@@ -276,3 +306,61 @@ def _rows(
             low=np.append(overall.low, of_fact.low),
             high=np.append(overall.high, of_fact.high),
         )
+
+
+def beliefs_section(
+    cells: Cells, agents: Sequence[str], progress: Progress | None
+) -> dict[str, Any]:
+    """Probes of every cell that is a POMDP whose game names facts, a picture a task; numbers are
+    kept in the run folders.
+    """
+    colours = style.agent_colours(agents)
+    hiding = {cell: paths for cell, paths in cells.items() if cell[2] == "partial"}
+
+    def summary(
+        measured: Sequence[tuple[Label, measure.Beliefs]],
+    ) -> tuple[OfAgent, dict[str, Any]]:
+        seeds = [probes for _, probes in measured]
+        scores = scores_of(seeds)
+        return scores, {"seeds": len(seeds), "facts": _section_rows(scores)}
+
+    def draw(by_agent: Mapping[str, OfAgent], axis: Any) -> None:
+        plot_bars(by_agent, axis, colours)
+        if len(facts_of(by_agent)) > 2:
+            for label in axis.get_xticklabels():
+                label.set(rotation=20, ha="right", rotation_mode="anchor")
+
+    parts = section("beliefs", hiding, (measure.beliefs, PROBES), summary, draw, progress)
+    parts["notes"] = [note for note in parts["notes"] if NO_FACTS not in note]
+    parts["sentences"] = _sentences(parts["rows"])
+    return parts
+
+
+def _section_rows(scores: OfAgent) -> list[dict[str, Any]]:
+    """What is read of every fact, one row a fact."""
+    rows = list[dict[str, Any]]()
+    for fact in facts_of({"": scores}):
+        state = scores.get((fact, "state"))
+        row: dict[str, Any] = {"fact": fact, "frame": scores[fact, "frame"].overall}
+        row["state"] = state.overall if state is not None else None
+        rows.append(row)
+    return rows
+
+
+def _sentences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Whose state holds more than its frame shows, as far as the two intervals lie apart; those
+    that hold most first.
+    """
+    sentences = list[tuple[float, str]]()
+    for row in rows:
+        for of_fact in row["facts"]:
+            state = of_fact["state"]
+            frame = of_fact["frame"]
+            if state is not None and state.low > max(frame.high, 0.0):
+                text = (
+                    f"{row['game']} {row['twin']}: {row['agent']}'s state holds {of_fact['fact']}: "
+                    f"a linear probe reads it with a score of {state.value:.2f}, off the frame "
+                    f"alone with {frame.value:.2f}."
+                )
+                sentences.append((frame.value - state.value, text))
+    return [text for _, text in sorted(sentences)]

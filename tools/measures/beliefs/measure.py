@@ -22,45 +22,36 @@ A probe shows what a linear function can read, not what the agent uses: for that
 counterfactual exchanges (`arcade_torch.tools.measures.counterfactual`).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.agents.config import require
+from arcade_torch.tools.measures.beliefs.recording import (
+    MIN_EPISODES,
+    Floats,
+    Ints,
+    Recording,
+    record,
+)
 from arcade_torch.tools.measures.beliefs.ridge import Ridge
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval, resampled
-from arcade_torch.tools.measures.policy import Progress, policy_of
-from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
+from arcade_torch.tools.measures.policy import Progress
+from arcade_torch.tools.measures.windows import Twin, resolve_agent
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.floating[Any]]  # single precision as recorded: states may be wide
 Source = Literal["state", "frame"]
 SOURCES: tuple[Source, ...] = ("state", "frame")
 PENALTIES = tuple(10.0**power for power in range(-6, 4))
 """Of which the one with the least squared error on held-out episodes is taken, for classes too: the
 share of right classes in few episodes is too coarse to choose by. The last gives the guess.
 """
-MIN_EPISODES = 8
 LARGEST = 2048
 """Side of the largest matrix that is decomposed: of states that are wider at most so many steps fit
 a probe, drawn at random.
 """
 DRAWS = 2000  # of the bootstrap
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What was recorded of E episodes of at most T steps; entries beyond an end are of no use."""
-
-    states: Floats  # [E, T, D], the recurrent state after the frame of the step; D may be 0
-    features: Floats  # [E, T, F], of the frame of the step
-    facts: Mapping[str, NDArray[Any]]  # [E, T, ...], bool, integers or floats
-    lengths: Ints  # [E]
 
 
 @dataclass(frozen=True)
@@ -166,113 +157,6 @@ def beliefs(
         player, env, episodes=episodes, max_steps=max_steps, seed=seed, progress=progress
     )
     return beliefs_of(recording, seed=seed)
-
-
-@torch.no_grad()
-def record(
-    agent: Any,
-    env: Any,
-    *,
-    episodes: int,
-    max_steps: int,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Recording:
-    """Play greedy episodes side by side, and keep states, features and facts of all steps.
-
-    Everything is as for `beliefs`.
-    """
-    require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
-    require(max_steps >= 1, "max_steps", max_steps, "at least 1")
-    if not hasattr(env, "facts"):
-        raise ValueError(
-            f"{type(env).__name__} has no facts(): hand over an ArcadeEnv, or an env whose facts() "
-            "gives tensors [N, ...] by name"
-        )
-    size = int(env.batch_size[0])
-    parts = list[Recording]()
-    with policy_of(agent).evaluating():
-        for group in range(-(-episodes // size)):
-            drawn = np.random.SeedSequence([seed, group]).generate_state(1)
-            env.set_seed(held_out(int(drawn[0]) % SEED_LIMIT))
-            part = _record_batch(agent, env, max_steps)
-            parts.append(_first(part, episodes - group * size))
-            if progress is not None:
-                progress(min(episodes, (group + 1) * size), episodes)
-    return _joined(parts)
-
-
-def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
-    """The first episode of every env of a batch."""
-    policy = policy_of(agent)
-    size = int(env.batch_size[0])
-    lengths = np.zeros(size, np.int64)
-    playing = torch.ones(size, dtype=torch.bool)
-    steps = list[tuple[Floats, Floats, dict[str, NDArray[Any]]]]()
-    obs = env.reset()
-    state = agent.initial_state(size)
-    while playing.any() and len(steps) < max_steps:
-        facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
-        features = policy.features(obs["pixels"])
-        action, _, state = agent.act(obs, state)
-        steps.append((flat_state(state, size), features.float().cpu().numpy(), facts))
-        lengths += playing.numpy()
-        step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        playing &= ~step.get(("next", "done")).reshape(-1).cpu()
-    states, all_features, all_facts = zip(*steps, strict=True)
-    if not all_facts[0]:
-        raise ValueError("this game names no facts: give its class a method facts, see Game.facts")
-    by_name = dict[str, NDArray[Any]]()
-    for name in all_facts[0]:
-        by_name[name] = np.stack([facts[name] for facts in all_facts], axis=1)
-    return Recording(np.stack(states, 1), np.stack(all_features, 1), by_name, lengths)
-
-
-def flat_state(state: Any, size: int) -> Floats:
-    """A recurrent state as numbers, float32 [size, D]; complex numbers are pairs."""
-    leaves = list[Floats]()
-    for leaf in _leaves(state):
-        numbers = torch.view_as_real(leaf) if leaf.is_complex() else leaf
-        leaves.append(numbers.detach().reshape(size, -1).float().cpu().numpy())
-    return np.concatenate(leaves, axis=1) if leaves else np.zeros((size, 0), np.float32)
-
-
-def _leaves(state: Any) -> Iterator[Tensor]:
-    """The tensors of a state, in the order of their names."""
-    if isinstance(state, Tensor):
-        yield state
-    elif state is not None:
-        for name in sorted(state.keys()):
-            yield from _leaves(state.get(name))
-
-
-def _first(part: Recording, count: int) -> Recording:
-    """The first episodes of a recording."""
-    facts = {name: values[:count] for name, values in part.facts.items()}
-    return Recording(part.states[:count], part.features[:count], facts, part.lengths[:count])
-
-
-def _joined(parts: Sequence[Recording]) -> Recording:
-    """Recordings one after the other, padded with zeros to the longest."""
-    steps = max(part.states.shape[1] for part in parts)
-
-    def join(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        padded = list[NDArray[Any]]()
-        for array in arrays:
-            missing = [(0, 0)] * array.ndim
-            missing[1] = (0, steps - array.shape[1])
-            padded.append(np.pad(array, missing))
-        return np.concatenate(padded)
-
-    facts = dict[str, NDArray[Any]]()
-    for name in parts[0].facts:
-        facts[name] = join([part.facts[name] for part in parts])
-    return Recording(
-        join([part.states for part in parts]),
-        join([part.features for part in parts]),
-        facts,
-        np.concatenate([part.lengths for part in parts]),
-    )
 
 
 def beliefs_of(recording: Recording, seed: int = 0) -> Beliefs:

@@ -134,7 +134,7 @@ def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator)
     state = agent.initial_state(size)
     while playing.any() and len(steps) < max_steps:
         rows = playing.nonzero().flatten().numpy()
-        donors = _donors(rows, size, rng)
+        donors = draw_donors(rows, size, rng)
         # before the decision itself: acting may change the state in place
         given = None if state is None else state[torch.from_numpy(donors)].clone()
         patched = agent.act(obs, given)[0]
@@ -151,7 +151,7 @@ def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator)
     return np.stack(steps, axis=-1)
 
 
-def _donors(rows: Ints, size: int, rng: np.random.Generator) -> Ints:
+def draw_donors(rows: Ints, size: int, rng: np.random.Generator) -> Ints:
     """For every env another one, drawn among those whose episodes run (``rows``); itself where
     there is none: int64 [size].
     """

@@ -16,6 +16,7 @@ from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.measures.recall_density import DensityOptions, measure
+from arcade_torch.tools.measures.saliency.figure import INSTEAD, vanishing
 from arcade_torch.tools.measures.section import Cells, section
 from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.options import at_least
@@ -40,7 +41,7 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
     """Figures ``recall-density-B`` for every number of bins; one npz file with every trajectory."""
     at_least(options, bins=1, episodes=1, seed=0)
     measured, notes = _measure(options, progress)
-    result = Made([], notes)
+    result = Made([], notes + vanishing_notes(measured, options.norm))
     frames = np.concatenate([density.lengths for _, density in measured])
     counts = _range([len(density.lengths) for _, density in measured])
     end = "the one that ended the episode" if options.end == "last" else "at a random step"
@@ -61,6 +62,19 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
         result.pictures.append(Picture(f"recall-density-{bins}", figure, note, rows, arrays))
     result.tables.append(_table(measured))
     return result
+
+
+def vanishing_notes(measured: Densities, norm: str = "l1") -> list[str]:
+    """One line for every run whose gradients vanish, on average over its decisions."""
+    notes = list[str]()
+    for label, density in measured:
+        certainty = float(density.certainty.mean())
+        why = vanishing(density.target, certainty, float(density.sizes.mean()), norm)
+        if why:
+            notes.append(
+                f"{label}: shares of the gradient say nothing: {why} on average; {INSTEAD}"
+            )
+    return notes
 
 
 def _masses(measured: Densities, bins: int, confidence: float) -> Masses:
@@ -118,7 +132,10 @@ def _measure(options: DensityOptions, progress: Progress | None) -> tuple[Densit
                 "gradient)"
             )
     if not densities:
-        raise ValueError(f"no trajectory is left of any checkpoint: {listed(empty)}")
+        raise ValueError(
+            f"no trajectory is left of any checkpoint: {listed(empty)}; play more episodes, or "
+            "take counterfactual recall (analyze counterfactual), which needs no gradient"
+        )
     if empty:
         notes.append(f"left out, no trajectory: {listed(empty)}")
     short = sum(density.dropped for _, density in densities)

@@ -44,6 +44,8 @@ class RecallDensity:
     dropped: int  # trajectories left out because they have fewer than three frames
     silent: int  # trajectories left out because all their gradients vanish
     target: str  # what was differentiated
+    sizes: Array  # [m], the sum over its frames that the gradient of a trajectory was divided by
+    certainty: Array  # [m], the largest output at the decision
 
     @property
     def shares(self) -> tuple[Array, ...]:
@@ -140,6 +142,8 @@ def density_of_windows(
     policy = as_policy(model, **names)
     shares = [np.zeros(0)]
     ended = list[bool]()
+    sizes = list[float]()
+    certainty = list[float]()
     dropped = 0
     silent = 0
     for count, window in enumerate(windows, start=1):
@@ -159,6 +163,8 @@ def density_of_windows(
             if gradients.per_frame.sum() > 0:
                 shares.append(gradients.shares())
                 ended.append(window.ended)
+                sizes.append(float(gradients.per_frame.sum()))
+                certainty.append(float(gradients.output.max()))
             else:
                 silent += 1
         if progress is not None:
@@ -170,6 +176,8 @@ def density_of_windows(
         dropped=dropped,
         silent=silent,
         target=resolve(policy, target),
+        sizes=np.array(sizes),
+        certainty=np.array(certainty),
     )
 
 

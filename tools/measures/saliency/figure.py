@@ -2,7 +2,7 @@
 
 import math
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,14 @@ SATURATED = 0.99
 """From this probability of one action on the softmax of a policy is flat: its slope, ``p (1 - p)``,
 is a twenty-fifth of the steepest and less.
 """
-VANISHING = 1e-10
-"""Below this sum of squared gradients an episode has none to speak of: if all values of a frame of
-128 pixels move by 1 (of 255), then, to first order, no output moves by more than 0.003.
+VANISHING: Mapping[str, float] = {"l2sq": 1e-10, "l1": 2e-3}
+"""Below this sum of squared gradients, or of their sizes, an episode has none to speak of: if all
+values of a frame of 128 pixels move by 1 (of 255), then, to first order, no output moves by more
+than 0.003.
 """
+SUMMED: Mapping[str, str] = {"l2sq": "squared gradients", "l1": "gradients"}
+INSTEAD = "take --target logits, or counterfactual recall (analyze counterfactual)"
+"""What a note on vanishing gradients advises."""
 
 # title, frames [T, *frame] of any kind, maps [T, H, W] up to step n
 Row = tuple[str, Any, NDArray[np.float32]]
@@ -60,10 +64,7 @@ def rows(options: SaliencyOptions, progress: Progress | None) -> Made:
         cells.append((title, len(shares), f"{100 * shares[-1]:.1f} %"))
         warning = no_gradient(episode, options.norm)
         if warning:
-            notes.append(
-                f"{title}: shares of the gradient say nothing: {warning}; take --target logits, "
-                "or analyze counterfactual"
-            )
+            notes.append(f"{title}: shares of the gradient say nothing: {warning}; {INSTEAD}")
         numbers += rows_of(row=index, run=title, step=np.arange(len(shares)), share=shares)
         arrays[f"title_{index}"] = np.array(title)
         arrays[f"frames_{index}"] = episode.frames
@@ -186,16 +187,24 @@ def _strip(episode: EpisodeSaliency) -> dict[str, Any]:
 
 
 def no_gradient(episode: EpisodeSaliency, norm: str = "l2sq") -> str:
-    """Why the shares of an episode say nothing, or an empty text if they do.
+    """Why the shares of an episode say nothing, or an empty text if they do; all else is as for
+    `vanishing`.
+    """
+    return vanishing(episode.target, episode.output.max(), episode.per_frame.sum(), norm)
+
+
+def vanishing(target: str, certainty: float, total: float, norm: str = "l2sq") -> str:
+    """Why shares of gradients say nothing, or an empty text if they do.
 
     Args:
-        episode: saliency of a decision.
-        norm: with which it was computed; sums of others than ``l2sq`` are not compared.
+        target: what was differentiated.
+        certainty: the largest output at the decision.
+        total: the sum over frames.
+        norm: with which it was computed; sums of others than those of `VANISHING` are not compared.
     """
     reasons = list[str]()
-    if episode.target == "probs" and episode.output.max() >= SATURATED:
-        reasons.append(f"the policy is saturated, its best action has {episode.output.max():.5f}")
-    total = episode.per_frame.sum()
-    if norm == "l2sq" and total < VANISHING:
-        reasons.append(f"all squared gradients sum to {total:.0e}")
+    if target == "probs" and certainty >= SATURATED:
+        reasons.append(f"the policy is saturated, its best action has {certainty:.5f}")
+    if norm in VANISHING and total < VANISHING[norm]:
+        reasons.append(f"all {SUMMED[norm]} sum to {total:.0e}")
     return ", and ".join(reasons)

@@ -1,0 +1,257 @@
+"""Steering: move a recurrent state along the direction of one fact, and see whether the decision
+follows.
+
+`patching` puts the whole state of another episode (the donor) in place of the own. Here the state
+moves only as far as the fact asks: by what states of that step differ on average between the own
+value of the fact and the donor's, the least squares of states on the fact. That is the direction in
+which states change with the reading of a linear probe, not the probe's weights, which also serve to
+cancel what else the states hold (Haufe et al. 2014, NeuroImage 87). It is fitted to other episodes,
+for each step anew: the states of many memories turn or fade from step to step. The control moves
+the state equally far in a random direction.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.tools.measures.beliefs.measure import Targets
+from arcade_torch.tools.measures.beliefs.patching import NOBODY, Patches, draw_donors
+from arcade_torch.tools.measures.beliefs.recording import (
+    Floats,
+    Ints,
+    Recording,
+    record,
+    shifted_state,
+)
+from arcade_torch.tools.measures.bootstrap import Array
+from arcade_torch.tools.measures.policy import Progress, policy_of
+from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
+
+Arm = Literal["state", "fact", "random"]
+ARMS: tuple[Arm, ...] = ("state", "fact", "random")
+MIN_FITTED = 16
+"""A direction is fitted to so many episodes at least, and to twice as many as the fact has numbers
+that can vary by themselves.
+"""
+
+
+@dataclass(frozen=True)
+class Steering:
+    """Decisions of E episodes at T steps on their own frames, with states that were moved for each
+    of F facts; NOBODY where there is no such step, no donor with another value of the fact, or no
+    direction.
+    """
+
+    names: NDArray[Any]  # str [F]; none for an agent without a recurrent state
+    action: Ints  # [E, T], with the own state
+    donor_action: Ints  # [E, T], the donor's decision at that step
+    exchanged: Ints  # [E, T], with the donor's whole state
+    moved: Ints  # [F, E, T], moved along the direction of the fact
+    random: Ints  # [F, E, T], moved equally far at random
+
+    def patches(self, fact: str, arm: Arm = "fact") -> Patches:
+        """Decisions after a move, where the donor has another value of the fact: who follows the
+        donor's decision is counted where that is another one.
+
+        Args:
+            fact: one of ``names``.
+            arm: ``fact``: moved along its direction; ``random``: equally far at random; ``state``:
+                the donor's whole state, at the same steps.
+
+        Raises:
+            ValueError: no such fact or arm.
+        """
+        names = self.names.tolist()
+        require(arm in ARMS, "arm", arm, f"one of {', '.join(ARMS)}")
+        require(fact in names, "fact", fact, f"one of {', '.join(names)}")
+        place = names.index(fact)
+        moved = self.moved[place]
+        decided = {"state": self.exchanged, "fact": moved, "random": self.random[place]}[arm]
+        donor_action = np.where(moved != NOBODY, self.donor_action, NOBODY)
+        return Patches(self.action, donor_action, decided)
+
+
+def steering(
+    agent: Any,
+    env: Any = None,
+    *,
+    episodes: int = 128,
+    max_steps: int = 128,
+    seed: int = 0,
+    observability: Twin | None = None,
+    progress: Progress | None = None,
+) -> Steering:
+    """Move the recurrent states of greedy episodes along the directions of all facts.
+
+    Args:
+        agent: as for `resolve_agent`; ``env`` and ``observability`` too. The env has ``facts()``,
+            and holds two episodes or more, which are one another's donors.
+        episodes: greedy episodes that are moved; as many others give the directions.
+        max_steps: steps of each that are looked at, from its beginning.
+        seed: of the episodes, which training never sees, of donors and of random directions.
+        progress: called with (episodes played, all of them).
+
+    Returns:
+        Actions.
+
+    Raises:
+        ValueError: an option is out of range, or the env names no facts or holds a single episode.
+    """
+    player, env = resolve_agent(agent, env, observability)
+    size = int(env.batch_size[0])
+    require(size >= 2, "the batch size of env", size, "at least 2, for donors")
+
+    def fitted(done: int, count: int) -> None:
+        if progress is not None:
+            progress(done, 2 * count)
+
+    recording = record(
+        player, env, episodes=episodes, max_steps=max_steps, seed=seed, progress=fitted
+    )
+    directions = Directions(recording)
+    parts = list[Ints]()
+    with policy_of(player).evaluating():
+        for group in range(-(-episodes // size)):
+            drawn = np.random.SeedSequence([seed, group, 5]).generate_state(1)
+            env.set_seed(held_out(int(drawn[0]) % SEED_LIMIT))
+            rng = np.random.default_rng([seed, group, 6])
+            part = _steer_batch(player, env, directions, max_steps, rng)
+            parts.append(part[:, : episodes - group * size])
+            if progress is not None:
+                progress(episodes + min(episodes, (group + 1) * size), 2 * episodes)
+    steps = max(part.shape[-1] for part in parts)
+    padded = list[Ints]()
+    for part in parts:
+        missing = ((0, 0), (0, 0), (0, steps - part.shape[-1]))
+        padded.append(np.pad(part, missing, constant_values=NOBODY))
+    action, donor_action, exchanged, *arms = np.concatenate(padded, axis=1)
+    of_facts = np.array(arms, np.int64).reshape(2, -1, *action.shape)
+    names = np.array(directions.names, dtype=str)
+    return Steering(names, action, donor_action, exchanged, of_facts[0], of_facts[1])
+
+
+class Directions:
+    """How the states of a recording differ, step by step, with each of its facts."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.states = recording.states
+        steps = recording.states.shape[1]
+        self.alive = np.arange(steps) < recording.lengths[:, None]
+        self.facts = dict[str, NDArray[Any]]()  # [E, T, C]
+        self.targets = dict[str, Targets]()
+        for name, values in recording.facts.items() if recording.states.shape[-1] else ():
+            flat = flat_fact(values, 2)
+            present = flat[self.alive & exists(flat)]
+            if len(present) and (present != present[0]).any():
+                self.facts[name] = flat
+                self.targets[name] = Targets.of(present, flat.dtype.kind in "bi")
+
+    @property
+    def names(self) -> list[str]:
+        """The facts that vary."""
+        return list(self.facts)
+
+    def slopes(self, name: str, step: int) -> Array | None:
+        """By how much the state [D] at a step changes with each target number [M] of a fact, float
+        [M, D]; None where too few episodes tell.
+        """
+        if step >= self.states.shape[1]:
+            return None
+        values = self.facts[name][:, step]
+        rows = self.alive[:, step] & exists(values)
+        if rows.sum() < MIN_FITTED:
+            return None
+        numbers = self.targets[name].numbers(values[rows])
+        numbers -= numbers.mean(axis=0)
+        if rows.sum() < 2 * np.linalg.matrix_rank(numbers):
+            return None
+        states = self.states[rows, step].astype(np.float64)
+        states -= states.mean(axis=0)
+        return np.asarray(np.linalg.pinv(numbers) @ states)
+
+    def moves(
+        self, name: str, step: int, values: NDArray[Any], donors: Ints
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """How far the states [N, D] of a step move for their facts [N, ...] to become those of the
+        donors, and for whom: where both have a value, and not the same.
+        """
+        flat = flat_fact(values, 1)
+        slopes = self.slopes(name, step)
+        moves = np.zeros((len(flat), self.states.shape[-1]), np.float32)
+        if slopes is None:
+            return moves, np.zeros(len(flat), bool)
+        there = exists(flat)
+        is_other = there & there[donors] & (flat != flat[donors]).any(axis=-1)
+        rows = np.flatnonzero(is_other)
+        targets = self.targets[name]
+        change = targets.numbers(flat[donors[rows]]) - targets.numbers(flat[rows])
+        moves[rows] = change @ slopes
+        return moves, is_other
+
+    def at_random(self, moves: Floats, step: int, rng: np.random.Generator) -> Floats:
+        """Moves [N, D] of the same lengths in random directions, of the numbers that vary."""
+        drawn = rng.normal(size=moves.shape)
+        states = self.states[self.alive[:, step], step]
+        drawn *= states.min(axis=0, initial=np.inf) < states.max(axis=0, initial=-np.inf)
+        lengths = np.linalg.norm(drawn, axis=1, keepdims=True)
+        wanted = np.linalg.norm(moves, axis=1, keepdims=True)
+        return np.asarray(drawn * wanted / np.where(lengths > 0, lengths, 1), np.float32)
+
+
+def flat_fact(values: NDArray[Any], batch_ndim: int) -> NDArray[Any]:
+    """The cells of a fact side by side, [..., C]."""
+    return values.reshape(*values.shape[:batch_ndim], -1)
+
+
+def exists(flat: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether all cells [..., C] have a value."""
+    missing = flat < 0 if flat.dtype.kind in "bi" else np.isnan(flat)
+    return ~missing.any(axis=-1)
+
+
+@torch.no_grad()
+def _steer_batch(
+    agent: Any, env: Any, directions: Directions, max_steps: int, rng: np.random.Generator
+) -> Ints:
+    """The first episode of every env of a batch, [3 + 2 F, N, T]: own, donor's and exchanged
+    decisions, then those moved for each fact, then those moved at random.
+    """
+    size = int(env.batch_size[0])
+    count = len(directions.names)
+    playing = torch.ones(size, dtype=torch.bool)
+    steps = list[Ints]()
+    before = dict[str, NDArray[Any]]()  # facts of the step before
+    obs = env.reset()
+    state = agent.initial_state(size)
+    while playing.any() and len(steps) < max_steps:
+        rows = playing.nonzero().flatten().numpy()
+        donors = draw_donors(rows, size, rng)
+        facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
+        actions = np.full((3 + 2 * count, size), NOBODY, np.int64)
+        if steps and len(rows) > 1 and count:
+            # before the decision itself: acting may change the state in place
+            given = state[torch.from_numpy(donors)].clone()
+            actions[2, rows] = agent.act(obs, given)[0].cpu().numpy()[rows]
+            for place, name in enumerate(directions.names):
+                last = len(steps) - 1
+                moves, is_other = directions.moves(name, last, before[name], donors)
+                is_other &= playing.numpy()
+                if is_other.any():
+                    chance = directions.at_random(moves, last, rng)
+                    for row, by in ((3 + place, moves), (3 + count + place, chance)):
+                        decided = agent.act(obs, shifted_state(state, by))[0].cpu().numpy()
+                        actions[row, is_other] = decided[is_other]
+        action, _, state = agent.act(obs, state)
+        decided = action.cpu().numpy()
+        actions[0, rows] = decided[rows]
+        if steps and len(rows) > 1:
+            actions[1, rows] = decided[donors][rows]
+        steps.append(actions)
+        before = facts
+        step, obs = env.step_and_maybe_reset(obs.set("action", action))
+        playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+    return np.stack(steps, axis=-1)
