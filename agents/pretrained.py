@@ -56,7 +56,7 @@ def from_pretrained(
     Example:
         >>> agent = from_pretrained("signpost-partial-lru")
         >>> agent.config.env, agent.config.memory
-        ('SignpostEasy', 'lru')
+        ('SignpostEasy-v0', 'lru')
     """
     if sha256 is not None:
         check_hash(sha256)

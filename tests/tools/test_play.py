@@ -506,7 +506,8 @@ def test_the_command_opens_a_window_and_goes_on_with_seeds_that_the_player_has_n
 ) -> None:
     met = []
 
-    def play(player: Session, scale: int, key_repeat_ms: int) -> None:
+    def play(player: Session, scale: int, key_repeat_ms: int, watched: object) -> None:
+        assert watched is None
         met.append((player.seed, scale, key_repeat_ms, player.game.obs_size))
         press(player, "0q")
 

@@ -1,6 +1,5 @@
 """``arcade-torch play`` and ``arcade-torch record``."""
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,14 +75,11 @@ class Play(GameCommand):
         at_least(self, key_repeat=0, fps=0.1)
         at_most(self, fps=screens.FPS)
         self.check_scale()
-        watched = None
-        if self.agent:
-            agent = self.take_agent()
-            watched = screens.Watched(recording.trained(agent, None), self.fps)
         fits = self.scores is None or self.scores.suffix == ".csv"
         require(fits, "--scores", str(self.scores), "a file that ends in .csv")
-        options = self.game_options()
-        compiled = compiled_game(self.game, self.obs_size, self.rules, options)
+        scene = self.scene()
+        options = scene.options
+        compiled = compiled_game(self.game, scene.obs_size, scene.rules, options)
         game: Any = compiled.batched.game
         said: list[str] = []
         rows = scores.read_scores_file(self.scores) if self.scores is not None else []
@@ -100,10 +96,13 @@ class Play(GameCommand):
             compiled,
             seed=seed,
             episodes=self.episodes,
-            partial=self.partial,
+            partial=scene.partial,
             both=self.both,
             on_attempt=keep,
         )
+        watched = None
+        if scene.agent is not None:
+            watched = screens.Watched(recording.trained(scene.agent, None), self.fps)
         if self.plays_in_terminal():
             screens.play_in_terminal(session, watched)
         else:
@@ -113,16 +112,15 @@ class Play(GameCommand):
             say(line)
         return 0
 
-    def take_agent(self) -> Any:
-        """The agent that plays; what it was trained on decides frames, rules and options."""
+    def scene(self) -> "Scene":
+        """What is played: as the options say, or as the agent that plays was trained."""
+        if not self.agent:
+            return Scene(self.obs_size, self.rules, self.partial, self.game_options())
         if self.scores is not None:
             raise ValueError("--scores is for people: leave it out with --agent")
         scene = scene_of_agent(self.game, agent_folder(self.agent), self.game_options())
-        self.obs_size = scene.obs_size
-        self.rules = scene.rules
-        self.partial = self.partial or scene.partial
-        self.env_option = tuple(f"{name}={json.dumps(v)}" for name, v in scene.options.items())
-        return scene.agent
+        scene.partial = self.partial or scene.partial
+        return scene
 
     def plays_in_terminal(self) -> bool:
         """Whether to play in the terminal, because it was asked for or because there is no window;

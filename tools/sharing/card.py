@@ -56,7 +56,10 @@ which is POPGym Arcade for PyTorch.
 ```python
 from arcade_torch.agents import evaluate, from_pretrained
 
-agent = from_pretrained({repo!r}, sha256={results["sha256"]["model.safetensors"]!r})
+agent = from_pretrained(
+    {_scalar(repo)},
+    sha256={_scalar(results["sha256"]["model.safetensors"])},
+)
 print(evaluate(agent).text)
 ```
 

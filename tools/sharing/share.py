@@ -153,7 +153,7 @@ def _film(checkpoint: Any, folder: Path) -> str:
         fps = recording.FILM_FPS
         frames = recording.recorded_frames(session, player, max_steps=MOST_STEPS, hold=fps, scale=2)
         with tempfile.TemporaryDirectory() as scratch:
-            made = write(Path(scratch) / name, frames, fps)
-            write_atomic(folder / name, made.read_bytes())
+            film = write(Path(scratch) / name, frames, fps)
+            write_atomic(folder / name, film.read_bytes())
         return name
     return ""

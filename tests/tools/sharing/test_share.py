@@ -53,7 +53,9 @@ def test_the_model_card_is_yaml_that_boards_read(pushed: Path) -> None:
     assert entry["metrics"][0]["type"] == "mean_reward"
     assert entry["metrics"][0]["value"].startswith(f"{results['mean_reward']:.3f} +/- ")
     assert "reinforcement-learning" in about["tags"] and about["library_name"] == "arcade-torch"
-    assert "from_pretrained('shared', sha256=" in page and str(pushed.parent) not in text
+    assert (
+        'from_pretrained(\n    "shared",\n    sha256="' in page and str(pushed.parent) not in text
+    )
     (row,) = yaml.safe_load((pushed / ".eval_results" / "arcade-torch.yaml").read_text())
     assert row["value"] == pytest.approx(results["mean_reward"], abs=1e-4)
     assert row["dataset"]["id"] == "popgym-arcade" and row["date"]
@@ -105,7 +107,7 @@ def test_an_agent_of_the_package_is_named_like_a_run(
     monkeypatch.chdir(tmp_path)
     name = "signpost-partial-lru"
     assert cli.main(["evaluate", name, "--episodes", "16"]) == 0
-    assert "ppo-lru on SignpostEasy-v0 (partial)" in capsys.readouterr().out
+    assert "pqn-lru on SignpostEasy-v0 (partial)" in capsys.readouterr().out
     words = ["recall-density", name, "signpost-partial-mlp", "--episodes", "8"]
     assert cli.main(["analyze", *words]) == 0
     assert list((tmp_path / "analysis").glob("*.png"))
