@@ -139,10 +139,10 @@ class Demo(Resumable):
     """Small study of what memory does: two games as MDP and POMDP, with a memory and without, three
     seeds each.
 
-    Ends in one HTML page with learning curves, observability gap, memory bias, saliency and
-    counterfactual recall. Less than ten minutes on two cores; type the same again to go on after an
-    interruption. One game is a probe, solved with memory and only with it; the other is one of the
-    ten, where a minute of training only begins to show it.
+    Ends in one HTML page with learning curves, observability gap, memory bias, saliency,
+    counterfactual recall and beliefs. Less than ten minutes on two cores; type the same again to go
+    on after an interruption. One game is a probe, solved with memory and only with it; the other is
+    one of the ten, where a minute of training only begins to show it.
 
     Example: arcade-torch demo --games BattleShipEasy --frames 700000 --seeds 2 --out runs/ships
     """

@@ -311,18 +311,17 @@ def _rows(
 def beliefs_section(
     cells: Cells, agents: Sequence[str], progress: Progress | None
 ) -> dict[str, Any]:
-    """Probes of every cell that is a POMDP whose game names facts, a picture a task; numbers are
-    kept in the run folders.
+    """Probes of the first seed of every cell that is a POMDP whose game names facts, a picture a
+    task; numbers are kept in the run folders. Each further seed would take as long again.
     """
     colours = style.agent_colours(agents)
-    hiding = {cell: paths for cell, paths in cells.items() if cell[2] == "partial"}
+    hiding = {cell: paths[:1] for cell, paths in cells.items() if cell[2] == "partial"}
 
     def summary(
         measured: Sequence[tuple[Label, measure.Beliefs]],
     ) -> tuple[OfAgent, dict[str, Any]]:
-        seeds = [probes for _, probes in measured]
-        scores = scores_of(seeds)
-        return scores, {"seeds": len(seeds), "facts": _section_rows(scores)}
+        scores = scores_of([probes for _, probes in measured])
+        return scores, {"facts": _section_rows(scores)}
 
     def draw(by_agent: Mapping[str, OfAgent], axis: Any) -> None:
         plot_bars(by_agent, axis, colours)
@@ -358,8 +357,8 @@ def _sentences(rows: Sequence[Mapping[str, Any]]) -> list[str]:
             frame = of_fact["frame"]
             if state is not None and state.low > max(frame.high, 0.0):
                 text = (
-                    f"{row['game']} {row['twin']}: {row['agent']}'s state holds {of_fact['fact']}: "
-                    f"a linear probe reads it with a score of {state.value:.2f}, off the frame "
+                    f"{row['game']} {row['twin']}: a linear probe reads {of_fact['fact']} off "
+                    f"{row['agent']}'s state with a score of {state.value:.2f}, off the frame "
                     f"alone with {frame.value:.2f}."
                 )
                 sentences.append((frame.value - state.value, text))

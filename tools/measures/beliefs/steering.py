@@ -210,7 +210,7 @@ def flat_fact(values: NDArray[Any], batch_ndim: int) -> NDArray[Any]:
 def exists(flat: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether all cells [..., C] have a value."""
     missing = flat < 0 if flat.dtype.kind in "bi" else np.isnan(flat)
-    return ~missing.any(axis=-1)
+    return np.asarray(~missing.any(axis=-1), np.bool_)
 
 
 @torch.no_grad()
