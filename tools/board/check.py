@@ -49,6 +49,11 @@ class CheckRecord(Checked):
     weights: Literal["kept", "retrained"]  # where the checkpoints came from
     made_with: Options
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require(self.runs <= self.of, "runs", f"at most the {self.of} of the entry")
+        self._require(self.equal <= self.runs, "equal", f"at most the {self.runs} evaluated")
+
 
 def check(
     file: Path,

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 from arcade_torch.agents.config import (
     GROUPS,
@@ -21,6 +21,7 @@ from arcade_torch.agents.config import (
     Range,
     Seed,
     TrainConfig,
+    coerce,
     flatten,
     require,
 )
@@ -96,10 +97,8 @@ class BoardRun(Checked):
 
 
 @dataclass(frozen=True)
-class Entry(Checked):
+class Entry:
     """What a file in ``results/leaderboard`` holds."""
-
-    GROUP: ClassVar[str] = ""
 
     protocol: int
     name: Name
@@ -119,6 +118,11 @@ class Entry(Checked):
     made_with: Options  # versions, commit, platform and processor of the evaluation
     settings: Options  # of the training, dotted names, those that all runs share
     runs: tuple[BoardRun, ...]
+
+    def __post_init__(self) -> None:
+        kinds = get_type_hints(type(self), include_extras=True)
+        for name in set(kinds) - {"runs"}:  # each of which has checked itself
+            object.__setattr__(self, name, coerce(name, getattr(self, name), kinds[name]))
 
     def config(self, run: BoardRun) -> TrainConfig:
         """The settings that trained a run; an `EntryRefusedError` if they are none, or another
@@ -260,11 +264,10 @@ def check_protocol(entry: Entry, protocol: Protocol = PROTOCOL) -> None:
             that names it.
     """
     _check_equal("protocol", entry.protocol, protocol.version)
-    wanted = {"episodes": protocol.episodes, "seed": protocol.seed}
-    for name, value in wanted.items():
-        _check_equal(f"evaluation.{name}", entry.evaluation.get(name), value)
-    for name, value in (("rules", protocol.rules), ("obs_size", protocol.obs_size)):
-        _check_equal(f"environments.{name}", entry.environments.get(name), value)
+    _check_equal("evaluation.episodes", entry.evaluation.get("episodes"), protocol.episodes)
+    _check_equal("evaluation.seed", entry.evaluation.get("seed"), protocol.seed)
+    _check_equal("environments.rules", entry.environments.get("rules"), protocol.rules)
+    _check_equal("environments.obs_size", entry.environments.get("obs_size"), protocol.obs_size)
     for phase in ("training", "acting"):
         check_observations(phase, entry.observations.get(phase))
     _check_grid(entry.runs)

@@ -107,7 +107,7 @@ def submit(
         parameters=_one_value(played, "parameters"),
         state_bytes=_one_value(played, "state_bytes"),
         checkpoints=dict(words.checkpoints),
-        observations={"training": list(played[0].observations), "acting": _acting(played)},
+        observations={"training": _acting(played), "acting": _acting(played)},
         evaluation={"episodes": protocol.episodes, "seed": protocol.seed},
         environments={"rules": configs[0].rules, "obs_size": configs[0].obs_size},
         made_with=made_with(),

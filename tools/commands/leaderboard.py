@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-
 import tyro
 
 from arcade_torch.tools.options import Command, at_least
