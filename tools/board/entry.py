@@ -188,7 +188,7 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def entry_of(values: Mapping[str, Any]) -> Entry:
     """An entry from plain values; a ``ValueError`` names what does not fit."""
-    fields = dict(_known(values, Entry, "an entry"))
+    fields = dict(_complete_fields(values, Entry, "an entry"))
     runs = fields["runs"]
     allowed = f"a list of 1 to {MOST_RUNS} runs"
     require(isinstance(runs, list), "runs", type(runs).__name__, allowed)
@@ -196,7 +196,7 @@ def entry_of(values: Mapping[str, Any]) -> Entry:
     rows = []
     for place, row in enumerate(runs):
         try:
-            run = BoardRun(**_known(row, BoardRun, "a run"))
+            run = BoardRun(**_complete_fields(row, BoardRun, "a run"))
             _check_settings(run.settings)
         except (ValueError, TypeError) as error:
             raise ValueError(f"runs[{place}]: {error}") from error
@@ -209,7 +209,7 @@ def entry_of(values: Mapping[str, Any]) -> Entry:
     return dataclasses.replace(entry, runs=tuple(rows))
 
 
-def _known(values: Any, kind: Any, subject: str) -> Mapping[str, Any]:
+def _complete_fields(values: Any, kind: Any, subject: str) -> Mapping[str, Any]:
     """The values of a dataclass, none missing and none that it does not know."""
     require(isinstance(values, Mapping), subject, type(values).__name__, "a table of names")
     names = [item.name for item in dataclasses.fields(kind)]
@@ -232,7 +232,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         require(plain and short and finite, f"the setting {name[:60]!r}", repr(value)[:80], "short")
 
 
-def check_checkpoints(how: Mapping[str, Any]) -> None:
+def check_checkpoints(place: Mapping[str, Any]) -> None:
     """Refuse what does not say where the checkpoints are.
 
     Allowed are ``{"kind": "hub", "repo": "OWNER/NAME", "revision": COMMIT}``, ``{"kind": "url",
@@ -244,13 +244,13 @@ def check_checkpoints(how: Mapping[str, Any]) -> None:
         "url": {"url": _URL},
         "retrain": dict[str, re.Pattern[str]](),
     }
-    kind = how.get("kind")
+    kind = place.get("kind")
     require(kind in list(patterns), "checkpoints.kind", kind, f"one of {', '.join(patterns)}")
     wanted = patterns[str(kind)]
     names = ", ".join(["kind", *wanted])
-    require(set(how) == {"kind", *wanted}, f"checkpoints of kind {kind}", sorted(how), names)
+    require(set(place) == {"kind", *wanted}, f"checkpoints of kind {kind}", sorted(place), names)
     for name, pattern in wanted.items():
-        value = how[name]
+        value = place[name]
         fits = isinstance(value, str) and pattern.fullmatch(value) is not None
         require(fits, f"checkpoints.{name}", repr(value)[:100], f"of the form {pattern.pattern}")
 

@@ -1,7 +1,8 @@
 """The tables of ``docs/leaderboard.md``, from the entries and nothing else."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import mean
 
 from arcade_torch.tools.board.check import CheckRecord, read_record
 from arcade_torch.tools.board.entry import EntryRefusedError, check_protocol, read_entry
@@ -9,11 +10,9 @@ from arcade_torch.tools.board.protocol import (
     CLASSES,
     OPEN_CLASS,
     PROTOCOL,
-    QUICK,
     TWINS,
     Protocol,
     Suite,
-    frames_class,
     suites,
 )
 from arcade_torch.tools.board.ranking import (
@@ -36,6 +35,8 @@ PLAYERS = {
     "frames": "scripted, remembers the frames",
 }
 MEMORIES = {"lru": "PPO with LRU", "mlp": "PPO without memory"}
+Players = Mapping[str, Cells]
+"""Player -> returns."""
 _COLUMNS = ("rank", "entry", "memory", "POMDP", "MDP", "games", "seeds", "parameters")
 _MORE = ("state, bytes", "frames", "seconds a run", "environments", "checked")
 
@@ -78,7 +79,7 @@ def board(results: Path, protocol: Protocol = PROTOCOL) -> str:
     parts = [_summary(entries)]
     for suite in suites():
         parts += _suite(entries, suite, baselines)
-    parts += _returns(entries, baselines)
+    parts += _game_by_game(entries, baselines)
     parts += _reported(results)
     return "\n\n".join(parts)
 
@@ -94,7 +95,7 @@ def _summary(entries: Sequence[Listed]) -> str:
     records = [listed.record for listed in entries if listed.record is not None]
     again = sum(record.runs for record in records)
     return (
-        f"{len(entries)} entries of {runs} runs; {len(records)} entries were checked, {again} runs "
+        f"Entries: {len(entries)}, with {runs} runs. Checked: {len(records)} entries, {again} runs "
         "evaluated again."
     )
 
@@ -102,7 +103,7 @@ def _summary(entries: Sequence[Listed]) -> str:
 def _suite(
     entries: Sequence[Listed],
     suite: Suite,
-    baselines: dict[str, dict[tuple[str, str], list[float]]],
+    baselines: Players,
 ) -> list[str]:
     """One suite: a table for each class of frames that has entries."""
     games = ", ".join(game_of(game) for game in suite.games)
@@ -180,37 +181,45 @@ def _player_line(name: str, cells: Cells, suite: Suite) -> list[str]:
     return ["", name, "", *means, f"{len(suite.games)} of {len(suite.games)}", *rest]
 
 
-def _returns(
-    entries: Sequence[Listed], baselines: dict[str, dict[tuple[str, str], list[float]]]
-) -> list[str]:
-    """Mean returns of every entry, game by game, not normalised."""
+def _game_by_game(entries: Sequence[Listed], baselines: Players) -> list[str]:
+    """A small table for each game and class: mean greedy returns, not normalised, best POMDP
+    first.
+    """
     easy = suites()[0].games
-    games = [*easy, *(game for game in QUICK if game not in easy)]
-    games = [game for game in games if any((game, "full") in row.cells for row in entries)]
-    if not games:
-        return []
-    columns = ["entry", "class"]
-    for game in games:
-        columns += [f"{game_of(game)} {twin}" for twin in ("POMDP", "MDP")]
-    lines = list[list[str]]()
-    for row in sorted(entries, key=lambda row: (row.entry.frames, row.entry.name)):
-        lines.append([row.entry.name, frames_class(row.entry.frames), *_means(row.cells, games)])
-    for player, name in PLAYERS.items():
-        lines.append([name, "", *_means(baselines.get(player, {}), games)])
-    return [
-        "## Returns of the entries",
-        "Mean greedy returns over the seeds, not normalised.",
-        markdown_table(columns, lines, left=2),
-    ]
+    others = sorted({game for row in entries for game, _ in row.cells} - set(easy))
+    parts = ["## Game by game", "Mean greedy returns over the seeds, not normalised."]
+    for game in [*easy, *others]:
+        suite = Suite(game_of(game), (game,), "")
+        for frames in (*CLASSES, OPEN_CLASS):
+            rows = ranking(entries, suite, frames)
+            if not rows:
+                continue
+            lines = list[list[str]]()
+            best_first = sorted(rows, key=lambda row: (-_mean(row, game), row.listed.entry.name))
+            for rank, row in enumerate(best_first, 1):
+                means = _means(row.listed.cells, game)
+                lines.append([str(rank), row.listed.entry.name, *means, str(row.listed.seeds)])
+            for player, name in PLAYERS.items():
+                means = _means(baselines.get(player, {}), game)
+                if set(means) != {"-"}:
+                    lines.append(["", name, *means, ""])
+            parts.append(f"### {game}, class {frames}")
+            columns = ("rank", "entry", "POMDP", "MDP", "seeds")
+            parts.append(markdown_table(columns, lines, left=2))
+    return parts
 
 
-def _means(cells: Cells, games: Sequence[str]) -> list[str]:
-    """The mean return of each cell; a dash where there is none."""
+def _mean(row: Ranked, game: str) -> float:
+    """The mean return on a POMDP."""
+    return mean(row.listed.cells[game, "partial"])
+
+
+def _means(cells: Cells, game: str) -> list[str]:
+    """The mean return on the POMDP and on the MDP; a dash where there is none."""
     texts = []
-    for game in games:
-        for twin in reversed(TWINS):
-            values = cells.get((game, twin))
-            texts.append(f"{sum(values) / len(values):.3f}" if values else "-")
+    for twin in reversed(TWINS):
+        values = cells.get((game, twin))
+        texts.append(f"{mean(values):.3f}" if values else "-")
     return texts
 
 
@@ -242,7 +251,7 @@ def _value(row: Reported, suite: Suite, twin: str) -> float:
         return -1.0
     means = {}
     for cell, values in row.cells.items():
-        means[cell] = [sum(values) / len(values)]
+        means[cell] = [mean(values)]
     return suite_iqm(means, suite, twin).value
 
 

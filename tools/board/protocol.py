@@ -75,5 +75,7 @@ def suites() -> tuple[Suite, ...]:
         Suite("quick", QUICK, "The three quick games"),
     ]
     for kind, games in kinds.items():
-        groups.append(Suite(kind, tuple(games), f"{kind.capitalize()}: {MEMORY_KINDS[kind]}"))
+        title = "No memory" if kind == "none" else kind.capitalize()
+        meaning = MEMORY_KINDS[kind].removeprefix("nothing: ")
+        groups.append(Suite(kind, tuple(games), f"{title}: {meaning}"))
     return tuple(groups)

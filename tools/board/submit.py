@@ -68,54 +68,72 @@ def submit(
     runs = chosen_runs(find_runs(paths), memory, seeds)
     configs = [TrainConfig.from_dict(run.config) for run in runs]
     _check_group(runs, configs)
-    evaluator = Evaluator(protocol)
     shared, rest = settings_of(configs)
     rows = list[BoardRun]()
     played = list[Played]()
+    evaluator = Evaluator(protocol)
     order = sorted(range(len(runs)), key=lambda place: _cell_of(configs[place]))
     for done, place in enumerate(order, 1):
-        config = configs[place]
-        checkpoint = last_checkpoint(runs[place])
-        weights = weights_hash(checkpoint)
-        result = evaluator.play(checkpoint, config.observability)
+        row, result = _evaluated(runs[place], configs[place], rest[place], evaluator)
+        rows.append(row)
         played.append(result)
-        rows.append(
-            BoardRun(
-                game=config.env,
-                twin=config.observability,  # type: ignore[arg-type]  # no mixed one passed
-                seed=config.seed,
-                score=result.score,
-                std=result.std,
-                returns_sha256=result.returns_sha256,
-                weights_sha256=weights,
-                seconds=float((runs[place].final or {}).get("seconds", 0.0)),
-                settings=rest[place],
-            )
-        )
         if progress is not None:
-            progress(rows[-1].name, done, len(runs))
-    entry = Entry(
+            progress(row.name, done, len(runs))
+    entry = _entry(words, configs[0], shared, rows, played, protocol)
+    check_protocol(entry, protocol)
+    return entry
+
+
+def _evaluated(
+    run: Run, config: TrainConfig, settings: Mapping[str, Any], evaluator: Evaluator
+) -> tuple[BoardRun, Played]:
+    """One run by the protocol."""
+    checkpoint = last_checkpoint(run)
+    weights = weights_hash(checkpoint)
+    result = evaluator.play(checkpoint, config.observability)
+    row = BoardRun(
+        game=config.env,
+        twin=config.observability,  # type: ignore[arg-type]  # no mixed one passed
+        seed=config.seed,
+        score=result.score,
+        std=result.std,
+        returns_sha256=result.returns_sha256,
+        weights_sha256=weights,
+        seconds=float((run.final or {}).get("seconds", 0.0)),
+        settings=settings,
+    )
+    return row, result
+
+
+def _entry(
+    words: Words,
+    config: TrainConfig,
+    settings: Mapping[str, Any],
+    rows: Sequence[BoardRun],
+    played: Sequence[Played],
+    protocol: Protocol,
+) -> Entry:
+    """The entry of runs that were evaluated; ``config`` is that of any of them."""
+    return Entry(
         protocol=protocol.version,
         name=words.name,
-        memory=configs[0].memory,
-        algorithm=configs[0].algorithm,
+        memory=config.memory,
+        algorithm=config.algorithm,
         url=words.url,
         commit=words.commit,
         note=words.note,
         date=datetime.date.today().isoformat(),
-        frames=_frames(configs[0]),
+        frames=_frames(config),
         parameters=_one_value(played, "parameters"),
         state_bytes=_one_value(played, "state_bytes"),
         checkpoints=dict(words.checkpoints),
         observations={"training": _acting(played), "acting": _acting(played)},
         evaluation={"episodes": protocol.episodes, "seed": protocol.seed},
-        environments={"rules": configs[0].rules, "obs_size": configs[0].obs_size},
+        environments={"rules": config.rules, "obs_size": config.obs_size},
         made_with=made_with(),
-        settings=shared,
+        settings=settings,
         runs=tuple(rows),
     )
-    check_protocol(entry, protocol)
-    return entry
 
 
 def chosen_runs(runs: Runs, memory: str, seeds: Sequence[int]) -> list[Run]:
