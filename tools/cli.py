@@ -68,6 +68,15 @@ COMMANDS: dict[str, tuple[str, str]] = {
         if entry.analysis
     },
     **{f"figure {name}": ("figure.Figure", entry.summary) for name, entry in FIGURES.items()},
+    "leaderboard submit": (
+        "leaderboard.Submit",
+        "evaluate the runs of one agent by the protocol, and write its entry",
+    ),
+    "leaderboard check": (
+        "leaderboard.Check",
+        "evaluate an entry again, and refuse what does not agree",
+    ),
+    "leaderboard page": ("leaderboard.Page", "write the tables of docs/leaderboard.md"),
     "play": ("play.Play", "play a game by hand, in a window or in the terminal"),
     "record": ("play.Record", "a GIF or MP4 of a random, scripted or trained player"),
     "push": ("share.Push", "put a trained agent on the Hugging Face hub, or into a folder"),

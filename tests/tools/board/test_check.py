@@ -1,0 +1,298 @@
+"""An entry is what its checkpoints give; a falsified one is refused in one line that says where."""
+
+import copy
+import json
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arcade_torch.tools.board import check as checks
+from arcade_torch.tools.board import submit as submits
+from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
+from arcade_torch.tools.board.entry import EntryRefusedError
+from arcade_torch.tools.board.evaluation import Evaluator, Played
+from arcade_torch.tools.board.submit import submit
+from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
+
+Plain = dict[str, Any]
+NOTHING = Played(0.0, 0.0, 0.0, "0" * 64, 1, 1, ("pixels",))
+"""What an agent that is not played scored."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_once() -> Iterator[None]:
+    """All evaluators of this file share their environments."""
+    envs: dict[Any, Any] = {}
+    make = Evaluator._env
+
+    def shared(self: Evaluator, config: Any) -> Any:
+        if config.env not in envs:
+            envs[config.env] = make(self, config)
+        return envs[config.env]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Evaluator, "_env", shared)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    write_pair(folder, seed=1)
+    write_pair(folder, seed=2)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def honest(runs: Path) -> Plain:
+    return plain_entry(runs)
+
+
+def write(folder: Path, plain: Plain) -> Path:
+    file = folder / "entry.json"
+    file.write_text(json.dumps(plain))
+    return file
+
+
+def refusal(file: Path, runs: Path, **options: Any) -> str:
+    with pytest.raises(EntryRefusedError) as caught:
+        check(file, runs, protocol=SHORT, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_an_honest_entry_agrees_to_the_bit(runs: Path, honest: Plain, tmp_path: Path) -> None:
+    record = check(write(tmp_path, honest), runs, protocol=SHORT)
+    assert (record.runs, record.of, record.equal) == (4, 4, 4)
+    assert record.largest_difference == 0.0
+    assert record.weights == "kept"
+
+
+def test_an_entry_says_all_that_the_protocol_asks_for(honest: Plain) -> None:
+    cells = {(run["game"], run["twin"], run["seed"]) for run in honest["runs"]}
+    assert cells == {(GAME, twin, seed) for twin in ("full", "partial") for seed in (1, 2)}
+    assert honest["evaluation"] == {"episodes": 4, "seed": SHORT.seed}
+    assert honest["parameters"] > 0 and honest["state_bytes"] > 0 and honest["frames"] == 512
+    assert {"torch", "jax", "commit", "processor"} <= set(honest["made_with"])
+    assert honest["observations"]["acting"] == ["is_init", "last_action", "pixels"]
+
+
+def set_score(plain: Plain) -> None:
+    plain["runs"][1]["score"] += 0.5
+
+
+def set_score_and_its_hash(plain: Plain) -> None:
+    plain["runs"][1] |= {"score": 0.9, "std": 0.1, "returns_sha256": "0" * 64}
+
+
+def set_evaluation_seed(plain: Plain) -> None:
+    plain["evaluation"]["seed"] = 7
+
+
+def set_episodes(plain: Plain) -> None:
+    plain["evaluation"]["episodes"] = 2
+
+
+def set_training_seed(plain: Plain) -> None:
+    for run in plain["runs"]:
+        run["settings"]["seed"] = run["seed"] = run["seed"] + 5
+
+
+def set_seed_of_the_cell_alone(plain: Plain) -> None:
+    for run in plain["runs"]:
+        run["seed"] += 5
+
+
+def set_checkpoint(plain: Plain) -> None:
+    plain["runs"][3]["weights_sha256"] = "0" * 64
+
+
+def remove_cell(plain: Plain) -> None:
+    del plain["runs"][1]
+
+
+def repeat_cell(plain: Plain) -> None:
+    plain["runs"].append(plain["runs"][0])
+
+
+def set_protocol(plain: Plain) -> None:
+    plain["protocol"] = 2
+
+
+def show_the_state(plain: Plain) -> None:
+    plain["observations"]["training"].append("state")
+
+
+def hide_the_observations(plain: Plain) -> None:
+    plain["observations"] = {"acting": ["pixels"]}
+
+
+def set_rules(plain: Plain) -> None:
+    plain["environments"]["rules"] = "reference"
+
+
+def set_options(plain: Plain) -> None:
+    plain["settings"]["env_options.mine_reward"] = 0.0
+
+
+def train_the_pomdp_on_the_mdp(plain: Plain) -> None:
+    for run in plain["runs"]:
+        run["settings"]["observability"] = "full"
+
+
+def set_gamma(plain: Plain) -> None:
+    plain["settings"]["pqn.gamma"] = 0.5
+
+
+def set_parameters(plain: Plain) -> None:
+    plain["parameters"] = 12
+
+
+def set_state(plain: Plain) -> None:
+    plain["state_bytes"] = 4
+
+
+FALSIFIED: dict[Callable[[Plain], None], str] = {
+    set_score: f"score of {GAME} partial, seed 1: evaluated again it is",
+    set_score_and_its_hash: f"score of {GAME} partial, seed 1: evaluated again it is",
+    set_evaluation_seed: "evaluation.seed is 7; the protocol of this version demands 1000000",
+    set_episodes: "evaluation.episodes is 2",
+    set_training_seed: f"no run of mingru on {GAME} full, seed 6 lies below",
+    set_seed_of_the_cell_alone: f"settings of {GAME} full, seed 6: seed is 1, the entry says 6",
+    set_checkpoint: f"checkpoint of {GAME} partial, seed 2: the weights below",
+    remove_cell: f"missing cell: {GAME} partial, seed 1",
+    repeat_cell: f"two runs of one cell: {GAME} full, seed 1",
+    set_protocol: "protocol is 2; the protocol of this version demands 1",
+    show_the_state: "privileged observation in training: 'state'",
+    hide_the_observations: "observations.training does not say what the agent reads",
+    set_rules: "environments.rules is reference",
+    set_options: "env_options make another task",
+    train_the_pomdp_on_the_mdp: "observability is 'full', the entry says 'partial'",
+    set_gamma: "differs in pqn.gamma (0.99 != 0.5)",
+    set_parameters: f"parameters of {GAME} full, seed 1",
+    set_state: f"state_bytes of {GAME} full, seed 1",
+}
+
+
+@pytest.mark.parametrize("falsify", FALSIFIED, ids=lambda change: change.__name__)
+def test_a_falsified_entry_is_refused_in_a_line_that_says_where(
+    falsify: Callable[[Plain], None], runs: Path, honest: Plain, tmp_path: Path
+) -> None:
+    plain = copy.deepcopy(honest)
+    falsify(plain)
+    assert FALSIFIED[falsify] in refusal(write(tmp_path, plain), runs)
+
+
+def test_other_weights_are_refused_before_they_are_loaded(
+    honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path / "runs", seed=1)
+    write_pair(tmp_path / "runs", seed=2)
+    weights = sorted((tmp_path / "runs").rglob("weights.safetensors"))[0]
+    weights.write_bytes(weights.read_bytes()[:-4] + b"\0\0\0\1")
+
+    def load(*arguments: object) -> None:
+        raise AssertionError("weights of another hash were loaded")
+
+    monkeypatch.setattr(checks.Evaluator, "play", load)
+    message = refusal(write(tmp_path, honest), tmp_path / "runs")
+    assert f"checkpoint of {GAME} full, seed 1: the weights below" in message
+
+
+def test_on_the_same_machine_and_versions_a_score_has_to_be_equal_to_the_bit(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A difference that is allowed elsewhere is refused there."""
+    plain = copy.deepcopy(honest)
+    plain["runs"][0] |= {"score": plain["runs"][0]["score"] + 1e-9, "returns_sha256": "0" * 64}
+    here = {"commit": "abc", "processor": "one"}
+    monkeypatch.setattr(checks, "made_with", lambda: here)
+    plain["made_with"] = here | {"processor": "two"}
+    record = check(write(tmp_path, plain), runs, protocol=SHORT)
+    assert record.equal == 3 and 0 < record.largest_difference < 1e-8
+    plain["made_with"] = here
+    assert "equal to the bit: same commit" in refusal(write(tmp_path, plain), runs)
+    for unknown in ({"commit": "abc+changes"}, {"commit": ""}, {"processor": ""}):
+        monkeypatch.setattr(checks, "made_with", lambda unknown=unknown: here | unknown)
+        plain["made_with"] = here | unknown
+        assert check(write(tmp_path, plain), runs, protocol=SHORT).equal == 3
+
+
+def test_a_part_is_drawn_and_only_that_is_looked_for(
+    runs: Path, honest: Plain, tmp_path: Path
+) -> None:
+    """The folders of the others need not be there."""
+    file = write(tmp_path, honest)
+    places = [checks._drawn(range(40), 3, random.Random(seed)) for seed in range(5)]
+    assert all(len(set(drawn)) == 3 for drawn in places)
+    assert len({tuple(drawn) for drawn in places}) == 5
+    assert checks._drawn(range(4), 0, random.Random(0)) == [0, 1, 2, 3]
+    folder = runs / f"{GAME}-partial-mingru-2"
+    generators = [random.Random(seed) for seed in range(40)]
+    drawing_last = [
+        seed for seed in range(40) if checks._drawn(range(4), 1, generators[seed]) == [3]
+    ]
+    record = check(file, folder, 1, SHORT, generator=random.Random(drawing_last[0]))
+    assert (record.runs, record.of) == (1, 4)
+
+
+def test_a_record_is_of_one_very_file(runs: Path, honest: Plain, tmp_path: Path) -> None:
+    file = write(tmp_path, honest)
+    record = check(file, runs, 1, SHORT)
+    write_record(file, record)
+    assert read_record(file) == record
+    plain = copy.deepcopy(honest)
+    plain["note"] = "changed since"
+    assert read_record(write(tmp_path, plain)) is None
+    (tmp_path / "checks" / "entry.json").write_text('{"runs": -1}')
+    with pytest.raises(EntryRefusedError, match="is no record of a check"):
+        read_record(file)
+
+
+def test_a_record_cannot_claim_more_than_it_checked() -> None:
+    values: Plain = {
+        "entry_sha256": "0" * 64,
+        "date": "2026-11-27",
+        "runs": 5,
+        "of": 4,
+        "equal": 4,
+        "largest_difference": 0.0,
+        "weights": "kept",
+        "made_with": {},
+    }
+    with pytest.raises(ValueError, match=r"check\.runs must be"):
+        CheckRecord(**values)
+    with pytest.raises(ValueError, match=r"check\.equal must be"):
+        CheckRecord(**values | {"runs": 3})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observability": "mixed"}, "privileged observation"),
+        ({"memory": "gru"}, "the runs are 2 agents"),
+        ({"env": "CountRecallEasy-v0", "total_frames": 1024}, "runs of 512 and 1,024 frames"),
+        ({"env": "CountRecallEasy-v0"}, r"missing cell: CountRecallEasy-v0 partial, seed 0"),
+        ({"env": "CountRecallEasy-v0", "amp": True}, "was trained with other amp than"),
+        (
+            {"observability": "partial", "pqn": {"gamma": 0.5}},
+            "on one twin or seed than on another",
+        ),
+    ],
+)
+def test_runs_that_are_no_entry_are_refused(
+    changes: Plain, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other_twin = changes.get("observability") == "partial"
+    if other_twin:
+        write_run(tmp_path, observability="full")
+    else:
+        write_pair(tmp_path)
+    write_run(tmp_path, **({"observability": "full"} | changes))
+    monkeypatch.setattr(submits.Evaluator, "play", lambda *arguments: NOTHING)
+    with pytest.raises(ValueError, match=message):
+        submit([tmp_path], WORDS, protocol=SHORT)

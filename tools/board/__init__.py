@@ -1,0 +1,1 @@
+"""The leaderboard: a protocol, entries in one file each, their checks, and the page."""
