@@ -275,7 +275,7 @@ def test_a_record_cannot_claim_more_than_it_checked() -> None:
     [
         ({"observability": "mixed"}, "privileged observation"),
         ({"memory": "gru"}, "the runs are 2 agents"),
-        ({"env": "CountRecallEasy-v0", "total_frames": 1024}, "runs of 512 and 1,024 frames"),
+        ({"env": "CountRecallEasy-v0", "total_frames": 1024}, "runs of 1,024 and 512 frames"),
         ({"env": "CountRecallEasy-v0"}, r"missing cell: CountRecallEasy-v0 partial, seed 0"),
         ({"env": "CountRecallEasy-v0", "amp": True}, "was trained with other amp than"),
         (
