@@ -114,7 +114,7 @@ for place, (name, share) in enumerate(shares.items()):
     axis.bar(np.arange(steps) - steps + 1 + 0.2 * (place - 1.5), share, 0.18, label=name)
 axis.set_xlabel("steps before the decision")
 axis.set_ylabel("share; of decisions: exchange")
-axis.legend(fontsize="small")
+axis.legend(fontsize=8)
 for name, share in shares.items():
     print(f"{name:21} first frame {share[0]:6.1%}, last frame {share[-1]:6.1%}")
 
