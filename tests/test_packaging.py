@@ -166,6 +166,12 @@ def test_the_wheel_holds_every_source_file_and_nothing_else(wheel: Path, source:
         wanted |= {
             f"arcade_torch/tools/{data}/{path.name}" for path in folder.glob("*") if path.is_file()
         }
+    shipped = source / "agents" / "shipped"
+    wanted |= {
+        f"arcade_torch/agents/shipped/{path.relative_to(shipped).as_posix()}"
+        for path in shipped.rglob("*")
+        if path.is_file()
+    }
     assert files_in(wheel) == wanted
     assert any(name.startswith("arcade_torch/tools/templates/") for name in wanted), (
         "the report needs its template"

@@ -65,7 +65,7 @@ def write_bundle(
     header = {"format": "pt", "config_sha256": hashlib.sha256(config).hexdigest()}
     if half:
         header["stored_as"] = "float16"
-    weights = save(tensors, header)
+    weights = _in_one_order(save(tensors, header))
     write_atomic(folder / CONFIG, config)
     write_atomic(folder / WEIGHTS, weights)
     return hashlib.sha256(weights).hexdigest()
@@ -162,6 +162,18 @@ def _header(weights: bytes) -> dict[str, str]:
     end = _LENGTH_BYTES + int.from_bytes(weights[:_LENGTH_BYTES], "little")
     header: Any = json.loads(weights[_LENGTH_BYTES:end])
     return dict(header.get("__metadata__", {}))
+
+
+def _in_one_order(weights: bytes) -> bytes:
+    """A safetensors file whose header names its own entries in the order of the alphabet, so that
+    equal agents are equal files; ``save`` writes them in any order.
+    """
+    end = _LENGTH_BYTES + int.from_bytes(weights[:_LENGTH_BYTES], "little")
+    header: Any = json.loads(weights[_LENGTH_BYTES:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % _LENGTH_BYTES)  # tensors begin at a multiple of eight bytes
+    return len(text).to_bytes(_LENGTH_BYTES, "little") + text + weights[end:]
 
 
 def _settings(file: Path, config: bytes) -> tuple[TrainConfig, int]:

@@ -349,7 +349,7 @@ def test_steps_draw_straight_into_the_window(
         assert [copied.count(place) for place in places] == [1, 0, 0, 0, 0, 0], number
         copied.clear()
         assert torch.equal(pixels, expected["pixels"])
-        canvas = one._buffer._new_pixels.canvas
+        canvas = one._buffer._new_observation["pixels"].canvas
         assert pixels.is_contiguous() and canvas.memory.unsafe_buffer_pointer() == pixels.data_ptr()
 
 
