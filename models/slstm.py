@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
-from arcade_torch.models.sequential import one_by_one
+from arcade_torch.models.sequential import Loads, one_by_one, start_and_stored
 
 __all__ = ["SLSTM", "slstm_loop", "slstm_scan", "slstm_scan_backward"]
 
@@ -53,11 +53,7 @@ class SLSTM(Memory):
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 4, H]."""
         steps = self.from_input(x)
-        stored = h0.to(steps.dtype)
-        if h0.ndim == x.ndim:  # every start but index 0 loads zeros
-            first = torch.where(is_init[:, :1, None], 0, stored)
-            stored = F.pad(first.unsqueeze(1), (0, 0, 0, 0, 0, x.shape[1] - 1))
-        start = is_init | (torch.arange(x.shape[1], device=x.device) == 0)
+        start, stored = start_and_stored(h0, is_init, 2, steps.dtype)
         scan: Any = slstm_loop if x.shape[1] == 1 else slstm_scan
         states = scan(steps, self.from_state.weight.to(steps.dtype), start, stored)[0]
         return states[:, :, 0], states
@@ -73,13 +69,15 @@ def slstm_loop(
         steps: float [B, T, 4 H], what the input adds to a, b, d and e.
         weight: R, [4 H, H].
         start: bool [B, T], where the state is loaded; set at index 0.
-        stored: [B, T, 4, H], h, c, n and m to load there; not looked at elsewhere.
+        stored: h, c, n and m to load there, [B, T, 4, H] or [B, 1, 4, H]; see :class:`Loads`.
 
     Returns:
         (h, c, n and m after each step [B, T, 4, H], the stabilised i and f, z, o and sigmoid(-b)
         [B, T, 5 H]).
     """
     begins = start[..., None, None].unbind(1)
+    if stored.shape[1] < start.shape[1]:
+        stored = F.pad(stored, (0, 0, 0, 0, 0, start.shape[1] - 1))
     fresh = stored.unbind(1)
     states = []
     gates = []
@@ -118,8 +116,8 @@ def slstm_scan_backward(
     """Gradients of :func:`slstm_scan` with respect to its float arguments, from what it took and
     returned, and the gradient [B, T, 4, H] that arrives at the states (that at m counts nothing).
     """
-    begins = start[..., None, None]
-    before = torch.where(begins, stored, torch.cat([stored[:, :1], states[:, :-1]], dim=1))
+    loads = Loads(start, stored)
+    before = loads.before(states)
     i, f, z, o, remember = gates.chunk(5, dim=-1)
     n = states[:, :, 2]
     ratio = states[:, :, 1] / n
@@ -128,39 +126,39 @@ def slstm_scan_backward(
     h_to_n = -h_to_c * ratio
     h_to_e = ratio * o * (1 - o)
     c_to_d = i * (1 - z * z)
-    columns = [h_to_c, h_to_n, h_to_e, c_to_d, i, f, z, remember, before, begins, grad]
+    columns = [h_to_c, h_to_n, h_to_e, c_to_d, i, f, z, remember, before, grad]
     by_step = list(zip(*(x.unbind(1) for x in columns), strict=True))
 
     grad_steps = torch.empty_like(gates[..., : 4 * n.shape[-1]])
-    grad_before = torch.empty_like(states)
+    grad_stored = stored.new_zeros(stored.shape)
     carried = torch.zeros_like(states[:, 0])
     for t in range(grad.shape[1] - 1, -1, -1):
-        to_c, to_n, to_e, to_d, i_t, f_t, z_t, rest, before_t, begins_t, grad_t = by_step[t]
+        to_c, to_n, to_e, to_d, i_t, f_t, z_t, rest, before_t, grad_t = by_step[t]
         d_h, d_c, d_n, _ = (grad_t + carried).unbind(1)
         d_c = d_c + d_h * to_c
         d_n = d_n + d_h * to_n
         d_log_f = f_t * (d_c * before_t[:, 1] + d_n * before_t[:, 2])
         d_log_i = i_t * (d_c * z_t + d_n)
         d_steps = torch.cat([d_log_i, d_log_f * rest, d_c * to_d, d_h * to_e], dim=-1)
-        d_before = torch.stack([d_steps @ weight, d_c * f_t, d_n * f_t, d_log_f], dim=1)
+        carried = torch.stack([d_steps @ weight, d_c * f_t, d_n * f_t, d_log_f], dim=1)
         grad_steps[:, t] = d_steps
-        grad_before[:, t] = d_before
-        carried = d_before.masked_fill(begins_t, 0)
+        loads.collect(t, carried, grad_stored)
     grad_weight = grad_steps.flatten(0, 1).t() @ before[:, :, 0].flatten(0, 1)
-    return grad_steps, grad_weight, grad_before.masked_fill(~begins, 0)
+    return grad_steps, grad_weight, grad_stored
 
 
 @slstm_scan.register_fake
 def _(steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor) -> Any:
-    gates = steps.new_empty(*stored.shape[:2], 5 * stored.shape[-1])
-    return steps.new_empty(stored.shape), gates
+    size = stored.shape[-1]
+    gates = steps.new_empty(*start.shape, 5 * size)
+    return steps.new_empty(*start.shape, 4, size), gates
 
 
 @slstm_scan_backward.register_fake
 def _(
     weight: Tensor, start: Tensor, stored: Tensor, states: Tensor, gates: Tensor, grad: Tensor
 ) -> Any:
-    steps = gates.new_empty(*stored.shape[:2], 4 * stored.shape[-1])
+    steps = gates.new_empty(*start.shape, 4 * stored.shape[-1])
     return steps, weight.new_empty(weight.shape), stored.new_empty(stored.shape)
 
 
