@@ -1,8 +1,8 @@
-"""The last observations of episodes that have ended, drawn from the states that steps led to. Loads
-no torch.
+"""The last observations of episodes that have ended: of our games drawn from the states that steps
+led to, of other suites kept. Loads no torch.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -116,3 +116,42 @@ class _OneGame:
         spare = self._memory.spare()
         frames = self._draw_rows(states, flags, index, np.int32(self.first), spare)
         return self._memory.show(frames)
+
+
+class KeptObservations:
+    """The observations that steps led to, for the ends among them; what ``FinalObservations`` is
+    for our games.
+
+    Args:
+        names: Keys of the observation's leaves.
+    """
+
+    def __init__(self, names: Sequence[Any]) -> None:
+        self._names = tuple(names)
+        self._steps: dict[int, Any] = {}
+
+    def add(self, index: int, final_obs: Any) -> None:
+        """Keep the observation that a step led to, leaves [N, ...], under a number."""
+        self._steps[index] = final_obs
+
+    def draw(
+        self, wanted: np.ndarray
+    ) -> list[tuple[np.ndarray, np.ndarray, dict[Any, jax.Array], np.ndarray]]:
+        """Give the observations that are wanted, and forget all steps.
+
+        Args:
+            wanted: bool [N, L], by env and by the number of the step; those steps must have been
+                added.
+
+        Returns:
+            A portion for each step: int64 [n] rows, int64 [n] steps, arrays [N, ...] by key, and
+            the rows of those that count.
+        """
+        portions = []
+        for step in np.flatnonzero(wanted.any(0)).tolist():
+            rows = np.flatnonzero(wanted[:, step])
+            leaves = jax.tree.leaves(self._steps[step])
+            arrays = dict(zip(self._names, leaves, strict=True))
+            portions.append((rows, np.full(len(rows), step), arrays, rows))
+        self._steps.clear()
+        return portions

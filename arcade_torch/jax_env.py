@@ -1,6 +1,6 @@
 """``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,26 +17,18 @@ from arcade_torch.devices import pick_devices, wait_for_torch
 from arcade_torch.dlpack import is_host, to_jax, to_torch
 from arcade_torch.envs_jax.batch import choose_rows, env_keys
 from arcade_torch.envs_jax.validation import check_num_envs
+from arcade_torch.final_observations import KeptObservations
 from arcade_torch.process import check_process
 from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import TreeSnapshots
+from arcade_torch.suite import Outcome, Suite, described, name_of
 
 __all__ = ["JaxEnv", "from_jax"]
 
-# names that params and envs of the suites have for a time limit
-_LIMITS = ("max_steps_in_episode", "max_timesteps", "max_steps")
 _OWN_KEYS = (
     *("action", "last_action", "is_init", "step_count", "episode_reward"),
     *("reward", "done", "terminated", "truncated", "next"),
 )
-
-
-class Outcome(NamedTuple):
-    """What one step gives beside observation and state; [N] each, of one env scalars."""
-
-    reward: jax.Array  # float32
-    terminated: jax.Array  # bool
-    truncated: jax.Array  # bool
 
 
 class Episodes(NamedTuple):
@@ -49,105 +41,6 @@ class Episodes(NamedTuple):
     last_action: jax.Array  # [N, ...], zeros before the first step; survives resets
     step_count: jax.Array  # int32 [N]
     episode_reward: jax.Array  # float32 [N]
-
-
-class Suite:
-    """One env of a suite, by two functions without batch, params or automatic resets.
-
-    Args:
-        env: Has ``reset_env`` and ``step_env`` as gymnax's have, or ``reset`` and ``step`` that
-            begin no episode by themselves.
-        params: Given to both as last argument; None: the env's ``default_params``, or none at all.
-        max_steps: Time limit; None: that of the params, or none but the env's own.
-    """
-
-    def __init__(self, env: Any, params: Any = None, max_steps: int | None = None) -> None:
-        if params is None:
-            params = getattr(env, "default_params", None)
-        if max_steps is not None:
-            max_steps = validation.whole("max_steps", max_steps)
-            if max_steps < 1:
-                raise ValueError(f"max_steps is {max_steps}, expected 1 or more")
-        self.env = env
-        self.params = params
-        self.extra = () if params is None else (params,)
-        self._begin = _function(env, "reset")
-        self._go_on = _function(env, "step")
-        self.tells_truncation = callable(getattr(env, "is_truncated", None))
-        if max_steps is None and not self.tells_truncation:
-            max_steps = _limit_of(params)
-        self.max_steps = max_steps
-
-    def reset(self, key: jax.Array) -> tuple[Any, Any]:
-        """The first observation and state of an episode."""
-        obs, state = self._begin(key, *self.extra)
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, state)
-
-    def step(
-        self, key: jax.Array, state: Any, action: jax.Array, count: jax.Array
-    ) -> tuple[Any, Any, Outcome]:
-        """Take the step number ``count`` of an episode, from 1 on: observation, state, outcome."""
-        result = self._go_on(key, state, action, *self.extra)
-        if not isinstance(result, tuple) or len(result) not in (5, 6):
-            raise TypeError(
-                f"step of {_name(self.env)} gives {_described(result)}, expected observation, "
-                "state, reward, done (or terminated, truncated), info"
-            )
-        obs, after, reward = result[:3]
-        terminated, truncated = self._ends(result[3:-1], after, count)
-        outcome = Outcome(
-            jnp.asarray(reward, jnp.float32).reshape(()),
-            jnp.asarray(terminated, bool).reshape(()),
-            jnp.asarray(truncated, bool).reshape(()),
-        )
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, after), outcome
-
-    def _ends(self, flags: tuple[Any, ...], after: Any, count: jax.Array) -> tuple[Any, Any]:
-        """``terminated`` and ``truncated`` of a step, whatever the env itself tells apart.
-
-        An env that only knows ``done`` is taken to be truncated by an end at the time limit.
-        """
-        is_limit = jnp.bool_(False) if self.max_steps is None else count >= self.max_steps
-        if len(flags) == 2:
-            return flags[0], jnp.logical_or(flags[1], is_limit)
-        if self.tells_truncation:
-            truncated = self.env.is_truncated(after, *self.extra)
-            return flags[0], jnp.logical_or(truncated, is_limit)
-        return jnp.logical_and(flags[0], jnp.logical_not(is_limit)), is_limit
-
-
-def _function(env: Any, name: str) -> Callable[..., Any]:
-    """``reset_env`` or ``step_env``, else ``reset`` or ``step``."""
-    function = getattr(env, f"{name}_env", None) or getattr(env, name, None)
-    if not callable(function):
-        raise TypeError(
-            f"{_name(env)} has no {name}(key, ...): from_jax takes an env with gymnax's functions, "
-            "reset(key, params) -> (obs, state) and "
-            "step(key, state, action, params) -> (obs, state, reward, done, info); give another "
-            "suite's env these two"
-        )
-    checked: Callable[..., Any] = function
-    return checked
-
-
-def _limit_of(params: Any) -> int | None:
-    """The time limit that params name."""
-    for name in _LIMITS:
-        limit = getattr(params, name, None)
-        if limit is not None:
-            return int(limit)
-    return None
-
-
-def _name(env: Any) -> str:
-    """What an env is called in messages."""
-    return type(env).__name__
-
-
-def _described(value: Any) -> str:
-    """A result in a message: its kind, of a tuple also how many things it holds."""
-    size = f" of {len(value)}" if isinstance(value, tuple) else ""
-    return f"a {type(value).__name__}{size}"
 
 
 class JaxEnv(EnvBase):
@@ -213,7 +106,7 @@ class JaxEnv(EnvBase):
             device=torch_device,
         )
         self._snapshots = TreeSnapshots(
-            self._live, num_envs, torch_device, jax_device, kind=f"a state of {_name(suite.env)}"
+            self._live, num_envs, torch_device, jax_device, kind=f"a state of {name_of(suite.env)}"
         )
 
     @property
@@ -228,7 +121,9 @@ class JaxEnv(EnvBase):
 
     def __repr__(self) -> str:
         """Env, number and device."""
-        return f"JaxEnv({_name(self.suite.env)}, num_envs={self.num_envs}, device='{self.device}')"
+        return (
+            f"JaxEnv({name_of(self.suite.env)}, num_envs={self.num_envs}, device='{self.device}')"
+        )
 
     def get_state(self) -> TensorDict:
         """Copy everything that determines the future.
@@ -319,7 +214,7 @@ class JaxEnv(EnvBase):
         """Whether steps may draw into memory that tensors lie over: they may not."""
         return False
 
-    def final_observations(self, max_steps: int) -> "KeptObservations":
+    def final_observations(self, max_steps: int) -> KeptObservations:
         """Something that keeps the observations that steps led to, before the resets."""
         return KeptObservations(self._obs_names)
 
@@ -537,45 +432,6 @@ class JaxEnv(EnvBase):
         return td
 
 
-class KeptObservations:
-    """The observations that steps led to, for the ends among them; what ``FinalObservations`` is
-    for our games.
-
-    Args:
-        names: Keys of the observation's leaves.
-    """
-
-    def __init__(self, names: Sequence[Any]) -> None:
-        self._names = tuple(names)
-        self._steps: dict[int, Any] = {}
-
-    def add(self, index: int, final_obs: Any) -> None:
-        """Keep the observation that a step led to, leaves [N, ...], under a number."""
-        self._steps[index] = final_obs
-
-    def draw(
-        self, wanted: np.ndarray
-    ) -> list[tuple[np.ndarray, np.ndarray, dict[Any, jax.Array], np.ndarray]]:
-        """Give the observations that are wanted, and forget all steps.
-
-        Args:
-            wanted: bool [N, L], by env and by the number of the step; those steps must have been
-                added.
-
-        Returns:
-            A portion for each step: int64 [n] rows, int64 [n] steps, arrays [N, ...] by key, and
-            the rows of those that count.
-        """
-        portions = []
-        for step in np.flatnonzero(wanted.any(0)).tolist():
-            rows = np.flatnonzero(wanted[:, step])
-            leaves = jax.tree.leaves(self._steps[step])
-            arrays = dict(zip(self._names, leaves, strict=True))
-            portions.append((rows, np.full(len(rows), step), arrays, rows))
-        self._steps.clear()
-        return portions
-
-
 def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Two keys of each, uint32 [N, 2]."""
     pairs = jax.vmap(jax.random.split)(keys)
@@ -628,7 +484,7 @@ def _action_spec(
             bounds.append(torch.from_numpy(full.copy()).to(device))
         return Bounded(*bounds, shape=(num_envs, *shape), dtype=torch.float32, device=device)
     raise ValueError(
-        f"the actions of {_name(suite.env)} are {_described(space)}, expected a space with n, or "
+        f"the actions of {name_of(suite.env)} are {described(space)}, expected a space with n, or "
         "with low, high and shape: pass action_spec=, for instance "
         f"torchrl.data.Categorical(4, shape=({num_envs},))"
     )
