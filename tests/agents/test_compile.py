@@ -106,7 +106,10 @@ def test_loss_gradients_and_target_network_are_those_of_the_plain_network(
     assert (target - online).abs().max() > 1e-2
 
 
-@pytest.mark.parametrize("memory", ["lru", "gru", "attention"])
+@pytest.mark.parametrize(
+    "memory",
+    ["lru", *(pytest.param(name, marks=pytest.mark.slow) for name in ("gru", "attention"))],
+)
 def test_a_network_is_compiled_once_for_acting_and_once_for_learning(
     batch: TensorDict, memory: str
 ) -> None:

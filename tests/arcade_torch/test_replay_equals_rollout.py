@@ -44,6 +44,7 @@ from arcade_torch.models import (
 )
 from tests.agents.fakes import Stream, lambda_return, look_into, play
 from tests.arcade_torch.stub import GAME
+from tests.few import few_memories
 
 N, T, WINDOWS, SLICE = 6, 16, 2, 4
 CLOSE = {"rtol": 0.0, "atol": 1e-5}
@@ -129,6 +130,7 @@ def test_a_collected_window_replays_and_so_do_slices_of_it(name: str, recipe: Re
     assert name == "mlp" or (carried and cut > 0)
 
 
+@pytest.mark.parametrize("name", few_memories(memory_names()))
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("sampler", ["slices", "steps"])
 @pytest.mark.parametrize("checks", [True, False])
@@ -257,6 +259,7 @@ def window(policy: TensorDictSequential, path: str) -> TensorDictBase:
 paths = pytest.mark.parametrize("path", ["truncated", "all", "iterated", "Collector"])
 
 
+@pytest.mark.parametrize("name", few_memories(memory_names()))
 @paths
 def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_frames(
     name: str, path: str

@@ -1,15 +1,17 @@
-"""TorchRL's own checker on the configurations: each id, both sizes, both twins."""
+"""TorchRL's own checker: a few ids on every change; each id, both sizes, both twins as slow tests."""
 
 import pytest
 from torchrl.envs.utils import check_env_specs
 
 from arcade_torch import make, registered_ids
+from tests.few import GAMES
 
-# The specs of a game are the same at all its difficulties: at 256 one of them stands for all.
-CONFIGURATIONS = [(id, 128) for id in registered_ids()]
+# The specs of a game are the same at all its difficulties: one of them stands for all.
+CONFIGURATIONS = []
 for _id in registered_ids():
-    _rarely = [] if "Easy" in _id else [pytest.mark.slow]
-    CONFIGURATIONS.append(pytest.param(_id, 256, marks=_rarely))
+    _often = [] if "Easy" in _id and _id.startswith(GAMES) else [pytest.mark.slow]
+    CONFIGURATIONS.append(pytest.param(_id, 128, marks=_often))
+    CONFIGURATIONS.append(pytest.param(_id, 256, marks=_often))
 
 
 @pytest.mark.parametrize(("id", "obs_size"), CONFIGURATIONS)

@@ -1,14 +1,24 @@
 """Helpers shared by the tests of the games."""
 
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from arcade_torch.envs_jax import BatchedGame, env_keys, make, registered_ids
 
 ALL_IDS = registered_ids()
+
+
+def pytest_collection_modifyitems(items):
+    """Medium lies between Easy and Hard: what is tested at all three is slow there."""
+    folder = Path(__file__).parent
+    for item in items:
+        if folder in item.path.parents and "Medium" in item.name:
+            item.add_marker(pytest.mark.slow)
 
 
 @functools.cache

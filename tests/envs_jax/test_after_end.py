@@ -14,6 +14,7 @@ from arcade_torch.envs_jax import BatchedGame, MixedGames, env_keys, gymnax, mak
 from arcade_torch.envs_jax.game import UNSET
 
 from ..arcade_torch.stub import CoinGame, StubGame
+from ..few import few_games
 from ..test_own_game import Toy
 from .conftest import ALL_IDS
 
@@ -57,7 +58,7 @@ def assert_stays(states, reward, terminated, truncated):
 
 
 @pytest.mark.parametrize("rules", ["default", "reference"])
-@pytest.mark.parametrize("id", EASY)
+@pytest.mark.parametrize("id", few_games(EASY))
 def test_a_state_stays_in_pure_jax(id, rules):
     game = make(id, rules=rules)
 
@@ -206,7 +207,7 @@ def test_a_batch_without_flags_has_not_ended():
     )
 
 
-@pytest.mark.parametrize("id", EASY)
+@pytest.mark.parametrize("id", few_games(EASY))
 def test_an_eager_state_can_be_donated(id):
     game = make(id)
     state = game.reset(jax.random.PRNGKey(0))

@@ -20,6 +20,7 @@ from arcade_torch.envs_jax import (
 )
 from arcade_torch.envs_jax.game import UNSET
 from arcade_torch.envs_jax.render import Layers, blank, number_slot
+from tests.few import few_games
 from tests.own_registry import own_registry  # noqa: F401
 
 
@@ -322,6 +323,8 @@ def test_a_game_that_plays_well_passes():
     check_game(Counter(), play=True)
 
 
-@pytest.mark.parametrize("id", [id for id in registered_ids() + probe_ids() if "Hard" in id])
+@pytest.mark.parametrize(
+    "id", few_games(id for id in registered_ids() + probe_ids() if "Hard" in id)
+)
 def test_the_games_of_the_package_play_well(id):
     check_game(make(id), play=True)

@@ -12,6 +12,7 @@ from arcade_torch.envs_jax import BatchedGame, Game, MixedGames, check_game, env
 from arcade_torch.envs_jax.game import FIRE
 
 from ..arcade_torch.stub import CoinGame, StubGame
+from ..few import few_games
 from .conftest import ALL_IDS, one
 
 ENVS, STEPS = 4, 132  # a time limit of BattleShip and MineSweeper is reached
@@ -68,7 +69,7 @@ def test_facts_have_names_and_one_shape_and_type_at_all_states(id: str) -> None:
         assert shapes[name].shape == values.shape[2:] and shapes[name].dtype == values.dtype
 
 
-@pytest.mark.parametrize("id", EASY)
+@pytest.mark.parametrize("id", few_games(EASY))
 def test_many_states_at_once_have_the_facts_of_one_at_a_time_with_x64_too(id: str) -> None:
     states, facts = walk(id)
     alone = jax.jit(make(id).facts)
@@ -79,7 +80,7 @@ def test_many_states_at_once_have_the_facts_of_one_at_a_time_with_x64_too(id: st
                 np.testing.assert_array_equal(value, facts[name][step, env])
 
 
-@pytest.mark.parametrize("id", EASY)
+@pytest.mark.parametrize("id", few_games(EASY))
 def test_both_twins_have_the_same_facts(id: str) -> None:
     batched = BatchedGame(make(id))
     keys = jnp.repeat(env_keys(3, 1), 2, axis=0)

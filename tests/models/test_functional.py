@@ -14,6 +14,7 @@ from torchrl.objectives import DQNLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
 from arcade_torch.models import MemoryBlock, make_actor_critic, make_network, memory_names
+from tests.few import few_memories
 
 NAMES = memory_names()
 N, T = 3, 6
@@ -212,19 +213,13 @@ def problem(block, steps):
     return torch.randn(2, steps, 4), block.initial_state(2), torch.rand(2, steps) < 0.2
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", few_memories(NAMES))
 def test_two_hundred_calls_of_one_shape_compile_once(name):
     block = MemoryBlock(4, 8, name)
     assert compilations(block, [problem(block, 12)] * 200) == 1
 
 
-# half a minute: the chunks of gdn, twice as long
-SLOW_TO_COMPILE = pytest.param("deltaproduct", marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(
-    "name", [SLOW_TO_COMPILE if name == "deltaproduct" else name for name in NAMES]
-)
+@pytest.mark.parametrize("name", few_memories(NAMES))
 def test_twenty_lengths_compile_no_more_than_three_times(name):
     block = MemoryBlock(4, 8, name)
     assert compilations(block, [problem(block, steps) for steps in range(6, 26)]) <= 3
