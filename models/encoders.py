@@ -79,9 +79,8 @@ class Encoder(nn.Module):
             ValueError: the last three dimensions are neither, or the frames are floats in 0..1.
         """
         frames = self._frames(pixels)
-        device = frames.device.type
-        if self.amp and (device != "cpu" or BFLOAT16_PAYS):
-            with torch.autocast(device, torch.bfloat16):
+        if self._rounds(frames):
+            with torch.autocast(frames.device.type, torch.bfloat16):
                 features = self.features(frames)
             features = features.to(self.like.dtype)
         else:
@@ -91,6 +90,10 @@ class Encoder(nn.Module):
     def features(self, frames: Tensor) -> Tensor:
         """Encode compressed frames [N, *stored_shape] -> [N, E]."""
         raise NotImplementedError
+
+    def _rounds(self, frames: Tensor) -> bool:
+        """Whether these frames are encoded in bfloat16."""
+        return self.amp and (frames.device.type != "cpu" or BFLOAT16_PAYS)
 
     def _frames(self, pixels: Tensor) -> Tensor:
         """Compressed frames with one batch dimension, [N, *stored_shape]."""
@@ -324,8 +327,7 @@ class SmallEncoder(Encoder):
         mean = self._patches(self.mean.permute(1, 2, 0))
         weight = self.conv1.weight * self.inverse_rms  # rather the weights than every pixel
         weight = weight.permute(0, 2, 3, 1).flatten(1)  # [C, k * k * 3], the order of a patch
-        rounds = torch.is_autocast_enabled(frames.device.type)
-        layers = self._in_bfloat16 if rounds else self._in_float32
+        layers = self._in_bfloat16 if self._rounds(frames) else self._in_float32
         return F.leaky_relu_(F.layer_norm(layers(frames, mean, weight), (self.feature_size,)))
 
     def _in_float32(self, frames: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
