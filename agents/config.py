@@ -418,8 +418,9 @@ class TrainConfig(Checked):
     device: Device = "cpu"
     """Torch device of the network and the learner."""
     amp: bool = False
-    """Take the convolutions in bfloat16, where processor or GPU can: faster, and other numbers; the
-    rest stays float32. Agents act as they were trained."""
+    """Take the encoder in bfloat16 on a GPU, or on a processor that multiplies it faster than
+    float32 (x86: with AMX; without, nothing changes): other numbers; the rest stays float32. Agents
+    act as they were trained."""
     compile: bool = False
     """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and
     rounding of its own. Meant for GPUs: two cores are no faster with it. What is saved is the same;

@@ -97,8 +97,8 @@ class Learner:
         """
         for _ in range(self.config.epochs):
             order = torch.randperm(len(data), device="cpu", generator=self.training.generator)
-            shuffled = data[order.to(self.training.device, non_blocking=True)]
-            yield from shuffled.split(-(-len(data) // self.config.minibatches))
+            order = order.to(self.training.device, non_blocking=True)
+            yield from _rows(data, order).split(-(-len(data) // self.config.minibatches))
 
     def gradient_step(self, minibatch: TensorDictBase, frames: float) -> None:
         """One step of the optimiser, with the step size after ``frames`` frames."""
@@ -170,6 +170,11 @@ class Learner:
         # there.
         self.optimizer.param_groups[0].update(options)
         self.grad_steps = state["grad_steps"]
+
+
+def _rows(data: TensorDictBase, rows: Tensor) -> TensorDictBase:
+    """``data[rows]``; whole rows are copied, where indexing a CPU's bytes goes one by one."""
+    return data.apply(lambda entry: entry.index_select(0, rows))
 
 
 def make_optimizer(

@@ -375,7 +375,7 @@ class PPO(Learner):
             options["advantage_norm"] = PopArtValueNorm(
                 beta=config.advantage_decay, epsilon=1e-8, device=training.device
             )
-        loss = PPOLoss(make_actor(network), clip_epsilon=config.clip, **options)
+        loss = PPOLoss(make_actor(network), clip_epsilon=config.clip, functional=False, **options)
         loss.make_value_estimator(
             gamma=config.gamma,
             lmbda=config.lam,

@@ -345,9 +345,9 @@ class MemoryNetwork(TensorDictModuleBase):
         size = self.encoder.feature_size
         following = x[..., 1:, :size].detach()
         action = x[..., 1:, size:]
-        seen = following.flatten(0, -2)
-        # some features hardly ever change
-        target = (following - seen.mean(0)) / (seen.std(0, correction=0) + 0.01)
+        centred = following - following.flatten(0, -2).mean(0)
+        deviation = centred.square().flatten(0, -2).mean(0).sqrt()
+        target = centred / (deviation + 0.01)  # some features hardly ever change
         expected = self.predictor(torch.cat([y[..., :-1, :], action], dim=-1))  # type: ignore[misc]
         error = (expected - target).square().mean(-1, keepdim=True)
         return F.pad(error.masked_fill(is_init[..., 1:, None], 0.0), (0, 0, 0, 1))

@@ -29,6 +29,7 @@ from arcade_torch.models import (
     Encoder,
     PaperEncoder,
     SmallEncoder,
+    encoders,
     make_actor_critic,
     make_network,
     memory_names,
@@ -234,8 +235,9 @@ def test_a_run_with_graphs_is_a_run(algorithm: str, tmp_path: Path, cuda: str) -
 
 @pytest.mark.parametrize("kind", [PaperEncoder, SmallEncoder])
 def test_amp_features_and_gradients_are_float32_and_close_to_exact_ones(
-    kind: type[Encoder],
+    kind: type[Encoder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(encoders, "BFLOAT16_PAYS", True)
     encoder = kind(128)  # type: ignore[call-arg]
     frames = torch.randint(256, (4, 128, 128, 3), dtype=torch.uint8)
     exact = encoder(frames)

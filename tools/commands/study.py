@@ -142,14 +142,14 @@ class Demo(Resumable):
     Ends in one HTML page with learning curves, observability gap, memory bias, saliency,
     counterfactual recall and beliefs. Less than ten minutes on two cores; type the same again to go
     on after an interruption. One game is a probe, solved with memory and only with it; the other is
-    one of the ten, where a minute of training only begins to show it.
+    one of the ten, where half a minute of training only begins to show it.
 
     Example: arcade-torch demo --games BattleShipEasy --frames 700000 --seeds 2 --out runs/ships
     """
 
     word = "demo"
     games: tuple[str, ...] = ("SignpostEasy", "MineSweeperEasy")  # Games to play.
-    frames: int = 100_000  # Environment steps of each run.
+    frames: int = 45_000  # Environment steps of each run.
     seeds: int = 3  # Runs of each agent and twin.
     out: Path = Path("runs/demo")  # Folder of the study.
     workers: int = 0  # Runs at once; 0 for one a core.
