@@ -199,6 +199,7 @@ def test_the_study_part_holds_the_gap_of_the_returns(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_card_with_a_study_says_what_was_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
