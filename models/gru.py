@@ -7,7 +7,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
-from arcade_torch.models.sequential import Loads, one_by_one, start_and_stored
+from arcade_torch.models.sequential import (
+    Loads,
+    in_time_order,
+    linear_backward,
+    one_by_one,
+    start_and_stored,
+    time_first,
+)
 
 __all__ = ["GRU", "gru_loop", "gru_scan", "gru_scan_backward"]
 
@@ -41,22 +48,34 @@ class GRU(Memory):
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`."""
-        steps = self.from_input(x)
-        start, stored = start_and_stored(h0, is_init, 1, steps.dtype)
+        start, stored = start_and_stored(h0, is_init, 1, x.dtype)
         scan: Any = gru_loop if x.shape[1] == 1 else gru_scan
-        weights = self.gates_from_state.weight, self.candidate_from_state.weight
-        y = scan(steps, *(weight.to(steps.dtype) for weight in weights), start, stored)[0]
+        weights = (
+            self.from_input.weight,
+            self.from_input.bias,
+            self.gates_from_state.weight,
+            self.candidate_from_state.weight,
+        )
+        y = scan(x, *weights, start, stored)[0]
         return y, y
 
 
 def gru_loop(
-    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
+    x: Tensor,
+    input_weight: Tensor,
+    input_bias: Tensor,
+    gates_weight: Tensor,
+    candidate_weight: Tensor,
+    start: Tensor,
+    stored: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The recurrence in plain torch operators: what acting runs, and the oracle of
     :func:`gru_scan`.
 
     Args:
-        steps: float [B, T, 3 H], what the input adds to z, r and c.
+        x: float [B, T, D].
+        input_weight: W and W_h, [3 H, D]: what the input adds to z, r and c.
+        input_bias: [3 H].
         gates_weight: U, [2 H, H].
         candidate_weight: U_h, [H, H].
         start: bool [B, T], where a state is loaded; set at index 0.
@@ -66,6 +85,7 @@ def gru_loop(
         (the state after each step [B, T, H], z, r and c [B, T, 3 H]).
     """
     size = candidate_weight.shape[0]
+    steps = F.linear(x, input_weight, input_bias)
     begins = start.unsqueeze(-1).unbind(1)
     fresh = (
         stored.expand_as(steps[..., :size])
@@ -88,34 +108,41 @@ def gru_loop(
     return torch.stack(states, dim=1), torch.stack(gates, dim=1)
 
 
-def _by_step(x: Tensor, width: int) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """The first ``width`` features of every step, and the rest: views, made once for a loop."""
-    return x[..., :width].unbind(1), x[..., width:].unbind(1)
-
-
 @torch.library.custom_op("arcade_torch::gru_scan", mutates_args=())
 def gru_scan(
-    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
+    x: Tensor,
+    input_weight: Tensor,
+    input_bias: Tensor,
+    gates_weight: Tensor,
+    candidate_weight: Tensor,
+    start: Tensor,
+    stored: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`gru_loop` as one operator; gradients flow from the states, not from z, r and c."""
+    """:func:`gru_loop` as one operator; gradients flow from the states, not from z, r and c.
+
+    What the input adds is computed step by step where the gates are to stand, while the processor
+    has them near.
+    """
     size = candidate_weight.shape[0]
-    to_z_and_r = gates_weight.t()
-    to_c = candidate_weight.t()
     loads = Loads(start, stored)
-    states = steps.new_empty(*steps.shape[:2], size)
-    gates = torch.empty_like(steps, memory_format=torch.contiguous_format)
-    reset = torch.empty_like(states[:, 0])
-    h = loads.first
-    columns = zip(
-        *_by_step(steps, 2 * size), *_by_step(gates, 2 * size), *_by_step(gates, size), strict=True
-    )
+    from_input = input_weight.t().contiguous()
+    to_z_and_r = gates_weight.t().contiguous()
+    to_c = candidate_weight.t().contiguous()
+    states = time_first(x, size)
+    gates = time_first(x, 3 * size)
+    of_step = gates.unbind(1)
+    z_and_r = gates[..., : 2 * size].unbind(1)
+    z, r, c = (gate.unbind(1) for gate in gates.split(size, dim=-1))
     after = states.unbind(1)
-    for t, (input_of_gates, input_of_c, z_and_r, c, z, _) in enumerate(columns):
+    h = loads.first
+    reset = torch.empty_like(h)
+    for t, x_t in enumerate(x.unbind(1)):
         h = loads.apply(t, h)
-        torch.addmm(input_of_gates, h, to_z_and_r, out=z_and_r).sigmoid_()
-        torch.mul(z_and_r[:, size:], h, out=reset)
-        torch.addmm(input_of_c, reset, to_c, out=c).tanh_()
-        h = torch.lerp(h, c, z, out=after[t])
+        torch.addmm(input_bias, x_t, from_input, out=of_step[t])
+        z_and_r[t].addmm_(h, to_z_and_r).sigmoid_()
+        torch.mul(r[t], h, out=reset)
+        c[t].addmm_(reset, to_c).tanh_()
+        h = torch.lerp(h, c[t], z[t], out=after[t])
     return states, gates
 
 
@@ -129,15 +156,16 @@ def gru_scan_backward(
     gates: Tensor,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of :func:`gru_scan` with respect to its float arguments, from what it took and
+    """Gradients with respect to what the input adds to z, r and c [B, T, 3 H] and to
+    ``gates_weight``, ``candidate_weight`` and ``stored`` of :func:`gru_scan`, from what it took and
     returned, and the gradient [B, T, H] that arrives at the states.
     """
     size = candidate_weight.shape[0]
     loads = Loads(start, stored)
     before = loads.before(states)
-    d_steps = torch.empty_like(gates)
+    d_steps = time_first(gates, 3 * size)
     d_stored = stored.new_zeros(stored.shape)
-    d_h = torch.empty_like(states[:, 0])
+    d_h = torch.empty_like(loads.first)
     d_reset = torch.empty_like(d_h)
     d_candidate = torch.empty_like(d_h)
     d_gates = gates.new_empty(d_h.shape[0], 2 * size)
@@ -145,7 +173,8 @@ def gru_scan_backward(
     carried = torch.zeros_like(d_h)
     z, r, c = (x.unbind(1) for x in gates.split(size, dim=-1))
     z_and_r = gates[..., : 2 * size].unbind(1)
-    to_gates, to_c = _by_step(d_steps, 2 * size)
+    to_gates = d_steps[..., : 2 * size].unbind(1)
+    to_c = d_steps[..., 2 * size :].unbind(1)
     arrives = grad.unbind(1)
     read = before.unbind(1)
     for t in range(len(arrives) - 1, -1, -1):
@@ -159,19 +188,17 @@ def gru_scan_backward(
         torch.sub(d_h, d_candidate, out=carried).addcmul_(d_reset, r[t])
         carried.addmm_(to_gates[t], gates_weight)
         loads.collect(t, carried, d_stored)
-    rows = d_steps.flatten(0, 1)
-    reset = gates[:, :, size : 2 * size] * before
-    d_gates_weight = rows[:, : 2 * size].t() @ before.flatten(0, 1)
-    d_candidate_weight = rows[:, 2 * size :].t() @ reset.flatten(0, 1)
+    rows = in_time_order(d_steps)
+    d_gates_weight = rows[:, : 2 * size].t() @ in_time_order(before)
+    before *= gates[..., size : 2 * size]  # the reset state, in the same memory
+    d_candidate_weight = rows[:, 2 * size :].t() @ in_time_order(before)
     return d_steps, d_gates_weight, d_candidate_weight, d_stored
 
 
 @gru_scan.register_fake
-def _(
-    steps: Tensor, gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor
-) -> Any:
-    states = steps.new_empty(*steps.shape[:2], candidate_weight.shape[0])
-    return states, torch.empty_like(steps, memory_format=torch.contiguous_format)
+def _(x: Tensor, input_weight: Tensor, *rest: Tensor) -> Any:
+    size = input_weight.shape[0] // 3
+    return time_first(x, size), time_first(x, 3 * size)
 
 
 @gru_scan_backward.register_fake
@@ -179,19 +206,23 @@ def _(
     gates_weight: Tensor, candidate_weight: Tensor, start: Tensor, stored: Tensor, *rest: Tensor
 ) -> Any:
     weights = (gates_weight, candidate_weight, stored)
-    return torch.empty_like(rest[1]), *(x.new_empty(x.shape) for x in weights)
+    d_steps = time_first(rest[0], 3 * candidate_weight.shape[0])
+    return d_steps, *(x.new_empty(x.shape) for x in weights)
 
 
 def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*inputs[1:], *output)
+    x, input_weight, _, *rest = inputs
+    ctx.save_for_backward(x, input_weight, *rest, *output)
 
 
 def _differentiate(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
     if grad is None:
-        return (None,) * 5
-    to_steps, to_gates, to_candidate, to_stored = gru_scan_backward(*ctx.saved_tensors, grad)
-    return to_steps, to_gates, to_candidate, None, to_stored
+        return (None,) * 7
+    x, input_weight, *rest = ctx.saved_tensors
+    d_steps, *d_weights, d_stored = gru_scan_backward(*rest, grad)
+    d_input = linear_backward(x, input_weight, d_steps, ctx.needs_input_grad[0])
+    return *d_input, *d_weights, None, d_stored
 
 
 gru_scan.register_autograd(_differentiate, setup_context=_save)

@@ -8,7 +8,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.memory import Memory
-from arcade_torch.models.sequential import Loads, one_by_one, start_and_stored
+from arcade_torch.models.sequential import (
+    Loads,
+    in_time_order,
+    linear_backward,
+    one_by_one,
+    start_and_stored,
+    time_first,
+)
 
 __all__ = ["LSTM", "lstm_loop", "lstm_scan", "lstm_scan_backward"]
 
@@ -46,21 +53,28 @@ class LSTM(Memory):
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 2, H]."""
-        steps = self.from_input(x)
-        start, stored = start_and_stored(h0, is_init, 2, steps.dtype)
+        start, stored = start_and_stored(h0, is_init, 2, x.dtype)
         scan: Any = lstm_loop if x.shape[1] == 1 else lstm_scan
-        states = scan(steps, self.from_state.weight.to(steps.dtype), start, stored)[0]
+        weights = (self.from_input.weight, self.from_input.bias, self.from_state.weight)
+        states = scan(x, *weights, start, stored)[0]
         return states[:, :, 0], states
 
 
 def lstm_loop(
-    steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor
+    x: Tensor,
+    input_weight: Tensor,
+    input_bias: Tensor,
+    weight: Tensor,
+    start: Tensor,
+    stored: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The recurrence in plain torch operators: what acting runs, and the oracle of
     :func:`lstm_scan`.
 
     Args:
-        steps: float [B, T, 4 H], what the input adds to i, f, g and o.
+        x: float [B, T, D].
+        input_weight: W and W_g, [4 H, D]: what the input adds to i, f, g and o.
+        input_bias: [4 H].
         weight: U, [4 H, H].
         start: bool [B, T], where a state is loaded; set at index 0.
         stored: h and c to load there, [B, T, 2, H] or [B, 1, 2, H]; see :class:`Loads`.
@@ -68,6 +82,7 @@ def lstm_loop(
     Returns:
         (h and c after each step [B, T, 2, H], the gates i, f, g and o [B, T, 4 H]).
     """
+    steps = F.linear(x, input_weight, input_bias)
     begins = start[..., None, None].unbind(1)
     if stored.shape[1] < start.shape[1]:
         stored = F.pad(stored, (0, 0, 0, 0, 0, start.shape[1] - 1))
@@ -93,22 +108,33 @@ def lstm_loop(
 
 @torch.library.custom_op("arcade_torch::lstm_scan", mutates_args=())
 def lstm_scan(
-    steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor
+    x: Tensor,
+    input_weight: Tensor,
+    input_bias: Tensor,
+    weight: Tensor,
+    start: Tensor,
+    stored: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`lstm_loop` as one operator; gradients flow from the states, not from the gates."""
+    """:func:`lstm_loop` as one operator; gradients flow from the states, not from the gates.
+
+    What the input adds is computed step by step where the gates are to stand, while the processor
+    has them near.
+    """
     size = weight.shape[1]
     loads = Loads(start, stored)
-    states = steps.new_empty(*steps.shape[:2], 2, size)
-    gates = torch.empty_like(steps, memory_format=torch.contiguous_format)
-    from_state = weight.t()
+    from_input = input_weight.t().contiguous()
+    from_state = weight.t().contiguous()
+    states = time_first(x, 2, size)
+    gates = time_first(x, 4 * size)
     i_and_f = gates[..., : 2 * size].unbind(1)
-    i, f, g, o = (x.unbind(1) for x in gates.split(size, dim=-1))
+    i, f, g, o = (gate.unbind(1) for gate in gates.split(size, dim=-1))
     after = states.unbind(1)
     of_step = gates.unbind(1)
     state = loads.first
-    for t, from_input in enumerate(steps.unbind(1)):
+    for t, x_t in enumerate(x.unbind(1)):
         state = loads.apply(t, state)
-        torch.addmm(from_input, state[:, 0], from_state, out=of_step[t])
+        torch.addmm(input_bias, x_t, from_input, out=of_step[t])
+        of_step[t].addmm_(state[:, 0], from_state)
         i_and_f[t].sigmoid_()
         g[t].tanh_()
         o[t].sigmoid_()
@@ -123,13 +149,14 @@ def lstm_scan(
 def lstm_scan_backward(
     weight: Tensor, start: Tensor, stored: Tensor, states: Tensor, gates: Tensor, grad: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of :func:`lstm_scan` with respect to its float arguments, from what it took and
-    returned, and the gradient [B, T, 2, H] that arrives at the states.
+    """Gradients with respect to what the input adds to i, f, g and o [B, T, 4 H] and to ``weight``
+    and ``stored`` of :func:`lstm_scan`, from what it took and returned, and the gradient
+    [B, T, 2, H] that arrives at the states.
     """
     size = weight.shape[1]
     loads = Loads(start, stored)
     before = loads.before(states)
-    d_steps = torch.empty_like(gates)
+    d_steps = time_first(gates, 4 * size)
     d_stored = stored.new_zeros(stored.shape)
     i, f, g, o = (x.unbind(1) for x in gates.split(size, dim=-1))
     to_i, to_f, to_g, to_o = (x.unbind(1) for x in d_steps.split(size, dim=-1))
@@ -155,33 +182,37 @@ def lstm_scan_backward(
         torch.mm(to_gates[t], weight, out=carried[:, 0])
         torch.mul(d_c, f[t], out=carried[:, 1])
         loads.collect(t, carried, d_stored)
-    d_weight = d_steps.flatten(0, 1).t() @ before[:, :, 0].flatten(0, 1)
+    d_weight = in_time_order(d_steps).t() @ in_time_order(before[:, :, 0])
     return d_steps, d_weight, d_stored
 
 
 @lstm_scan.register_fake
-def _(steps: Tensor, weight: Tensor, start: Tensor, stored: Tensor) -> Any:
-    states = steps.new_empty(*steps.shape[:2], 2, weight.shape[1])
-    return states, torch.empty_like(steps, memory_format=torch.contiguous_format)
+def _(x: Tensor, input_weight: Tensor, *rest: Tensor) -> Any:
+    size = input_weight.shape[0] // 4
+    return time_first(x, 2, size), time_first(x, 4 * size)
 
 
 @lstm_scan_backward.register_fake
 def _(
     weight: Tensor, start: Tensor, stored: Tensor, states: Tensor, gates: Tensor, grad: Tensor
 ) -> Any:
-    return torch.empty_like(gates), *(x.new_empty(x.shape) for x in (weight, stored))
+    d_steps = time_first(states, 4 * weight.shape[1])
+    return d_steps, *(x.new_empty(x.shape) for x in (weight, stored))
 
 
 def _save(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*inputs[1:], *output)
+    x, input_weight, _, *rest = inputs
+    ctx.save_for_backward(x, input_weight, *rest, *output)
 
 
 def _differentiate(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
     if grad is None:
-        return (None,) * 4
-    to_steps, to_weight, to_stored = lstm_scan_backward(*ctx.saved_tensors, grad)
-    return to_steps, to_weight, None, to_stored
+        return (None,) * 6
+    x, input_weight, *rest = ctx.saved_tensors
+    d_steps, d_weight, d_stored = lstm_scan_backward(*rest, grad)
+    d_input = linear_backward(x, input_weight, d_steps, ctx.needs_input_grad[0])
+    return *d_input, d_weight, None, d_stored
 
 
 lstm_scan.register_autograd(_differentiate, setup_context=_save)

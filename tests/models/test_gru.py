@@ -18,13 +18,19 @@ def problem(batch=2, steps=5, size=3, resets=0.3, every=True):
     for index 0 alone.
     """
     states = (batch, steps if every else 1, size)
-    shapes = ((batch, steps, 3 * size), (2 * size, size), (size, size), states)
-    gates, *weights, stored = (
-        torch.randn(shape, dtype=F64, requires_grad=True) for shape in shapes
+    inputs = 2
+    shapes = (
+        (batch, steps, inputs),
+        (3 * size, inputs),
+        (3 * size,),
+        (2 * size, size),
+        (size, size),
+        states,
     )
+    x, *weights, stored = (torch.randn(shape, dtype=F64, requires_grad=True) for shape in shapes)
     start = torch.rand(batch, steps) < resets
     start[:, 0] = True
-    return gates, *weights, start, stored
+    return x, *weights, start, stored
 
 
 def leaves(arguments):
@@ -50,10 +56,10 @@ def test_the_operator_equals_the_loop_values_and_gradients(batch, steps, size, r
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("mapped", [(0, 1, 2, 3, 4), (1, 2), (0,), (4,)])
+@pytest.mark.parametrize("mapped", [tuple(range(7)), (1, 2, 3, 4), (0,), (6,)])
 def test_vmap_over_any_of_the_arguments_equals_one_after_the_other(mapped):
     problems = [problem() for _ in range(3)]
-    dims = tuple(0 if i in mapped else None for i in range(5))
+    dims = tuple(0 if i in mapped else None for i in range(7))
     stacked = [
         torch.stack([p[i] for p in problems]) if d == 0 else problems[0][i]
         for i, d in enumerate(dims)
@@ -62,7 +68,7 @@ def test_vmap_over_any_of_the_arguments_equals_one_after_the_other(mapped):
     y = torch.vmap(lambda *a: gru_scan(*a)[0], in_dims=dims)(*stacked)
     alone = torch.stack([gru_loop(*row)[0] for row in rows])
     torch.testing.assert_close(y, alone)
-    weights = [problems[0][i] for i in (0, 1, 2, 4)]
+    weights = [problems[0][i] for i in (0, 1, 2, 3, 4, 6)]
     direction = torch.randn_like(y)
     found, wanted = (torch.autograd.grad(out, weights, direction) for out in (y, alone))
     torch.testing.assert_close(found, wanted)
@@ -74,7 +80,7 @@ def test_opcheck_finds_nothing():
     with torch.no_grad():
         made = gru_scan(*arguments)
     torch.library.opcheck(
-        gru_scan_backward, (*(x.detach() for x in arguments[1:]), *made, torch.randn_like(made[0]))
+        gru_scan_backward, (*(x.detach() for x in arguments[3:]), *made, torch.randn_like(made[0]))
     )
 
 
@@ -95,4 +101,4 @@ def test_both_passes_take_no_longer_than_those_of_torchs_gru():
             began = time.process_time()
             read().sum().backward()
             times[name].append(time.process_time() - began)
-    assert min(times["ours"]) < 1.3 * min(times["torch"])
+    assert min(times["ours"]) < min(times["torch"])

@@ -57,12 +57,14 @@ def problem(every: bool = True) -> list[torch.Tensor]:
     """Random arguments of the scan, with a start at index 0, and a state to load for every step or
     for index 0 alone.
     """
-    steps = torch.randn(2, 6, 12, dtype=F64, requires_grad=True)
+    x = torch.randn(2, 6, 4, dtype=F64, requires_grad=True)
+    input_weight = torch.randn(12, 4, dtype=F64, requires_grad=True)
+    input_bias = torch.randn(12, dtype=F64, requires_grad=True)
     weight = torch.randn(12, 3, dtype=F64, requires_grad=True)
     stored = torch.randn(2, 6 if every else 1, 2, 3, dtype=F64, requires_grad=True)
     start = torch.rand(2, 6) < 0.4
     start[:, 0] = True
-    return [steps, weight, start, stored]
+    return [x, input_weight, input_bias, weight, start, stored]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -84,7 +86,7 @@ def test_opcheck_passes() -> None:
     torch.library.opcheck(lstm_scan, arguments)
     with torch.no_grad():
         states, gates = lstm_scan(*arguments)
-    detached = [x.detach() for x in arguments[1:]]
+    detached = [x.detach() for x in arguments[3:]]
     torch.library.opcheck(lstm_scan_backward, (*detached, states, gates, torch.randn_like(states)))
 
 

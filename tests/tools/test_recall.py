@@ -12,7 +12,7 @@ from arcade_torch.models import MemoryBlock, memory_names
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import recall
 from arcade_torch.tools.bench.recall import ASK, SOLVED, UNLABELLED, Recall, train, windows
-from arcade_torch.tools.files import read_rows
+from arcade_torch.tools.files import read_rows, write_csv
 
 
 @pytest.mark.parametrize("mixed", [False, True])
@@ -112,6 +112,13 @@ def test_the_command_keeps_its_rows_and_writes_the_page(
     assert "| `gdn` | " in text and "| delay 1 | delay 2 |" in text
     monkeypatch.setattr(recall, "train", None)
     assert cli.main(words) == cli.EXIT_OK and page.read_text() == text
+    others = [Recall("window of old", 1, 8, 0, 1.0, 9, 9, 9.0, 9, 9), *read_rows(out, Recall)]
+    others += [Recall("lru", 1, size, 0, 0.5, 9, 9, 9.0, 9, size) for size in (8, 16)]
+    write_csv(out, [row._asdict() for row in others], Recall._fields)
+    assert cli.main(words) == cli.EXIT_OK
+    text = page.read_text()  # the rows of others stay, of this width and of models there are
+    assert text.index("| `lru` | 50.0 % ") < text.index("| `gdn` | ") and text.count("`lru`") == 1
+    assert "| 9 | 8 |" in text and "window of old" not in text
     out.write_text("a,b\n1,2\n")
     assert cli.main(words) == cli.EXIT_BAD_INPUT
     assert "is no table with columns model, delay, hidden_size" in capsys.readouterr().err

@@ -27,7 +27,7 @@ from arcade_torch.models import MemoryBlock, make_memory, memory_names
 from arcade_torch.tools.bench.memory_tests import TESTS, table
 from arcade_torch.tools.bench.memory_tests.training import MOST_SEED, MOST_STEPS, Setting
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.files import markdown_table, measured_rows, write_between
+from arcade_torch.tools.files import Row, markdown_table, measured_rows, read_rows, write_between
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least, at_most
 
@@ -98,7 +98,7 @@ class Options(BenchOptions):
     """
     page: Path | None = None
     """Markdown page that gets the table between its marks, and beside it, of the other tests, a
-    picture of its name.
+    picture of its name. It shows all models that the file has rows of, not the named alone.
     """
 
     def __post_init__(self) -> None:
@@ -157,8 +157,16 @@ def _run_tests(
             rows.append(row)
             yield "memory_tests", row._asdict()
     if options.page is not None:
-        write_between(options.page, table.BEGIN, table.END, table.markdown(rows, memories))
-        figure.write(options.page.with_suffix(".png"), rows, memories)
+        shown = rows
+        if options.out is not None:
+            shown = []
+            for row in rows_of_all(options.out, table.Row):
+                setting_of_row = (row.hidden_size, row.most_steps)
+                if setting_of_row == (options.hidden_size, options.steps) and row.seed in seeds:
+                    shown.append(row)
+        models = list(dict.fromkeys(row.model for row in shown))
+        write_between(options.page, table.BEGIN, table.END, table.markdown(shown, models))
+        figure.write(options.page.with_suffix(".png"), shown, models)
 
 
 def _run_symbol(
@@ -178,7 +186,17 @@ def _run_symbol(
             asked.append(row)
             yield "recall", row._asdict()
     if options.page is not None:
+        if options.out is not None:
+            rows = rows_of_all(options.out, Recall)
+            asked = [row for row in rows if (row.hidden_size, row.seed) == sizes]
         write_between(options.page, BEGIN, END, markdown(asked))
+
+
+def rows_of_all(file: Path, kind: type[Row]) -> list[Row]:
+    """The rows that a file has of registered models, in the order of the registry."""
+    names = memory_names()
+    known = [row for row in read_rows(file, kind) if row[0] in names]
+    return sorted(known, key=lambda row: names.index(row[0]))
 
 
 class Windows(NamedTuple):

@@ -19,11 +19,13 @@ from arcade_torch.tools.board.entry import (
     Hash,
     check_observations,
     check_protocol,
+    file_word,
     read_entry,
     read_table,
 )
 from arcade_torch.tools.board.evaluation import Evaluator, Played, made_with, weights_hash
 from arcade_torch.tools.board.protocol import PROTOCOL, Protocol
+from arcade_torch.tools.board.pull import pull
 from arcade_torch.tools.board.submit import Progress, checkpoint_name
 from arcade_torch.tools.run_folders import SETTINGS, RunFolders
 
@@ -31,6 +33,8 @@ MOST_FRAMES_AGAIN = 25_000_000
 """Frames of the longest run that `retrain` makes again."""
 LEAST_TOLERANCE = 0.002
 """Of a score, where every episode has the same return."""
+Origin = Literal["kept", "pulled", "retrained"]
+"""Where checkpoints come from: a folder, the hub that the entry names, or its settings."""
 _Count = Annotated[int, Range("a whole number from 0", lambda x: 0 <= x <= 10**6)]
 
 
@@ -46,7 +50,7 @@ class CheckRecord(Checked):
     of: _Count  # runs of the entry
     equal: _Count  # of them to the bit
     largest_difference: float  # of a score
-    weights: Literal["kept", "retrained"]  # where the checkpoints came from
+    weights: Origin  # where the checkpoints came from
     made_with: Options
 
     def __post_init__(self) -> None:
@@ -62,7 +66,7 @@ def check(
     protocol: Protocol = PROTOCOL,
     progress: Progress | None = None,
     generator: random.Random | None = None,
-    train_missing: bool = False,
+    weights: Origin = "kept",
 ) -> CheckRecord:
     """Evaluate an entry again.
 
@@ -77,7 +81,8 @@ def check(
         protocol: what is played.
         progress: told after every run.
         generator: of the draw; by default one that nobody can foresee.
-        train_missing: train runs that are not below ``runs`` there, from their settings.
+        weights: how to get runs that are not below ``runs``: not at all, from the hub that the
+            entry names, or by training them from their settings.
 
     Returns:
         What to record.
@@ -89,11 +94,11 @@ def check(
     entry = read_entry(file)
     check_protocol(entry, protocol)
     chosen = _drawn(entry.runs, cells, generator or random.SystemRandom())
-    if train_missing:
-        retrain(entry, chosen, runs, progress)
+    if weights != "kept":
+        get_missing = {"pulled": pull, "retrained": retrain}[weights]
+        get_missing(entry, chosen, runs, progress)
     folders = find_folders(entry, chosen, runs)
-    here_and_now = made_with()
-    is_same = _is_same_machine(entry.made_with, here_and_now)
+    is_same = _is_same_machine(entry.made_with, made_with())
     evaluator = Evaluator(protocol)
     differences = list[float]()
     equal = 0
@@ -112,8 +117,8 @@ def check(
         of=len(entry.runs),
         equal=equal,
         largest_difference=max(differences),
-        weights="retrained" if train_missing else "kept",
-        made_with=here_and_now,
+        weights=weights,
+        made_with=made_with(),
     )
 
 
@@ -239,11 +244,6 @@ def retrain(
         train(entry.config(run), out / name, resume=True)
         if progress is not None:
             progress(f"trained {run.name}", done, len(runs))
-
-
-def file_word(name: str) -> str:
-    """A name that a folder can have."""
-    return "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name)
 
 
 def record_file(entry: Path) -> Path:

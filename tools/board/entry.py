@@ -158,6 +158,11 @@ class Entry:
         return dataclasses.asdict(self)
 
 
+def file_word(name: str) -> str:
+    """A name that a folder can have."""
+    return "".join(letter if letter.isalnum() or letter in "._-" else "-" for letter in name)
+
+
 def read_entry(path: Path) -> Entry:
     """An entry from its file.
 

@@ -162,7 +162,8 @@ def _checked(record: CheckRecord | None) -> str:
     """What was checked, and when."""
     if record is None:
         return "not yet"
-    again = "trained and evaluated again" if record.weights == "retrained" else "evaluated again"
+    before = {"kept": "", "pulled": "pulled and ", "retrained": "trained and "}[record.weights]
+    again = f"{before}evaluated again"
     text = f"{record.runs} of {record.of} {again} {record.date}, {record.equal} equal to the bit"
     if record.equal < record.runs:
         text += f", others within {record.largest_difference:.4f}"

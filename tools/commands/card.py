@@ -7,7 +7,7 @@ from typing import Any
 import tyro
 
 from arcade_torch.agents.runs.files import write_atomic, write_json
-from arcade_torch.tools.cards.study import FRAMES, SEEDS
+from arcade_torch.tools.cards.study import FRAMES, GAMES, SEEDS
 from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
@@ -24,7 +24,8 @@ class Card(Command):
     It takes seconds for a built-in model of a checkout, whose tests are on file, and about two
     minutes for one of yours; --no-tests leaves them out. --study adds what agents with it learn: 36
     runs of Signpost, MineSweeper and CountRecall, both twins, beside the agent without memory. That
-    takes an hour or so; type the same again to go on after an interruption.
+    takes an hour or so; --games, --seeds and --frames make it smaller. Type the same again to go on
+    after an interruption.
 
     Example: arcade-torch card --import yours.py yours --study
     """
@@ -35,6 +36,7 @@ class Card(Command):
     tests: bool = True  # Train it in the tests of memory, where no results are on file.
     study: bool = False  # Train agents with it.
     frames: int = FRAMES  # Of each run of the study.
+    games: tuple[str, ...] = GAMES  # Of the study, on both twins.
     seeds: int = SEEDS  # Of each agent of the study.
     workers: int = 0  # Runs of the study at once; 0 for one a core.
     html: bool = True  # Write the page, not the JSON alone.
@@ -100,7 +102,7 @@ class Card(Command):
         from arcade_torch.tools.figures.style import drawing
         from arcade_torch.tools.studies.runner import make_engine, study
 
-        definition = card_study(name, self.frames, seeds=self.seeds)
+        definition = card_study(name, self.frames, self.games, self.seeds)
         check_memories_of(definition)
         root = self.out / f"{name}-study"
         say(f"{len(definition.runs())} runs of {self.frames:,} frames, in {root}")

@@ -79,24 +79,33 @@ class Check(Command):
     """Train the runs that are not below --runs first, from the settings in the entry: a run gives
     the same weights again on the same processor and versions.
     """
+    pull: bool = False
+    """Fetch the runs that are not below --runs first, from the hub that the entry names (extra
+    hub): only weights whose SHA-256 is in the entry.
+    """
     record: bool = False  # Keep beside the entry what was checked, for the page.
 
     def run(self) -> int:
         """Check, and say what was checked."""
-        from arcade_torch.tools.board.check import check, record_file, write_record
+        from arcade_torch.tools.board.check import Origin, check, record_file, write_record
 
         at_least(self, cells=0)
         if self.runs is None:
             raise ValueError(
-                "give the folder with the runs of the entry, --runs DIR; with --retrain they are "
-                "trained there"
+                "give the folder with the runs of the entry, --runs DIR; with --pull they are "
+                "fetched there, with --retrain trained"
             )
+        if self.retrain and self.pull:
+            raise ValueError("give --pull or --retrain, not both: --pull fetches checkpoints")
+        weights: Origin = "kept"
+        if self.pull or self.retrain:
+            weights = "pulled" if self.pull else "retrained"
         checked = check(
             self.file,
             self.runs,
             self.cells,
             progress=say_progress,
-            train_missing=self.retrain,
+            weights=weights,
         )
         say(
             f"agrees: {checked.runs} of {checked.of} runs evaluated again, {checked.equal} equal "

@@ -22,9 +22,9 @@ def test_a_run_that_is_trained_again_from_its_entry_has_the_same_weights_and_sco
     file = tmp_path / "entry.json"
     plain = plain_entry(tmp_path / "first")
     file.write_text(json.dumps(plain))
-    record = check(file, tmp_path / "second", protocol=SHORT, train_missing=True)
+    record = check(file, tmp_path / "second", protocol=SHORT, weights="retrained")
     assert (record.runs, record.equal, record.weights) == (2, 2, "retrained")
 
     monkeypatch.setattr(checks, "MOST_FRAMES_AGAIN", 100)
     with pytest.raises(EntryRefusedError, match="are not trained again, at most 100"):
-        check(file, tmp_path / "third", protocol=SHORT, train_missing=True)
+        check(file, tmp_path / "third", protocol=SHORT, weights="retrained")

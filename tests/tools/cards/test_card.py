@@ -198,6 +198,27 @@ def test_the_study_part_holds_the_gap_of_the_returns(
     assert len(part["returns"]) == 4 and part["notes"] == ["left out"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_a_card_with_a_study_says_what_was_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["card", "mingru", "--no-tests", "--study", "--games", "SignpostEasy"]
+    words += ["--seeds", "1", "--frames", "4096", "--workers", "1", "--out", str(tmp_path)]
+    assert cli.main(words) == 0
+    assert "4 runs of 4,096 frames" in capsys.readouterr().out
+    study = json.loads((tmp_path / "mingru.json").read_text())["study"]
+    assert (study["subject"], study["frames"], study["seeds"]) == ("mingru", 4096, 1)
+    tasks = {(row["agent"], row["game"], row["twin"]) for row in study["returns"]}
+    game = "SignpostEasy-v0"
+    assert tasks == {(a, game, t) for a in ("mingru", "mlp") for t in ("MDP", "POMDP")}
+    assert [row["twin"] for row in study["counterfactual"]] == ["MDP", "POMDP"]
+    text = (tmp_path / "mingru.html").read_text()
+    assert "What agents with it learn" in text and "SignpostEasy" in text
+    assert cli.main(words) == 0  # nothing is trained again
+    assert json.loads((tmp_path / "mingru.json").read_text())["study"] == study
+
+
 def test_every_built_in_memory_has_an_about_line() -> None:
     for name in memory_names():
         assert len(measure._about(make_memory(name, 8, 16))) > 10
