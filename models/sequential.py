@@ -93,14 +93,14 @@ class Loads:
         return self.stored[:, t] if self.stored.shape[1] > 1 else self.stored.new_zeros(())
 
 
-def time_first(like: Tensor, *shape: int) -> Tensor:
+def time_first(source: Tensor, *shape: int) -> Tensor:
     """An empty tensor [B, T, *shape] with B, T, dtype and device of another one [B, T, ...].
 
     Its steps lie one after the other in memory, so that a loop over time reads and writes each in
     one piece: 64 rows that lie T steps apart share few places of a processor's cache.
     """
-    batch, steps = like.shape[:2]
-    return like.new_empty(steps, batch, *shape).transpose(0, 1)
+    batch, steps = source.shape[:2]
+    return source.new_empty(steps, batch, *shape).transpose(0, 1)
 
 
 def in_time_order(x: Tensor) -> Tensor:

@@ -157,16 +157,15 @@ def _run_tests(
             rows.append(row)
             yield "memory_tests", row._asdict()
     if options.page is not None:
-        shown = rows
         if options.out is not None:
-            shown = []
+            rows = []
             for row in rows_of_all(options.out, table.Row):
                 setting_of_row = (row.hidden_size, row.most_steps)
                 if setting_of_row == (options.hidden_size, options.steps) and row.seed in seeds:
-                    shown.append(row)
-        models = list(dict.fromkeys(row.model for row in shown))
-        write_between(options.page, table.BEGIN, table.END, table.markdown(shown, models))
-        figure.write(options.page.with_suffix(".png"), shown, models)
+                    rows.append(row)
+        models = list(dict.fromkeys(row.model for row in rows))
+        write_between(options.page, table.BEGIN, table.END, table.markdown(rows, models))
+        figure.write(options.page.with_suffix(".png"), rows, models)
 
 
 def _run_symbol(
@@ -195,8 +194,8 @@ def _run_symbol(
 def rows_of_all(file: Path, kind: type[Row]) -> list[Row]:
     """The rows that a file has of registered models, in the order of the registry."""
     names = memory_names()
-    known = [row for row in read_rows(file, kind) if row[0] in names]
-    return sorted(known, key=lambda row: names.index(row[0]))
+    rows = [row for row in read_rows(file, kind) if row[0] in names]
+    return sorted(rows, key=lambda row: names.index(row[0]))
 
 
 class Windows(NamedTuple):
