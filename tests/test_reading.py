@@ -1,6 +1,7 @@
 """How the code reads: one thought a line, functions that fit a screen, names that name something.
 
-Counted with ``ast`` in the five code folders; each failure names file and line.
+Counted with ``ast`` in the five code folders, and in the examples as far as length goes; each
+failure names file and line.
 """
 
 import ast
@@ -79,7 +80,7 @@ def test_comprehensions_are_rare(folder: str) -> None:
     assert len(wrong) <= MOST_COMPREHENSIONS[folder] * lines(folder) / 1000, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples"))
 def test_lines_and_functions_are_short(folder: str) -> None:
     wrong = []
     for path in files(folder):
