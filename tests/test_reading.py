@@ -15,6 +15,15 @@ FOLDERS = ("envs_jax", "arcade_torch", "models", "agents", "tools")
 MOST_LETTERS = 100
 MOST_LINES = 60
 """Of a function, its docstring included."""
+MOST_LINES_OF_A_FILE = 450
+LONGER_FILES = {
+    "arcade_torch/env.py": "one class, TorchRL's methods",
+    "arcade_torch/jax_env.py": "the same for the envs of other suites",
+    "arcade_torch/collector.py": "one class, TorchRL's protocol of collectors",
+    "arcade_torch/rollout_buffer.py": "one class, a window that is written, read, saved and loaded",
+    "tools/measures/counterfactual/measure.py": "a measure is one file that is imported alone",
+}
+"""Wholes that would read worse in parts."""
 MOST_PARALLEL = 3
 """Assignments ``a, b = x, y`` in 1,000 lines that are not empty: pairs by nature."""
 MOST_COMPREHENSIONS = dict.fromkeys(FOLDERS, 20) | {"tools": 30}
@@ -93,6 +102,16 @@ def test_lines_and_functions_are_short(folder: str) -> None:
             if length > MOST_LINES:
                 wrong.append(f"{place}: {node.name} has {length} lines")
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_files_are_short_or_one_whole(folder: str) -> None:
+    longer = set()
+    for path in files(folder):
+        if len(path.read_text(encoding="utf-8").splitlines()) > MOST_LINES_OF_A_FILE:
+            longer.add(str(path.relative_to(ROOT)))
+    allowed = {name for name in LONGER_FILES if name.startswith(f"{folder}/")}
+    assert longer == allowed
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
