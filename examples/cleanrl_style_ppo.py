@@ -27,8 +27,16 @@ register_games(
     ["SignpostEasy-v0"]
 )  # a probe; the games of the benchmark are registered by `import arcade_torch`
 
-NUM_ENVS, NUM_STEPS, MINIBATCHES, EPOCHS = 32, 20, 4, 3
-LEARNING_RATE, GAMMA, LAMBDA, CLIP, ENTROPY, VALUE = 5e-4, 0.99, 0.95, 0.2, 0.01, 0.5
+NUM_ENVS = 32
+NUM_STEPS = 20
+MINIBATCHES = 4
+EPOCHS = 3
+LEARNING_RATE = 5e-4
+GAMMA = 0.99
+LAMBDA = 0.95
+CLIP = 0.2
+ENTROPY = 0.01
+VALUE = 0.5
 
 
 class Agent(nn.Module):

@@ -50,7 +50,8 @@ class Gated(nn.Module):
         self, channels: int, out: int, kernel: int, stride: int = 1, pool: int = 1
     ) -> None:
         super().__init__()
-        self.conv, self.pool = nn.Conv2d(channels, 2 * out, kernel, stride), pool
+        self.conv = nn.Conv2d(channels, 2 * out, kernel, stride)
+        self.pool = pool
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, C, h, w] -> [N, out, h', w']."""
@@ -97,14 +98,14 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
     """Frames uint8 [T, 64, 64, 3] of 64 games in which half of the moves are random, and numbers
     [T, cells] by name.
     """
-    num_envs, rng = 64, np.random.default_rng(seed)
+    num_envs = 64
+    rng = np.random.default_rng(seed)
     batched = BatchedGame(make(name))
     oracle = make_oracle(batched.game)
-    batch, is_init = (
-        batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool)),
-        np.ones(num_envs, bool),
-    )
-    pixels, seen = batched.render(batch), []
+    batch = batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool))
+    is_init = np.ones(num_envs, bool)
+    pixels = batched.render(batch)
+    seen = []
     answers: dict[str, list[np.ndarray]] = {}
     for t in range(4 * frames // num_envs):
         state = jax.tree.map(np.asarray, batch.state)
@@ -114,7 +115,8 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
             seen.append(halves.float().mean((2, 4)).to(torch.uint8))
             answers.setdefault("action", []).append(action[:, None])
             for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-                fact, cells = jax.tree_util.keystr(path).strip("."), leaf.reshape(num_envs, -1)
+                fact = jax.tree_util.keystr(path).strip(".")
+                cells = leaf.reshape(num_envs, -1)
                 if cells.shape[1] <= 128 and not any(
                     word in fact for word in ("time", "key", "step")
                 ):
