@@ -28,7 +28,8 @@ _MODULES = {
     "runs.files": ("CheckpointError",),
     "runs.folder": ("RunFolderError",),
     "runs.shipped": ("pretrained_names",),
-    "training": ("TrainResult", "Trainer", "train"),
+    "trainer": ("Trainer",),
+    "training": ("TrainResult", "train"),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -49,7 +50,8 @@ if TYPE_CHECKING:
     from arcade_torch.agents.runs.files import CheckpointError
     from arcade_torch.agents.runs.folder import RunFolderError
     from arcade_torch.agents.runs.shipped import pretrained_names
-    from arcade_torch.agents.training import Trainer, TrainResult, train
+    from arcade_torch.agents.trainer import Trainer
+    from arcade_torch.agents.training import TrainResult, train
 
 __all__ = [
     "DQN", "PPO", "PQN", "Agent", "CheckpointError", "DQNConfig", "DQNLoss", "EvalResult",

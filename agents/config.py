@@ -1,26 +1,25 @@
-"""What a run is: frozen dataclasses of plain numbers, their checks, their JSON form; nothing here
-imports torch.
-"""
+"""What a run is: frozen dataclasses of plain numbers, and their JSON form. Imports no torch."""
 
 import dataclasses
-import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    NamedTuple,
-    get_args,
-    get_origin,
-    get_type_hints,
+from typing import Annotated, Any, ClassVar, Literal
+
+from arcade_torch.agents.checked import (
+    Checked,
+    Count,
+    CountOrZero,
+    Fraction,
+    Options,
+    Positive,
+    PositiveOrZero,
+    Range,
+    Text,
+    require,
 )
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
-# fields that do not belong to a run's identity
-RESUME_MAY_CHANGE = ("checkpoint_every", "threads", "logger")
 # Names that are no options, because other fields decide them and learners rely on them.
 OF_ENV = (
     "id",
@@ -44,111 +43,11 @@ OF_NETWORK = (
     "store",
     "encoder",
 )
-
-
-class Range(NamedTuple):
-    """Values that a field may hold: in words, and as a test."""
-
-    allowed: str
-    holds: Callable[[Any], bool]
-
-
-Text = Annotated[str, Range("a non-empty string", lambda x: x != "")]
 DEVICE = re.compile(r"cpu(:0)?|cuda(:(0|[1-9][0-9]{0,2}))?")
 Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", DEVICE.fullmatch)]
-# Bounded, so that no slip and no file of somebody else asks for all memory there is.
-Count = Annotated[int, Range("a whole number >= 1 (and at most 10**6)", lambda x: 1 <= x <= 10**6)]
-CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: 0 <= x <= 10**15)]
 Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
-Positive = Annotated[float, Range("a number > 0", lambda x: x > 0.0)]
-PositiveOrZero = Annotated[float, Range("a number >= 0", lambda x: x >= 0.0)]
-Fraction = Annotated[float, Range("a number in [0, 1]", lambda x: 0.0 <= x <= 1.0)]
-Options = Mapping[str, Any]
 TimeLimit = Literal["bootstrap", "terminal"]
 Bootstrap = Literal["next", "last"]
-
-
-def require(condition: bool, name: str, value: Any, allowed: str) -> None:
-    """Unless a condition holds, refuse a value (ValueError) in one line that names it and says what
-    is allowed.
-    """
-    if not condition:
-        one_line = " ".join(line.strip() for line in repr(value).splitlines())
-        raise ValueError(f"{name} must be {allowed}; got {one_line}")
-
-
-def coerce(name: str, value: Any, kind: Any) -> Any:
-    """The value of a field, whole floats as ints; refused where its annotation, type or
-    :class:`Range`, forbids it.
-    """
-    if get_origin(kind) is Annotated:
-        kind, limits = get_args(kind)
-        value = coerce(name, value, kind)
-        require(bool(limits.holds(value)), name, value, limits.allowed)
-        return value
-    if get_origin(kind) is Literal:
-        return _choice(name, value, get_args(kind))
-    if kind == Options:
-        return _options(name, value)
-    if kind is int:
-        require(_is_number(value) and value == value // 1, name, value, "a whole number")
-        return int(value)
-    if kind is float:
-        too_large = _is_number(value) and abs(value) >= 2.0**1000  # float() would overflow
-        require(_is_number(value) and not too_large, name, value, "a number")
-        return float(value)
-    words = {str: "a string", bool: "true or false"}
-    require(isinstance(value, kind), name, value, words.get(kind, f"a {kind.__name__}"))
-    return value
-
-
-def _choice(name: str, value: Any, choices: tuple[str, ...]) -> str:
-    """One of several words."""
-    *first, last = map(repr, choices)
-    allowed = f"{', '.join(first)} or {last}" if first else last
-    require(isinstance(value, str) and value in choices, name, value, allowed)
-    return value  # type: ignore[no-any-return]
-
-
-def _options(name: str, value: Any) -> dict[str, Any]:
-    """A table of options that a config file can hold."""
-    require(isinstance(value, Mapping), name, value, "a mapping of option names to values")
-    for option, given in value.items():
-        kept = survives_json({option: given})
-        require(kept, f"{name}.{option}", given, "a value that JSON gives back as it was")
-    return dict(value)
-
-
-def _is_number(value: Any) -> bool:
-    """Whether a value is a number, true and false not counted."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def survives_json(value: Any) -> bool:
-    """Whether JSON gives a value back as it was."""
-    try:
-        return bool(json.loads(json.dumps(value)) == value)
-    except (TypeError, ValueError, RecursionError):  # it cannot be written, or not be compared
-        return False
-
-
-@dataclass(frozen=True)
-class Checked:
-    """A frozen dataclass whose fields are checked by their annotations, with one clear line for
-    what does not fit.
-    """
-
-    # what the names of its fields begin with in messages
-    GROUP: ClassVar[str] = ""
-
-    def __post_init__(self) -> None:
-        kinds = get_type_hints(type(self), include_extras=True)
-        for item in dataclasses.fields(self):
-            value = coerce(self.GROUP + item.name, getattr(self, item.name), kinds[item.name])
-            object.__setattr__(self, item.name, value)
-
-    def _require(self, condition: bool, name: str, allowed: str) -> None:
-        require(condition, self.GROUP + name, getattr(self, name, None), allowed)
 
 
 @dataclass(frozen=True)
@@ -503,65 +402,6 @@ class TrainConfig(Checked):
         for name, kind in GROUPS.items():
             values[name] = kind(**_fields_of(kind, values.get(name, {}), kind.GROUP))
         return cls(**values)
-
-
-Settings = TrainConfig | Mapping[str, Any]  # a config, or what a ``config.json`` holds
-
-
-def differing_fields(
-    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
-) -> list[str]:
-    """Names of the fields that make two configs different runs, as ``name (this != that)``; see
-    `differing_values`.
-    """
-    pairs = differing_values(one, other, free).items()
-    return [f"{name} ({this!r} != {that!r})" for name, (this, that) in pairs]
-
-
-def differing_values(
-    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
-) -> dict[str, tuple[Any, Any]]:
-    """The settings in which two runs differ: dotted name -> both values.
-
-    Args:
-        one: settings of a run, as a config or as its ``config.json`` holds them. A setting that is
-            not there has its default: the run may be from before there was that setting. One that
-            is not known here is None where it is missing.
-        other: those of another.
-        free: settings, and groups of settings, that may differ. The groups of learners that neither
-            run uses make no difference.
-    """
-    default = flatten(TrainConfig().to_dict())
-    mine = default | flatten(_stated(one))
-    theirs = default | flatten(_stated(other))
-    used = {str(mine["algorithm"]), str(theirs["algorithm"])}
-    skipped = {*free} | {*GROUPS} - used
-    pairs = dict[str, tuple[Any, Any]]()
-    for name in sorted(mine.keys() | theirs.keys()):
-        group = name.partition(".")[0]
-        values = mine.get(name), theirs.get(name)
-        if values[0] != values[1] and not {name, group} & skipped:
-            pairs[name] = values
-    return pairs
-
-
-def _stated(settings: Settings) -> dict[str, Any]:
-    """Plain settings without those that are null, which say nothing."""
-    plain = settings.to_dict() if isinstance(settings, TrainConfig) else settings
-    return {name: value for name, value in plain.items() if value is not None}
-
-
-def flatten(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as dotted keys: ``{"device": "cpu", "pqn": {"gamma": 0.9}}`` has
-    ``pqn.gamma``.
-    """
-    settings = dict[str, Any]()
-    for name, value in plain.items():
-        if isinstance(value, Mapping):
-            settings |= flatten(value, f"{prefix}{name}.")
-        else:
-            settings[prefix + name] = value
-    return settings
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:

@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 import arcade_torch
-from arcade_torch.agents.config import SEED_LIMIT, TrainConfig, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
 
 MOST_EPISODES = 2**16

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.models.memory import MemoryModule
+from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.rollout_buffer import final_key
 
@@ -32,6 +32,7 @@ class NetworkInputs:
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
         self.observation_keys = [key for key in keys if key not in self.state_keys]
+        self.final_keys = {key: final_key(key) for key in keys}
         self.stores = set()
         for module in network.modules():
             if isinstance(module, MemoryModule | MemoryNetwork):
@@ -276,7 +277,7 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
     """
     if key == "is_init":
         return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
-    final = batch.get(final_key(key), None)
+    final = batch.get(inputs.final_keys[key], None)
     if final is not None:
         return final  # type: ignore[no-any-return]
     value = batch.get(unravel_key(("next", key)), None)
@@ -286,7 +287,7 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
         value = batch.get(key, None)
     if value is None:
         raise KeyError(
-            f"no next observations: neither {final_key(key)!r} nor ('next', {key!r}); take "
+            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}); take "
             "collect() or 'all'"
         )
     return _rows(value, steps)

@@ -19,7 +19,8 @@ from torchrl.modules import PopArtValueNorm, ProbabilisticActor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from arcade_torch.agents.config import PPOConfig, TimeLimit, coerce, require
+from arcade_torch.agents.checked import coerce, require
+from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import Key, NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import SequenceGAE

@@ -16,7 +16,8 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from arcade_torch.agents.config import Bootstrap, CountOrZero, PQNConfig, TimeLimit, coerce, require
+from arcade_torch.agents.checked import CountOrZero, coerce, require
+from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
 from arcade_torch.agents.layout import (
     Key,
     NetworkInputs,

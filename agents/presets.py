@@ -4,7 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from arcade_torch.agents.config import GROUPS, TrainConfig, coerce, require
+from arcade_torch.agents.checked import coerce, require
+from arcade_torch.agents.config import GROUPS, TrainConfig
 
 _SMALL = {
     "num_envs": 64,

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file, save
 from tensordict import TensorDict, TensorDictBase
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import (
     CheckpointError,
     checksum,

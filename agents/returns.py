@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives.value import TDLambdaEstimator
 
-from arcade_torch.agents.config import TimeLimit, coerce
+from arcade_torch.agents.checked import coerce
+from arcade_torch.agents.config import TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, is_stock, unroll
 
 

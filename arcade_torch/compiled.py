@@ -15,7 +15,6 @@ import numpy as np
 from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
-from arcade_torch.envs_jax.mixture import Batched
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.validation import format_value, plain
 from arcade_torch.frame_memory import Canvas, Spare
@@ -62,10 +61,8 @@ class CompiledGame:
             )
         return compiled_game, self.recipe
 
-    def __init__(self, game: Game[Any] | Batched) -> None:
-        self.batched: Batched = (
-            game if isinstance(game, BatchedGame | MixedGames) else BatchedGame(game)
-        )
+    def __init__(self, game: Game[Any] | BatchedGame[Any]) -> None:
+        self.batched = game if isinstance(game, BatchedGame) else BatchedGame(game)
         self.step = compiled(self._step, donate_argnums=2, keep_unused=True)
         self._step_into = compiled(self._flat_step_into, donate_argnums=0)
         self._structure: Any = None  # of a step, whose leaves ``_step_into`` gives

@@ -17,8 +17,7 @@ from torchrl.data import Composite, Unbounded
 from arcade_torch.devices import wait_for_torch
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
-from arcade_torch.envs_jax.batch import Batch
-from arcade_torch.envs_jax.mixture import Batched
+from arcade_torch.envs_jax.batch import Batch, BatchedGame
 from arcade_torch.validation import check_tensor
 
 # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
@@ -154,7 +153,7 @@ class Snapshots:
     """
 
     def __init__(
-        self, batched: Batched, batch: Batch, device: torch.device, jax_device: jax.Device
+        self, batched: BatchedGame[Any], batch: Batch, device: torch.device, jax_device: jax.Device
     ) -> None:
         num_envs = int(batch.step_count.shape[0])
         padded = jax.eval_shape(batched.pad, batch)

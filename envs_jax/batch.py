@@ -4,7 +4,6 @@ Every env carries its own random key, so env ``i`` of a large batch walks the ve
 alone, and stepping then resetting by mask gives the same bits as the fused step.
 """
 
-import abc
 from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -88,12 +87,33 @@ def choose_rows(mask: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(choose, yes, no)
 
 
-class Steps(abc.ABC):
-    """What a batch of one game and a batch of several do alike, put together from stepping,
-    resetting and drawing.
+class BatchedGame(Generic[State]):
+    """Compiled functions over a batch of one game; each is compiled once per batch size.
+
+    ``MixedGames`` is the same for several games.
+
+    Args:
+        game: The game to batch.
+
+    Attributes:
+        game: The same.
+        groups: The batches of one game that this one is put together from: itself.
+
+    Raises:
+        ValueError: It is not one of this package and does not keep the contract; see
+            ``check_game``.
     """
 
-    def __init__(self) -> None:
+    groups: tuple["BatchedGame[Any]", ...]
+
+    def __init__(self, game: Game[State]) -> None:
+        check_foreign(game)
+        self.game = game
+        self.groups = (self,)
+        self._compile()
+
+    def _compile(self) -> None:
+        """Compile what users call; inside of compiled functions the plain methods are called."""
         self.init = compiled(self._init)
         self.step = compiled(self._step)
         self.render = compiled(self._render)
@@ -104,131 +124,8 @@ class Steps(abc.ABC):
         self.step_auto = self.step_autoreset  # the name until 0.2
         self.step_render = compiled(self._step_render)
 
-    @abc.abstractmethod
-    def without_ends(self, batch: Batch) -> Batch:
-        """The batch without the flags of an end: it says by its structure that every episode runs.
-
-        A step of such a batch has nothing to hold, so it is faster. Resetting gives one again.
-        """
-
-    @abc.abstractmethod
-    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
-        """The batch with the flags of an end, bool [N] each."""
-
-    @abc.abstractmethod
-    def ends(self, batch: Batch) -> tuple[Array, Array]:
-        """``terminated`` and ``truncated`` of a batch that has flags, bool [N] each."""
-
-    @abc.abstractmethod
     def _init(self, keys: Array, partial: Array) -> Batch:
         """Begin N episodes from ``keys`` (uint32 [N, 2]), seen as ``partial`` says (bool [N])."""
-
-    @abc.abstractmethod
-    def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
-        """Take one action in every env. What comes has the flags of an end, whether the batch has
-        them or not.
-
-        An episode that has ended stays as it is: state, counts and both flags, with the reward 0,
-        and its random key.
-        """
-
-    @abc.abstractmethod
-    def _reset_where(self, batch: Batch, mask: Array) -> Batch:
-        """Begin a new episode where ``mask`` (bool [N]) is true; all other rows keep their bits."""
-
-    @abc.abstractmethod
-    def _render(self, batch: Batch) -> Array:
-        """Draw every env: uint8 [N, S, S, 3]."""
-
-    @abc.abstractmethod
-    def _facts(self, batch: Batch) -> dict[str, Array]:
-        """The facts of every env, see :meth:`Game.facts`: arrays [N, ...] that share no memory with
-        the batch.
-        """
-
-    def _step_autoreset(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
-        """Step, begin anew where an episode ended, then draw once.
-
-        Returns:
-            The batch to go on with, the batch before the resets (its ended rows are the final
-            states), what the step gave, and the frames of the first.
-        """
-        stepped, outcome = self._step(batch, action)
-        root = self._reset_where(stepped, outcome.done)
-        return root, stepped, outcome, self._render(root)
-
-    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
-        """Step and draw, without any reset."""
-        stepped, outcome = self._step(batch, action)
-        return stepped, outcome, self._render(stepped)
-
-    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
-        """Begin anew where ``mask`` is true, and draw all."""
-        root = self._reset_where(batch, mask)
-        return root, self._render(root)
-
-
-class BatchedGame(Steps, Generic[State]):
-    """Compiled functions over a batch of one game; each is compiled once per batch size.
-
-    Args:
-        game: The game to batch.
-
-    Raises:
-        ValueError: It is not one of this package and does not keep the contract; see
-            ``check_game``.
-    """
-
-    def __init__(self, game: Game[State]) -> None:
-        check_foreign(game)
-        self.game = game
-        super().__init__()
-
-    @property
-    def groups(self) -> tuple["BatchedGame[State]", ...]:
-        """The games of the batch, here one; see ``MixedGames``."""
-        return (self,)
-
-    def rows(self, num_envs: int) -> tuple[slice, ...]:
-        """The envs of each game of the batch: here all."""
-        return (slice(0, num_envs),)
-
-    def task(self, num_envs: int) -> npt.NDArray[np.int64]:
-        """The index of the game that each env plays, int64 [num_envs]: here 0."""
-        return np.zeros(num_envs, np.int64)
-
-    def states(self, state: Any) -> tuple[Any, ...]:
-        """The states of each game's own envs."""
-        return (state,)
-
-    def pad(self, batch: Batch) -> Batch:
-        """The batch with all leaves [N, ...], which it has; see ``MixedGames``."""
-        return batch
-
-    def unpad(self, batch: Batch) -> Batch:
-        """The inverse of ``pad``."""
-        return batch
-
-    def without_ends(self, batch: Batch) -> Batch:
-        """See :meth:`Steps.without_ends`."""
-        if keeps_ends(batch.state):
-            batch = batch._replace(state=batch.state._replace(terminated=UNSET, truncated=UNSET))
-        return batch._replace(terminated=UNSET, truncated=UNSET)
-
-    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
-        """See :meth:`Steps.with_ends`."""
-        if keeps_ends(batch.state):
-            return batch._replace(
-                state=batch.state._replace(terminated=terminated, truncated=truncated)
-            )
-        return batch._replace(terminated=terminated, truncated=truncated)
-
-    def ends(self, batch: Batch) -> tuple[Array, Array]:
-        """See :meth:`Steps.ends`."""
-        keeper = _keeper(batch)
-        return keeper.terminated, keeper.truncated
-
-    def _init(self, keys: Array, partial: Array) -> Batch:
         key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros(keys.shape[0], jnp.int32)
@@ -237,6 +134,12 @@ class BatchedGame(Steps, Generic[State]):
         )
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
+        """Take one action in every env. What comes has the flags of an end, whether the batch has
+        them or not.
+
+        An episode that has ended stays as it is: state, counts and both flags, with the reward 0,
+        and its random key.
+        """
         action = jnp.asarray(action, jnp.int32)
         stepped, outcome = self._step_running(self.without_ends(batch), action)
         if not has_ends(batch):
@@ -262,6 +165,7 @@ class BatchedGame(Steps, Generic[State]):
         return self.with_ends(stepped, terminated, truncated), outcome
 
     def _reset_where(self, batch: Batch, mask: Array) -> Batch:
+        """Begin a new episode where ``mask`` (bool [N]) is true; all other rows keep their bits."""
         key, first = _split(batch.key)
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros_like(batch.step_count)
@@ -273,11 +177,78 @@ class BatchedGame(Steps, Generic[State]):
         return Batch(*choose_rows(mask, self.without_ends(fresh), self.without_ends(batch)))
 
     def _render(self, batch: Batch) -> Array:
+        """Draw every env: uint8 [N, S, S, 3]."""
         return jax.vmap(self.game.render)(batch.state, batch.partial)
 
     def _facts(self, batch: Batch) -> dict[str, Array]:
+        """The facts of every env, see :meth:`Game.facts`: arrays [N, ...] that share no memory with
+        the batch.
+        """
         facts: dict[str, Array] = jax.vmap(self.game.facts)(batch.state)
         return facts
+
+    def _step_autoreset(self, batch: Batch, action: Array) -> tuple[Batch, Batch, Outcome, Array]:
+        """Step, begin anew where an episode ended, then draw once.
+
+        Returns:
+            The batch to go on with, the batch before the resets (its ended rows are the final
+            states), what the step gave, and the frames of the first.
+        """
+        stepped, outcome = self._step(batch, action)
+        root = self._reset_where(stepped, outcome.done)
+        return root, stepped, outcome, self._render(root)
+
+    def _step_render(self, batch: Batch, action: Array) -> tuple[Batch, Outcome, Array]:
+        """Step and draw, without any reset."""
+        stepped, outcome = self._step(batch, action)
+        return stepped, outcome, self._render(stepped)
+
+    def _reset_render(self, batch: Batch, mask: Array) -> tuple[Batch, Array]:
+        """Begin anew where ``mask`` is true, and draw all."""
+        root = self._reset_where(batch, mask)
+        return root, self._render(root)
+
+    def without_ends(self, batch: Batch) -> Batch:
+        """The batch without the flags of an end: it says by its structure that every episode runs.
+
+        A step of such a batch has nothing to hold, so it is faster. Resetting gives one again.
+        """
+        if keeps_ends(batch.state):
+            batch = batch._replace(state=batch.state._replace(terminated=UNSET, truncated=UNSET))
+        return batch._replace(terminated=UNSET, truncated=UNSET)
+
+    def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
+        """The batch with the flags of an end, bool [N] each."""
+        if keeps_ends(batch.state):
+            return batch._replace(
+                state=batch.state._replace(terminated=terminated, truncated=truncated)
+            )
+        return batch._replace(terminated=terminated, truncated=truncated)
+
+    def ends(self, batch: Batch) -> tuple[Array, Array]:
+        """``terminated`` and ``truncated`` of a batch that has flags, bool [N] each."""
+        keeper = _keeper(batch)
+        return keeper.terminated, keeper.truncated
+
+    def rows(self, num_envs: int) -> tuple[slice, ...]:
+        """The envs of each game of the batch: here all."""
+        return (slice(0, num_envs),)
+
+    def task(self, num_envs: int) -> npt.NDArray[np.int64]:
+        """The index of the game that each env plays, int64 [num_envs]: here 0."""
+        return np.zeros(num_envs, np.int64)
+
+    def states(self, state: Any) -> tuple[Any, ...]:
+        """The states of each game's own envs."""
+        return (state,)
+
+    def pad(self, batch: Batch) -> Batch:
+        """The batch with all leaves [N, ...], which it has; see ``MixedGames``."""
+        return batch
+
+    def unpad(self, batch: Batch) -> Batch:
+        """The inverse of ``pad``."""
+        return batch
 
 
 def with_flags(batch: Batch) -> Batch:

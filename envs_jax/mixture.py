@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, Steps, with_flags
+from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, with_flags
 from arcade_torch.envs_jax.game import NUM_ACTIONS, UNSET, Array, Game
 from arcade_torch.envs_jax.render.screen import WORD
 from arcade_torch.envs_jax.settings import compiled, raw_key
@@ -73,7 +73,7 @@ class Mixture:
         return f"mixture({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
 
 
-class MixedGames(Steps):
+class MixedGames(BatchedGame[Any]):
     """Compiled functions over a batch in which every env plays one of several games.
 
     Has the methods of ``BatchedGame`` with the same meaning, so that the bridge takes either. In
@@ -98,14 +98,19 @@ class MixedGames(Steps):
         [0, 0, 0, 0, 1, 1]
     """
 
+    game: Mixture  # type: ignore[assignment]  # says of itself what a game does
+
     def __init__(self, games: Sequence[Game[Any]], weights: Sequence[int] | None = None) -> None:
         shares = tuple(weights) if weights is not None else (1,) * len(games)
         _check(games, shares)
         self.game = Mixture(tuple(games), shares)
         self.groups = tuple(BatchedGame(game) for game in games)
-        super().__init__()
-        self.pad = compiled(self._pad)
-        self.unpad = compiled(self._unpad)
+        self._compile()
+
+    def _compile(self) -> None:
+        super()._compile()
+        self._padded = compiled(self._pad)
+        self._unpadded = compiled(self._unpad)
 
     def rows(self, num_envs: int) -> tuple[slice, ...]:
         """The envs of each game: contiguous, as the weights say, what is left over going to the
@@ -144,14 +149,14 @@ class MixedGames(Steps):
         return tuple(state[game.id] for game in self.game.games)
 
     def without_ends(self, batch: Batch) -> Batch:
-        """See :meth:`Steps.without_ends`."""
+        """See :meth:`BatchedGame.without_ends`."""
         running = []
         for group, part in zip(self.groups, self._parts(batch), strict=True):
             running.append(group.without_ends(part))
         return self._join(running)
 
     def with_ends(self, batch: Batch, terminated: Array, truncated: Array) -> Batch:
-        """See :meth:`Steps.with_ends`."""
+        """See :meth:`BatchedGame.with_ends`."""
         all_rows = self.rows(len(batch.step_count))
         flagged = []
         for group, part, rows in zip(self.groups, self._parts(batch), all_rows, strict=True):
@@ -159,7 +164,7 @@ class MixedGames(Steps):
         return self._join(flagged)
 
     def ends(self, batch: Batch) -> tuple[Array, Array]:
-        """See :meth:`Steps.ends`."""
+        """See :meth:`BatchedGame.ends`."""
         terminated = []
         truncated = []
         for group, part in zip(self.groups, self._parts(batch), strict=True):
@@ -219,10 +224,19 @@ class MixedGames(Steps):
             raise ValueError(_no_shared_facts(self.game.games, of_games))
         return shared
 
-    def _pad(self, batch: Batch) -> Batch:
+    def pad(self, batch: Batch) -> Batch:
         """The batch with all leaves [N, ...]: states of a game are zero in the envs that play
         another.
         """
+        padded: Batch = self._padded(batch)
+        return padded
+
+    def unpad(self, batch: Batch) -> Batch:
+        """The inverse of ``pad``."""
+        unpadded: Batch = self._unpadded(batch)
+        return unpadded
+
+    def _pad(self, batch: Batch) -> Batch:
         size = len(batch.step_count)
         state = {}
         for game, rows in zip(self.game.games, self.rows(size), strict=True):
@@ -234,7 +248,6 @@ class MixedGames(Steps):
         return batch._replace(state=state)
 
     def _unpad(self, batch: Batch) -> Batch:
-        """The inverse of ``pad``."""
         state = {}
         for game, rows in zip(self.game.games, self.rows(len(batch.step_count)), strict=True):
             state[game.id] = _rows_of(batch.state[game.id], rows)
@@ -278,9 +291,6 @@ def _join_words(*frames: Array) -> Array:
         words.append(jax.lax.bitcast_convert_type(pixels, jnp.uint32))
     joined = jax.lax.bitcast_convert_type(jnp.concatenate(words), jnp.uint8)
     return joined.reshape(-1, *frames[0].shape[1:])
-
-
-Batched = BatchedGame[Any] | MixedGames
 
 
 def _without_states(batches: Sequence[Batch]) -> list[Batch]:

@@ -27,7 +27,10 @@ from torchrl.objectives.value import GAE
 import arcade_torch
 from arcade_torch.models import MemoryModule, SmallEncoder, make_memory
 
-NUM_ENVS, NUM_STEPS, WIDTH, ENTROPY = 16, 8, 128, 0.05
+NUM_ENVS = 16
+NUM_STEPS = 8
+WIDTH = 128
+ENTROPY = 0.05
 
 
 class Result(NamedTuple):
@@ -61,20 +64,18 @@ def main(frames: int = 100_000, memory: str = "mingru") -> Result:
     critic = TensorDictSequential(
         body, TensorDictModule(nn.Linear(WIDTH, 1), ["remembered"], ["state_value"])
     )
-    parameters = list(
-        {id(p): p for module in (policy, critic) for p in module.parameters()}.values()
-    )
+    parameters = list(nn.ModuleList([policy, critic]).parameters())  # the body's once
     optimizer = torch.optim.Adam(parameters, lr=1e-3)
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
 
     env = arcade_torch.make("SignpostEasy", num_envs=NUM_ENVS, observability="partial", seed=0)
-    primed = TransformedEnv(
-        env, get_primers_from_module(policy)
-    )  # memory is empty where an episode begins
+    # memory is empty where an episode begins
+    primed = TransformedEnv(env, get_primers_from_module(policy))
     collector = Collector(
         primed, policy, frames_per_batch=NUM_ENVS * NUM_STEPS, total_frames=frames
     )
-    worst, returns = 0.0, []
+    worst = 0.0
+    returns = []
     for window, batch in enumerate(collector):
         with set_recurrent_mode(True):  # the last dimension of the batch is time
             advantage(batch)

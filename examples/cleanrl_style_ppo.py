@@ -5,12 +5,14 @@ Nothing here is TorchRL. ``gymnasium.make_vec`` gives one environment of N games
 compiled call; with ``autoreset_mode="SameStep"`` no step is lost at an end, and the final frame,
 whose value a truncated episode bootstraps from, stands in ``infos["final_obs"]``.
 
-    python examples/cleanrl_style_ppo.py --frames 40000   # prints returns of -0.60, then 0.90 after
-    16,000 frames python examples/cleanrl_style_ppo.py --sb3 --frames 10000   # a greedy return of
-    0.85 after 10,240 frames
+    python examples/cleanrl_style_ppo.py --frames 40000
+    # returns of -0.60, then 0.90 after 16,000 frames
+    python examples/cleanrl_style_ppo.py --sb3 --frames 10000
+    # a greedy return of 0.85 after 10,240 frames
 """
 
 import argparse
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,8 +27,16 @@ register_games(
     ["SignpostEasy-v0"]
 )  # a probe; the games of the benchmark are registered by `import arcade_torch`
 
-NUM_ENVS, NUM_STEPS, MINIBATCHES, EPOCHS = 32, 20, 4, 3
-LEARNING_RATE, GAMMA, LAMBDA, CLIP, ENTROPY, VALUE = 5e-4, 0.99, 0.95, 0.2, 0.01, 0.5
+NUM_ENVS = 32
+NUM_STEPS = 20
+MINIBATCHES = 4
+EPOCHS = 3
+LEARNING_RATE = 5e-4
+GAMMA = 0.99
+LAMBDA = 0.95
+CLIP = 0.2
+ENTROPY = 0.01
+VALUE = 0.5
 
 
 class Agent(nn.Module):
@@ -45,7 +55,8 @@ class Agent(nn.Module):
             nn.Linear(32 * 6 * 6, 128),
             nn.ReLU(),
         )
-        self.policy, self.value = nn.Linear(128, num_actions), nn.Linear(128, 1)
+        self.policy = nn.Linear(128, num_actions)
+        self.value = nn.Linear(128, 1)
 
     def forward(self, frames: Tensor) -> tuple[Categorical, Tensor]:
         """Policy, and value float [B]."""
@@ -68,63 +79,86 @@ def main(frames: int = 40_000) -> list[float]:
     )
     agent = Agent(envs.single_action_space.n)
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
-    shape = NUM_STEPS, NUM_ENVS
-    seen = torch.zeros((*shape, *envs.single_observation_space.shape), dtype=torch.uint8)
-    actions = torch.zeros(shape, dtype=torch.int64)
-    log_probs, rewards, dones, values = (torch.zeros(shape) for _ in range(4))
     frame, _ = envs.reset(seed=0)
     history: list[float] = []
     for window in range(frames // (NUM_ENVS * NUM_STEPS)):
-        finished: list[float] = []
-        for t in range(NUM_STEPS):
-            seen[t] = torch.from_numpy(frame)
-            with torch.no_grad():
-                policy, values[t] = agent(seen[t])
-            actions[t] = policy.sample()
-            log_probs[t] = policy.log_prob(actions[t])
-            frame, reward, terminated, truncated, infos = envs.step(actions[t].numpy())
-            rewards[t] = torch.from_numpy(reward)
-            dones[t] = torch.from_numpy(terminated | truncated)
-            cut = np.flatnonzero(truncated & ~terminated)
-            # The episode would have gone on: its last step earns what was still to come.
-            if len(cut):
-                with torch.no_grad():
-                    rewards[t, cut] += (
-                        GAMMA * agent(torch.from_numpy(np.stack(infos["final_obs"][cut])))[1]
-                    )
-            if "final_info" in infos:
-                finished += infos["final_info"]["episode_reward"][infos["_final_info"]].tolist()
-        with torch.no_grad():
-            next_value, advantage = agent(torch.from_numpy(frame))[1], torch.zeros(NUM_ENVS)
-        advantages = torch.zeros(shape)
-        for t in reversed(range(NUM_STEPS)):
-            delta = rewards[t] + GAMMA * next_value * (1 - dones[t]) - values[t]
-            advantages[t] = advantage = delta + GAMMA * LAMBDA * (1 - dones[t]) * advantage
-            next_value = values[t]
-        flat = [
-            x.flatten(0, 1) for x in (seen, actions, log_probs, advantages, advantages + values)
-        ]
-        for _ in range(EPOCHS):
-            for rows in torch.randperm(NUM_ENVS * NUM_STEPS).chunk(MINIBATCHES):
-                f, a, old, adv, target = (x[rows] for x in flat)
-                policy, value = agent(f)
-                ratio = (policy.log_prob(a) - old).exp()
-                adv = (adv - adv.mean()) / (adv.std() + 1e-8)
-                gain = torch.minimum(ratio * adv, ratio.clamp(1 - CLIP, 1 + CLIP) * adv).mean()
-                loss = (
-                    VALUE * (value - target).square().mean()
-                    - gain
-                    - ENTROPY * policy.entropy().mean()
-                )
-                optimizer.zero_grad()
-                loss.backward()
-                nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
-                optimizer.step()
+        rollout, frame, finished = play(envs, agent, frame)
+        add_advantages(rollout, agent, frame)
+        learn(agent, optimizer, rollout)
         history.append(float(np.mean(finished)) if finished else float("nan"))
         if window % 8 == 0:
             print(f"{(window + 1) * NUM_ENVS * NUM_STEPS:>8,} frames, return {history[-1]:6.3f}")
     envs.close()
     return history
+
+
+@torch.no_grad()
+def play(
+    envs: Any, agent: Agent, frame: np.ndarray
+) -> tuple[dict[str, Tensor], np.ndarray, list[float]]:
+    """Play one window from a frame on.
+
+    Returns:
+        The window, [T, N, ...] by name; the frame after it; returns of the episodes that ended.
+    """
+    shape = (NUM_STEPS, NUM_ENVS)
+    rollout = {name: torch.zeros(shape) for name in ("log_probs", "rewards", "dones", "values")}
+    rollout["actions"] = torch.zeros(shape, dtype=torch.int64)
+    frame_shape = envs.single_observation_space.shape
+    rollout["frames"] = torch.zeros((*shape, *frame_shape), dtype=torch.uint8)
+    finished: list[float] = []
+    for t in range(NUM_STEPS):
+        rollout["frames"][t] = torch.from_numpy(frame)
+        policy, rollout["values"][t] = agent(rollout["frames"][t])
+        action = policy.sample()
+        rollout["actions"][t] = action
+        rollout["log_probs"][t] = policy.log_prob(action)
+        frame, reward, terminated, truncated, infos = envs.step(action.numpy())
+        rollout["rewards"][t] = torch.from_numpy(reward)
+        rollout["dones"][t] = torch.from_numpy(terminated | truncated)
+        cut = np.flatnonzero(truncated & ~terminated)
+        # The episode would have gone on: its last step earns what was still to come.
+        if len(cut):
+            final = torch.from_numpy(np.stack(infos["final_obs"][cut]))
+            rollout["rewards"][t, cut] += GAMMA * agent(final)[1]
+        if "final_info" in infos:
+            finished += infos["final_info"]["episode_reward"][infos["_final_info"]].tolist()
+    return rollout, frame, finished
+
+
+@torch.no_grad()
+def add_advantages(rollout: dict[str, Tensor], agent: Agent, frame: np.ndarray) -> None:
+    """Write advantages (GAE) and value targets of a window that ``frame`` follows."""
+    next_value = agent(torch.from_numpy(frame))[1]
+    advantage = torch.zeros(NUM_ENVS)
+    rollout["advantages"] = torch.zeros(NUM_STEPS, NUM_ENVS)
+    for t in reversed(range(NUM_STEPS)):
+        goes_on = 1 - rollout["dones"][t]
+        value = rollout["values"][t]
+        delta = rollout["rewards"][t] + GAMMA * next_value * goes_on - value
+        advantage = delta + GAMMA * LAMBDA * goes_on * advantage
+        rollout["advantages"][t] = advantage
+        next_value = value
+    rollout["targets"] = rollout["advantages"] + rollout["values"]
+
+
+def learn(agent: Agent, optimizer: torch.optim.Optimizer, rollout: dict[str, Tensor]) -> None:
+    """Some epochs of PPO over one window, its steps shuffled."""
+    steps = {name: values.flatten(0, 1) for name, values in rollout.items()}
+    for _ in range(EPOCHS):
+        for rows in torch.randperm(NUM_ENVS * NUM_STEPS).chunk(MINIBATCHES):
+            policy, value = agent(steps["frames"][rows])
+            ratio = (policy.log_prob(steps["actions"][rows]) - steps["log_probs"][rows]).exp()
+            advantage = steps["advantages"][rows]
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            clipped = ratio.clamp(1 - CLIP, 1 + CLIP)
+            gain = torch.minimum(ratio * advantage, clipped * advantage).mean()
+            value_loss = (value - steps["targets"][rows]).square().mean()
+            loss = VALUE * value_loss - gain - ENTROPY * policy.entropy().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+            optimizer.step()
 
 
 def stable_baselines3(frames: int = 10_000) -> float:

@@ -29,7 +29,10 @@ from torchrl.objectives.value import GAE
 import arcade_torch
 from arcade_torch.models import MemoryModule, make_memory
 
-NUM_ENVS, NUM_STEPS, EPOCHS, WIDTH = 64, 32, 4, 64
+NUM_ENVS = 64
+NUM_STEPS = 32
+EPOCHS = 4
+WIDTH = 64
 
 
 def make_agent(env: arcade_torch.JaxEnv, memory: str) -> ActorValueOperator:

@@ -18,9 +18,15 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax import gymnax
 
-NUM_ENVS, NUM_STEPS, UPDATES = 64, 10, 150
-GAMMA, GAE_LAMBDA, LEARNING_RATE, ENTROPY_COEFF = 0.99, 0.95, 2e-3, 0.02
-STRIDE, HIDDEN = 8, 64  # every eighth pixel of a frame is read
+NUM_ENVS = 64
+NUM_STEPS = 10
+UPDATES = 150
+GAMMA = 0.99
+GAE_LAMBDA = 0.95
+LEARNING_RATE = 2e-3
+ENTROPY_COEFF = 0.02
+STRIDE = 8  # every eighth pixel of a frame is read
+HIDDEN = 64
 
 
 class LogState(NamedTuple):
@@ -54,7 +60,8 @@ class LogWrapper:
     ) -> tuple[Any, ...]:
         """Step, and keep the sums."""
         obs, env_state, reward, done, info = self._env.step(key, state.env_state, action, params)
-        total, length = state.episode_return + reward, state.episode_length + 1
+        total = state.episode_return + reward
+        length = state.episode_length + 1
         last_return = jnp.where(done, total, state.last_return)
         last_length = jnp.where(done, length, state.last_length)
         state = LogState(
@@ -124,7 +131,8 @@ def adam(
     step: jax.Array, grad: jax.Array, moments: tuple[jax.Array, jax.Array]
 ) -> tuple[Any, jax.Array]:
     """One update of Adam for one array."""
-    mean, square = 0.9 * moments[0] + 0.1 * grad, 0.999 * moments[1] + 0.001 * grad**2
+    mean = 0.9 * moments[0] + 0.1 * grad
+    square = 0.999 * moments[1] + 0.001 * grad**2
     change = (mean / (1 - 0.9**step)) / (jnp.sqrt(square / (1 - 0.999**step)) + 1e-8)
     return (mean, square), -LEARNING_RATE * change
 
@@ -190,7 +198,8 @@ def main(updates: int = UPDATES, observability: str = "full", seed: int = 0) -> 
         infos["returned_episode"]
     ]  # in the order in which they ended
     tenth = len(returns) // 10
-    first, last = float(returns[:tenth].mean()), float(returns[-tenth:].mean())
+    first = float(returns[:tenth].mean())
+    last = float(returns[-tenth:].mean())
     print(
         f"{env.name}, {observability}: {len(returns)} episodes, mean return {first:.2f} at first, "
         f"{last:.2f} at last"

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 
 from arcade_torch.envs_jax import Game, make
 
-STEPS, NUM_ENVS = 1000, 64
+STEPS = 1000
+NUM_ENVS = 64
 
 
 class Result(NamedTuple):
@@ -51,7 +52,8 @@ def walk(game: Game, key: jax.Array, hides: jax.Array, steps: int = STEPS) -> Re
 def main(id: str = "MineSweeperEasy", steps: int = STEPS, num_envs: int = NUM_ENVS) -> Result:
     """Walk all envs, print the rate, and give the sums of each env, leaves [num_envs]."""
     run = jax.jit(jax.vmap(partial(walk, make(id), steps=steps)))
-    keys, hides = jax.random.split(jax.random.PRNGKey(0), num_envs), jnp.arange(num_envs) % 2 == 1
+    keys = jax.random.split(jax.random.PRNGKey(0), num_envs)
+    hides = jnp.arange(num_envs) % 2 == 1
     compiled = run.lower(keys, hides).compile()
     with jax.transfer_guard("disallow"):
         start = time.perf_counter()

@@ -34,12 +34,12 @@ from arcade_torch.envs_jax.render.palette import (
     Colour,
 )
 
-SIDE, FACES = 4, 8
-DOWN, KNOWN, UP = (
-    0,
-    1,
-    1 + FACES,
-)  # tile codes: a card face down, face down and shown by the MDP twin, face up
+SIDE = 4
+FACES = 8
+# tile codes
+DOWN = 0  # a card face down
+KNOWN = 1  # face down, and shown by the MDP twin; one code a face
+UP = 1 + FACES  # face up; one code a face
 LOOKS: list[tuple[Colour, int | None]] = [
     (NAVY, None),
     *((c, face) for c in (SILVER, WHITE) for face in range(FACES)),
@@ -73,14 +73,15 @@ def card(side: int, colour: Colour, face: int | None, cursor: bool) -> Picture:
 class Pairs(Game[PairsState]):
     """Find the eight pairs in 200 steps. Returns lie in [0, 1]."""
 
-    max_steps, return_range = 200, (0.0, 1.0)
+    max_steps = 200
+    return_range = (0.0, 1.0)
 
     def __init__(self, *, id: str, obs_size: int, rules: Rules) -> None:
-        self.id, self.obs_size, self.rules = id, obs_size, rules
-        layout, background = (
-            draw.grid_layout(obs_size, SIDE),
-            draw.titled_background(obs_size, "PAIRS", MIST, NAVY),
-        )
+        self.id = id
+        self.obs_size = obs_size
+        self.rules = rules
+        layout = draw.grid_layout(obs_size, SIDE)
+        background = draw.titled_background(obs_size, "PAIRS", MIST, NAVY)
         tiles = [
             card(layout.tile, colour, face, cursor)
             for cursor in (False, True)
@@ -92,7 +93,8 @@ class Pairs(Game[PairsState]):
 
     def reset(self, key: Array) -> PairsState:
         """Shuffle the cards; the cursor begins in the upper left corner."""
-        zero, size = jnp.int32(0), SIDE * SIDE
+        zero = jnp.int32(0)
+        size = SIDE * SIDE
         cards = jax.random.permutation(key, jnp.arange(size, dtype=jnp.int32) % FACES)
         return PairsState(
             cards, jnp.zeros(size, bool), jnp.full(2, -1, jnp.int32), zero, zero, zero

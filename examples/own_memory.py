@@ -27,18 +27,22 @@ class LSTM(nn.Module):
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()
-        self.input_size, self.hidden_size = input_size, hidden_size
+        self.input_size = input_size
+        self.hidden_size = hidden_size
         self.lstm = nn.LSTM(input_size, hidden_size, batch_first=True)
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """x [B, T, D], state [B], is_init bool [B, T] to (y [B, T, H], state [B])."""
-        h, c, outputs = state["h"], state["c"], []
+        h = state["h"]
+        c = state["c"]
+        outputs = []
         begins = is_init[:, 1:].any(dim=0).nonzero().flatten() + 1
         for begin, end in pairwise([0, *begins.tolist(), x.shape[1]]):
             fresh = is_init[:, begin, None]
             kept = [torch.where(fresh, 0, old).unsqueeze(0) for old in (h, c)]
             y, (h, c) = self.lstm(x[:, begin:end], (kept[0], kept[1]))
-            h, c = h[0], c[0]
+            h = h[0]
+            c = c[0]
             outputs.append(y)
         return torch.cat(outputs, dim=1), TensorDict({"h": h, "c": c}, batch_size=[len(x)])
 

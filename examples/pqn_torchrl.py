@@ -24,7 +24,11 @@ import arcade_torch
 from arcade_torch.agents import PQNLoss
 from arcade_torch.models import MemoryModule, SmallEncoder, make_memory
 
-NUM_ENVS, NUM_STEPS, EPOCHS, MINIBATCHES, WIDTH = 32, 16, 2, 4, 64
+NUM_ENVS = 32
+NUM_STEPS = 16
+EPOCHS = 2
+MINIBATCHES = 4
+WIDTH = 64
 
 
 def make_env(policy: nn.Module, seed: int) -> EnvBase:

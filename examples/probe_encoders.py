@@ -14,7 +14,9 @@ on in a second (batches of 132).
 import argparse
 import csv
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -48,7 +50,8 @@ class Gated(nn.Module):
         self, channels: int, out: int, kernel: int, stride: int = 1, pool: int = 1
     ) -> None:
         super().__init__()
-        self.conv, self.pool = nn.Conv2d(channels, 2 * out, kernel, stride), pool
+        self.conv = nn.Conv2d(channels, 2 * out, kernel, stride)
+        self.pool = pool
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, C, h, w] -> [N, out, h', w']."""
@@ -95,14 +98,14 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
     """Frames uint8 [T, 64, 64, 3] of 64 games in which half of the moves are random, and numbers
     [T, cells] by name.
     """
-    num_envs, rng = 64, np.random.default_rng(seed)
+    num_envs = 64
+    rng = np.random.default_rng(seed)
     batched = BatchedGame(make(name))
     oracle = make_oracle(batched.game)
-    batch, is_init = (
-        batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool)),
-        np.ones(num_envs, bool),
-    )
-    pixels, seen = batched.render(batch), []
+    batch = batched.init(env_keys(seed, num_envs), np.zeros(num_envs, bool))
+    is_init = np.ones(num_envs, bool)
+    pixels = batched.render(batch)
+    seen = []
     answers: dict[str, list[np.ndarray]] = {}
     for t in range(4 * frames // num_envs):
         state = jax.tree.map(np.asarray, batch.state)
@@ -112,7 +115,8 @@ def play(name: str, frames: int, seed: int) -> tuple[Tensor, dict[str, Tensor]]:
             seen.append(halves.float().mean((2, 4)).to(torch.uint8))
             answers.setdefault("action", []).append(action[:, None])
             for path, leaf in jax.tree_util.tree_leaves_with_path(state):
-                fact, cells = jax.tree_util.keystr(path).strip("."), leaf.reshape(num_envs, -1)
+                fact = jax.tree_util.keystr(path).strip(".")
+                cells = leaf.reshape(num_envs, -1)
                 if cells.shape[1] <= 128 and not any(
                     word in fact for word in ("time", "key", "step")
                 ):
@@ -134,83 +138,105 @@ def classes(values: Tensor, like: Tensor) -> Tensor:
     return values.long() - int(like.min())
 
 
+class Heads(nn.Module):
+    """A linear layer for each fact, from 128 features to the classes of its cells."""
+
+    def __init__(self, answers: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.sizes = {fact: int(values.max()) + 1 for fact, values in answers.items()}
+        self.layers = nn.ModuleDict()
+        for fact, size in self.sizes.items():
+            self.layers[fact.replace(".", "_")] = nn.Linear(128, answers[fact].shape[1] * size)
+
+    def forward(self, fact: str, features: Tensor) -> Tensor:
+        """[N, 128] -> logits [N, cells, classes]."""
+        out = self.layers[fact.replace(".", "_")](features)
+        return out.view(len(features), -1, self.sizes[fact])
+
+
+def halved(frames: Tensor) -> Tensor:
+    """Frames of 64 pixels at half their size."""
+    return frames.view(-1, 32, 2, 32, 2, 3).float().mean((2, 4)).to(torch.uint8)
+
+
+def learnable(facts: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The facts as classes, without those that never change or have too many values."""
+    answers = {}
+    for fact, values in facts.items():
+        as_classes = classes(values, values)
+        if (as_classes != as_classes[:1]).any() and as_classes.max() < 512:
+            answers[fact] = as_classes
+    return answers
+
+
 def teach(
     name: str,
     side: int,
     encoder: nn.Sequential,
     data: list[tuple[Tensor, dict[str, Tensor]]],
     passes: int,
-):
+) -> list[dict[str, Any]]:
     """Rows of the table, one a fact: train on the first of ``data``, measure on the second."""
     (pixels, facts), (others, other_facts) = data
     if side == 32:
-        pixels, others = (
-            x.view(-1, 32, 2, 32, 2, 3).float().mean((2, 4)).to(torch.uint8)
-            for x in (pixels, others)
-        )
+        pixels = halved(pixels)
+        others = halved(others)
     shift = pixels.float().mean(0)
     scale = (pixels[:2000].float() - shift).square().mean().sqrt().clamp_min(1)
 
     def scaled(frames: Tensor) -> Tensor:
         return ((frames - shift) / scale).permute(0, 3, 1, 2)
 
-    answers = {fact: classes(values, values) for fact, values in facts.items()}
-    answers = {
-        fact: values
-        for fact, values in answers.items()
-        if (values != values[:1]).any() and values.max() < 512
-    }
-    sizes = {fact: int(values.max()) + 1 for fact, values in answers.items()}
     encoder(scaled(pixels[:2]))  # the lazy layer
-    heads = nn.ModuleDict(
-        {f.replace(".", "_"): nn.Linear(128, answers[f].shape[1] * n) for f, n in sizes.items()}
-    )
-    parameters = [*encoder.parameters(), *heads.parameters()]
+    answers = learnable(facts)
+    heads = Heads(answers)
+    speed = train(encoder, heads, pixels, scaled, answers, passes)
+    rows = []
+    with torch.no_grad():
+        features = torch.cat([encoder(scaled(chunk)) for chunk in others.split(512)])
+        for fact, values in answers.items():
+            truth = classes(other_facts[fact], facts[fact])
+            right = float((heads(fact, features).argmax(-1) == truth).float().mean())
+            guess = float((values.mode(0).values == truth).float().mean())
+            learned = (right - guess) / max(1 - guess, 1e-9)
+            row = {"game": name, "fact": fact, "accuracy": right, "guess": guess}
+            rows.append(row | {"learned": learned, "frames_per_second": speed})
+    return rows
+
+
+def train(
+    encoder: nn.Sequential,
+    heads: Heads,
+    pixels: Tensor,
+    scaled: Callable[[Tensor], Tensor],
+    answers: dict[str, Tensor],
+    passes: int,
+) -> int:
+    """Teach encoder and heads; returns the frames a second, without the time of the heads."""
     steps = passes * (len(pixels) // BATCH)
-    optimizer = torch.optim.Adam(parameters, fused=True)
+    optimizer = torch.optim.Adam([*encoder.parameters(), *heads.parameters()], fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
-
-    def logits(fact: str, features: Tensor) -> Tensor:
-        return heads[fact.replace(".", "_")](features).view(len(features), -1, sizes[fact])
-
     spent = 0.0
     for _ in range(passes):
         for rows in torch.randperm(len(pixels)).split(BATCH):
-            if len(rows) == BATCH:
-                began = time.perf_counter()
-                features = encoder(scaled(pixels[rows]))
-                gradient = features.detach().requires_grad_()
-                loss = sum(
-                    F.cross_entropy(logits(f, gradient).flatten(0, 1), answers[f][rows].flatten())
-                    for f in sizes
-                )
-                optimizer.zero_grad()
-                heads_began = time.perf_counter()
-                loss.backward()
-                heads_took = time.perf_counter() - heads_began
-                features.backward(gradient.grad)
-                optimizer.step()
-                schedule.step()
-                spent += time.perf_counter() - began - heads_took
-    rows, speed = [], round(steps * BATCH / spent)
-    with torch.no_grad():
-        features = torch.cat([encoder(scaled(chunk)) for chunk in others.split(512)])
-        for fact in sizes:
-            truth = classes(other_facts[fact], facts[fact])
-            right = float((logits(fact, features).argmax(-1) == truth).float().mean())
-            guess = float((answers[fact].mode(0).values == truth).float().mean())
-            learned = (right - guess) / max(1 - guess, 1e-9)
-            rows.append(
-                dict(
-                    game=name,
-                    fact=fact,
-                    accuracy=right,
-                    guess=guess,
-                    learned=learned,
-                    frames_per_second=speed,
-                )
-            )
-    return rows
+            if len(rows) < BATCH:
+                continue
+            began = time.perf_counter()
+            features = encoder(scaled(pixels[rows]))
+            gradient = features.detach().requires_grad_()
+            loss = torch.zeros(())
+            for fact, values in answers.items():
+                logits = heads(fact, gradient).flatten(0, 1)
+                loss = loss + F.cross_entropy(logits, values[rows].flatten())
+            optimizer.zero_grad()
+            heads_began = time.perf_counter()
+            loss.backward()
+            heads_took = time.perf_counter() - heads_began
+            features.backward(gradient.grad)
+            optimizer.step()
+            schedule.step()
+            spent += time.perf_counter() - began - heads_took
+    return round(steps * BATCH / spent)
 
 
 def main() -> None:

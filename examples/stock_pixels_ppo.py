@@ -27,7 +27,9 @@ from torchrl.objectives.value import GAE
 
 import arcade_torch
 
-WINDOW, MINIBATCH, EPOCHS = 640, 160, 3
+WINDOW = 640
+MINIBATCH = 160
+EPOCHS = 3
 
 
 def make_env(theirs: bool) -> EnvBase:

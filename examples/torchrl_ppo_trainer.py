@@ -42,7 +42,12 @@ import arcade_torch
 from arcade_torch.agents import check_replay
 from arcade_torch.models import MemoryModule, SmallEncoder, make_memory
 
-NUM_ENVS, NUM_STEPS, SLICE, MINIBATCH, EPOCHS, WIDTH = 64, 20, 5, 320, 4, 128
+NUM_ENVS = 64
+NUM_STEPS = 20
+SLICE = 5
+MINIBATCH = 320
+EPOCHS = 4
+WIDTH = 128
 OLD_VALUES = ("state_value", ("next", "state_value"), "advantage", "value_target")
 
 
@@ -76,7 +81,8 @@ def make_trainer(memory: str, frames: int) -> PPOTrainer:
     """The trainer and its parts, all of TorchRL but environment, collector, encoder and memory."""
     encoder = SmallEncoder()
     agent = make_agent(memory, encoder)
-    policy, critic = agent.get_policy_operator(), agent.get_value_operator()
+    policy = agent.get_policy_operator()
+    critic = agent.get_value_operator()
     env = arcade_torch.make("SignpostEasy", num_envs=NUM_ENVS, observability="partial", seed=0)
     collector = arcade_torch.ArcadeCollector(
         env, policy, NUM_ENVS * NUM_STEPS, frames, compress=encoder.compress, seed=0

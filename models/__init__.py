@@ -32,10 +32,10 @@ Example:
 """
 
 from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
-from arcade_torch.models.checks import MemoryLawError, check_memory
+from arcade_torch.models.checks import LawResult, MemoryLawError, check_memory, law_results
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
-from arcade_torch.models.law_results import LawResult, law_results
-from arcade_torch.models.memory import Memory, MemoryContract, MemoryModule, ReplayableMemory
+from arcade_torch.models.memory import Memory, MemoryContract, ReplayableMemory
+from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
 from arcade_torch.models.presets import make_network
 from arcade_torch.models.registry import make_memory, memory_names, register_memory

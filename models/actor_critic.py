@@ -8,9 +8,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import Key, Store, batch_shape
+from arcade_torch.models.memory import batch_shape
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network, preset_of
+from arcade_torch.models.recurrence import Key, Store
 
 __all__ = ["ActorCriticNetwork", "current_names", "make_actor_critic"]
 

@@ -9,7 +9,31 @@ from torch.nn import functional as F
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
-__all__ = ["LRU"]
+__all__ = ["LRU", "ring"]
+
+
+def ring(size: int, r_min: float, r_max: float, max_phase: float) -> tuple[Tensor, Tensor]:
+    """Draw numbers uniformly from a ring of the complex plane.
+
+    Args:
+        size: how many.
+        r_min: inner radius, in [0, r_max).
+        r_max: outer radius, in (r_min, 1].
+        max_phase: phases are uniform in [0, max_phase] radians.
+
+    Returns:
+        (squares of their radii, phases), float [size]; kept away from 0 and 1, for logarithms.
+
+    Raises:
+        ValueError: radii out of range.
+
+    Source: Orvieto et al. (2023), arXiv 2303.06349, lemma 3.2.
+    """
+    if not 0 <= r_min < r_max <= 1:
+        raise ValueError(f"need 0 <= r_min < r_max <= 1, got r_min={r_min}, r_max={r_max}")
+    square = (torch.rand(size) * (r_max**2 - r_min**2) + r_min**2).clamp(1e-8, 1 - 1e-6)
+    phase = (max_phase * torch.rand(size)).clamp_min(1e-8)
+    return square, phase
 
 
 class LRU(Memory):
@@ -46,12 +70,10 @@ class LRU(Memory):
         max_phase: float = 2 * math.pi,
     ) -> None:
         super().__init__(input_size, hidden_size)
-        if not 0 <= r_min < r_max <= 1:
-            raise ValueError(f"need 0 <= r_min < r_max <= 1, got r_min={r_min}, r_max={r_max}")
         self.state_shape = (hidden_size, 2)
-        square = (torch.rand(hidden_size) * (r_max**2 - r_min**2) + r_min**2).clamp(1e-8, 1 - 1e-6)
+        square, phase = ring(hidden_size, r_min, r_max, max_phase)
         self.nu = nn.Parameter(torch.log(-0.5 * torch.log(square)))
-        self.theta = nn.Parameter(torch.log((max_phase * torch.rand(hidden_size)).clamp_min(1e-8)))
+        self.theta = nn.Parameter(torch.log(phase))
         self.gamma = nn.Parameter(0.5 * torch.log1p(-square))
         self.input = nn.Parameter(
             torch.randn(hidden_size, 2, input_size) / math.sqrt(2 * input_size)

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.encoders import Encoder
-from arcade_torch.models.memory import Key, Recurrence, Store, batch_shape, replay
+from arcade_torch.models.memory import batch_shape, replay
+from arcade_torch.models.recurrence import Key, Recurrence, Store
 from arcade_torch.models.registry import make_memory
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
-from arcade_torch.models.memory import Key, Store
 from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork
+from arcade_torch.models.recurrence import Key, Store
 from arcade_torch.models.stateless import FeedForward
 
 __all__ = [

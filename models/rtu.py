@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.lru import ring
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -50,12 +51,10 @@ class RTU(Memory):
         max_phase: float = 2 * math.pi,
     ) -> None:
         super().__init__(input_size, hidden_size)
-        if not 0 <= r_min < r_max <= 1:
-            raise ValueError(f"need 0 <= r_min < r_max <= 1, got r_min={r_min}, r_max={r_max}")
         self.state_shape = (hidden_size, 2)
-        square = (torch.rand(hidden_size) * (r_max**2 - r_min**2) + r_min**2).clamp(1e-8, 1 - 1e-6)
+        square, phase = ring(hidden_size, r_min, r_max, max_phase)
         self.nu = nn.Parameter(torch.log(-0.5 * torch.log(square)))
-        self.theta = nn.Parameter(torch.log((max_phase * torch.rand(hidden_size)).clamp_min(1e-8)))
+        self.theta = nn.Parameter(torch.log(phase))
         self.input = nn.Parameter(
             torch.randn(hidden_size, 2, input_size) / math.sqrt(2 * input_size)
         )

@@ -1,6 +1,7 @@
 """How the code reads: one thought a line, functions that fit a screen, names that name something.
 
-Counted with ``ast`` in the five code folders; each failure names file and line.
+Counted with ``ast`` in the five code folders, and as far as length and assignments go in the
+examples; each failure names file and line.
 """
 
 import ast
@@ -14,6 +15,15 @@ FOLDERS = ("envs_jax", "arcade_torch", "models", "agents", "tools")
 MOST_LETTERS = 100
 MOST_LINES = 60
 """Of a function, its docstring included."""
+MOST_LINES_OF_A_FILE = 450
+LONGER_FILES = {
+    "arcade_torch/env.py": "one class, TorchRL's methods",
+    "arcade_torch/jax_env.py": "the same for the envs of other suites",
+    "arcade_torch/collector.py": "one class, TorchRL's protocol of collectors",
+    "arcade_torch/rollout_buffer.py": "one class, a window that is written, read, saved and loaded",
+    "tools/measures/counterfactual/measure.py": "a measure is one file that is imported alone",
+}
+"""Wholes that would read worse in parts."""
 MOST_PARALLEL = 3
 """Assignments ``a, b = x, y`` in 1,000 lines that are not empty: pairs by nature."""
 MOST_COMPREHENSIONS = dict.fromkeys(FOLDERS, 20) | {"tools": 30}
@@ -67,7 +77,7 @@ def is_parallel(node: ast.AST) -> bool:
     return isinstance(node.value, ast.Tuple | ast.GeneratorExp)
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples"))
 def test_one_assignment_a_line(folder: str) -> None:
     wrong = [place for place, node in nodes(folder) if is_parallel(node)]
     assert len(wrong) <= MOST_PARALLEL * lines(folder) / 1000, "\n".join(wrong)
@@ -79,7 +89,7 @@ def test_comprehensions_are_rare(folder: str) -> None:
     assert len(wrong) <= MOST_COMPREHENSIONS[folder] * lines(folder) / 1000, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples"))
 def test_lines_and_functions_are_short(folder: str) -> None:
     wrong = []
     for path in files(folder):
@@ -92,6 +102,16 @@ def test_lines_and_functions_are_short(folder: str) -> None:
             if length > MOST_LINES:
                 wrong.append(f"{place}: {node.name} has {length} lines")
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_files_are_short_or_one_whole(folder: str) -> None:
+    longer = set()
+    for path in files(folder):
+        if len(path.read_text(encoding="utf-8").splitlines()) > MOST_LINES_OF_A_FILE:
+            longer.add(str(path.relative_to(ROOT)))
+    allowed = {name for name in LONGER_FILES if name.startswith(f"{folder}/")}
+    assert longer == allowed
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

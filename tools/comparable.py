@@ -9,7 +9,8 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
-from arcade_torch.agents.config import TrainConfig, differing_values
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_values
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.names import AgentKey, agent_names, bare_name, game_names, plain_number
 from arcade_torch.tools.run_folders import RunFolders

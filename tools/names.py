@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from arcade_torch.agents.config import flatten
+from arcade_torch.agents.differences import flatten
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.text import printable
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import make

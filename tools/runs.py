@@ -5,7 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import flatten
+from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import is_final, read_csv, read_json
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey

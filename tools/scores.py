@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.names import AgentKey, agent_names, game_names

@@ -17,7 +17,8 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from arcade_torch.agents.config import TrainConfig, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.checkpoint import (
     FORMAT,
     MOST_WEIGHTS,

@@ -31,7 +31,9 @@ import torch
 from safetensors.torch import load, save
 from torch import Tensor
 
-from arcade_torch.agents.config import TrainConfig, differing_fields, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import (
     MOST_JSON,
     MOST_TENSORS,

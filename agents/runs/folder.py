@@ -13,7 +13,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 import arcade_torch
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format, remove_draft_checkpoints
 from arcade_torch.agents.runs.files import is_final, read_json, remove_drafts, write_json
 

@@ -5,7 +5,7 @@ Loads no torch. Every array that is handed out is the caller's own.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +101,7 @@ class NumpyBatch:
     @property
     def game(self) -> Game[Any]:
         """The game that is played."""
-        return cast(Game[Any], self._batched.game)  # not a mixture of games
+        return self._batched.game  # never a mixture of games
 
     @property
     def state(self) -> Any:

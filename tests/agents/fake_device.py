@@ -24,7 +24,7 @@ from torch.utils._pytree import tree_flatten
 from arcade_torch.agents import preset
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.policy import build_network, make_policy
-from arcade_torch.agents.training import LEARNERS, Trainer
+from arcade_torch.agents.trainer import LEARNERS, Trainer
 from arcade_torch.models import memory_names
 
 NAME = "npy"

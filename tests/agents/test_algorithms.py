@@ -25,7 +25,7 @@ from arcade_torch.agents.config import GROUPS
 from arcade_torch.agents.learner import Training
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS
-from arcade_torch.agents.training import LEARNERS
+from arcade_torch.agents.trainer import LEARNERS
 from arcade_torch.models import memory_names
 from tests.agents.fakes import (
     GAMMA,

@@ -15,7 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from arcade_torch.agents import preset
 from arcade_torch.agents.cuda_graph import WARM_UPS, GraphedFunction, GraphedPolicy
 from arcade_torch.agents.policy import EpsilonGreedy, make_policy
-from arcade_torch.agents.training import Trainer, own_random_numbers
+from arcade_torch.agents.trainer import Trainer
+from arcade_torch.agents.training import own_random_numbers
 from arcade_torch.models import make_network, memory_names
 
 from .fake_device import prepare

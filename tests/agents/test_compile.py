@@ -21,6 +21,7 @@ from arcade_torch.agents import (
     make_policy,
     preset,
     train,
+    trainer,
     training,
 )
 from arcade_torch.agents.config import TrainConfig
@@ -45,7 +46,7 @@ ENVS, STEPS = 4, 10
 @pytest.fixture(autouse=True)
 def _without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        training, "COMPILE_BACKEND", "eager"
+        trainer, "COMPILE_BACKEND", "eager"
     )  # captured as for inductor, then run as it stands
     torch.compiler.reset()
 

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from arcade_torch.agents.config import (
-    GROUPS,
-    OF_ENV,
-    OF_NETWORK,
-    DQNConfig,
-    PQNConfig,
-    TrainConfig,
-    differing_fields,
-)
+from arcade_torch.agents.config import GROUPS, OF_ENV, OF_NETWORK, DQNConfig, PQNConfig, TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.learner import epsilon_at, learning_rate_at
 from arcade_torch.agents.presets import preset, preset_names
 from arcade_torch.envs_jax.registry import GAMES

@@ -28,6 +28,7 @@ from arcade_torch.agents import (
     train,
     training,
 )
+from arcade_torch.agents import trainer as trainer_module
 from arcade_torch.agents.metrics import paper_score
 from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_checkpoint
 from arcade_torch.agents.runs.files import read_csv
@@ -296,10 +297,10 @@ def test_the_generator_that_is_saved_is_that_of_the_device_on_which_actions_are_
         raise Made
 
     monkeypatch.setattr(
-        training, "pick_devices", lambda device: (torch.device(device), None), raising=False
+        trainer_module, "pick_devices", lambda device: (torch.device(device), None), raising=False
     )
-    monkeypatch.setattr(training, "build_network", lambda config: None)
-    monkeypatch.setitem(training.LEARNERS, "pqn", stop)
+    monkeypatch.setattr(trainer_module, "build_network", lambda config: None)
+    monkeypatch.setitem(trainer_module.LEARNERS, "pqn", stop)
     generators = [torch.Generator(), torch.Generator()]
     monkeypatch.setattr(torch.cuda, "default_generators", generators)
     trainer = object.__new__(training.Trainer)

@@ -69,6 +69,27 @@ def one(game, **changes):
     )
 
 
+_steps = {}
+# of all games: what changes their steps, but for the difficulty
+_OPTIONS = ("id", "rules", "mine_reward", "move_budget")
+
+
+def step(game, state, action):
+    """One step with key 0, compiled once a game: state, reward, terminated, truncated."""
+    key = tuple(getattr(game, name, None) for name in _OPTIONS)
+    if key not in _steps:
+        _steps[key] = jax.jit(game.step)
+    new, reward, terminated, truncated = _steps[key](jax.random.PRNGKey(0), state, np.int32(action))
+    return new, float(reward), bool(terminated), bool(truncated)
+
+
+@functools.cache
+def fresh(id, rules="default", count=4096):
+    """First states of many envs, with numpy leaves."""
+    reset = jax.jit(jax.vmap(make(id, rules=rules).reset))
+    return jax.tree.map(np.asarray, reset(env_keys(0, count)))
+
+
 _compiled = {}
 
 
@@ -80,4 +101,6 @@ def draw(game, state, partial):
     return np.asarray(_compiled[key](state, partial))
 
 
-__all__ = ["ALL_IDS", "Walk", "batched", "draw", "going_on", "make", "one", "random_actions"]
+__all__ = [
+    "ALL_IDS", "Walk", "batched", "draw", "fresh", "going_on", "make", "one", "random_actions", "step",
+]  # fmt: skip

@@ -1,7 +1,5 @@
 """AutoEncode: a deal, a watch, a stack to pop; and the suits that the card games share."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,23 +13,11 @@ from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import BLACK, RED, SMOKE
 from arcade_torch.envs_jax.render.suits import suit_mask, suit_pictures
 
-from .conftest import batched, draw, one, random_actions
+from .conftest import batched, draw, one, random_actions, step
 
 CARDS = {"AutoEncodeEasy": 26, "AutoEncodeMedium": 52, "AutoEncodeHard": 78}
 UP, DOWN, LEFT, RIGHT, FIRE = range(5)
 KEY = jax.random.PRNGKey(0)
-
-
-@functools.cache
-def compiled_step(id, rules):
-    return jax.jit(make(id, rules=rules).step)
-
-
-def step(game, state, action):
-    new, reward, terminated, truncated = compiled_step(game.id, game.rules)(
-        KEY, state, jnp.int32(action)
-    )
-    return new, float(reward), bool(terminated), bool(truncated)
 
 
 def run(game, state, actions):

@@ -1,7 +1,5 @@
 """BattleShip, checked against brute force and against what its pictures ought to tell."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,28 +20,11 @@ from arcade_torch.envs_jax.battleship.rules import (
 from arcade_torch.envs_jax.oracles import oracle_return, random_return
 from arcade_torch.envs_jax.render.palette import BRASS, NICKEL, RED
 
-from .conftest import batched, draw, one
+from .conftest import batched, draw, fresh, one, step
 
 SIDES = {"BattleShipEasy": 8, "BattleShipMedium": 10, "BattleShipHard": 12}
 KEY = jax.random.PRNGKey(0)
 UP, DOWN, LEFT, RIGHT, FIRE = range(5)
-COMPILED = {}
-
-
-def step(game, state, action):
-    key = (game.id, game.rules)
-    if key not in COMPILED:
-        COMPILED[key] = jax.jit(game.step)
-    new, reward, terminated, truncated = COMPILED[key](KEY, state, np.int32(action))
-    return new, float(reward), bool(terminated), bool(truncated)
-
-
-@functools.cache
-def fresh(id, rules="default"):
-    """First states of many envs, with numpy leaves."""
-    return jax.tree.map(
-        np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, 4096))
-    )
 
 
 def sea(game, ships=(), shots=(), x=0, y=0, **changes):

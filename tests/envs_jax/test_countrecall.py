@@ -1,6 +1,5 @@
 """CountRecall: counting by brute force, the counter's range, and what the limit leaves."""
 
-import functools
 import itertools
 
 import jax
@@ -15,7 +14,7 @@ from arcade_torch.envs_jax.countrecall.oracle import SKIP, best_plan, right_answ
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render import Slot
 
-from .conftest import batched, draw, going_on, one, random_actions
+from .conftest import batched, draw, going_on, one, random_actions, step
 from .test_autoencode import read_history
 
 LEVELS = {
@@ -24,18 +23,6 @@ LEVELS = {
     "CountRecallHard": (78, 4, 20),
 }
 UP, DOWN, LEFT, RIGHT, FIRE = range(5)
-KEY = jax.random.PRNGKey(0)
-
-
-@functools.cache
-def compiled_step(id, rules, move_budget):
-    return jax.jit(make(id, rules=rules, move_budget=move_budget).step)
-
-
-def step(game, state, action):
-    call = compiled_step(game.id, game.rules, game.move_budget)
-    new, reward, terminated, truncated = call(KEY, state, jnp.int32(action))
-    return new, float(reward), bool(terminated), bool(truncated)
 
 
 @pytest.mark.parametrize("id", LEVELS)

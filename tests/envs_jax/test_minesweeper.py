@@ -10,25 +10,15 @@ from arcade_torch.envs_jax.minesweeper.oracle import mine_chances
 from arcade_torch.envs_jax.minesweeper.renderer import KINDS
 from arcade_torch.envs_jax.minesweeper.rules import COVERED_MINE, SWEPT
 
-from .conftest import Walk, batched, draw, one, random_actions
+from .conftest import Walk, batched, draw, one, random_actions, step
 
 LEVELS = {"MineSweeperEasy": (4, 2), "MineSweeperMedium": (6, 6), "MineSweeperHard": (8, 10)}
-KEY = jax.random.PRNGKey(0)
-COMPILED = {}
 
 
 def boards(id, count=512, seed=0, rules="default"):
     """Fresh states of many envs, with numpy leaves."""
     game = batched(id, rules=rules)
     return jax.tree.map(np.asarray, game.init(env_keys(seed, count), jnp.zeros(count, bool)).state)
-
-
-def step(game, state, action):
-    key = (game.id, game.rules, getattr(game, "mine_reward", 0))
-    if key not in COMPILED:
-        COMPILED[key] = jax.jit(game.step)
-    new, reward, terminated, truncated = COMPILED[key](KEY, state, jnp.int32(action))
-    return new, float(reward), bool(terminated), bool(truncated)
 
 
 def board(game, mines, x=0, y=0, **changes):

@@ -1,6 +1,5 @@
 """Navigator, checked against brute force and against what its pictures ought to tell."""
 
-import functools
 from collections import deque
 
 import jax
@@ -18,28 +17,10 @@ from arcade_torch.envs_jax.navigator.rules import FREE, TNT, TREASURE, draw_dist
 from arcade_torch.envs_jax.oracles import make_oracle, play, random_return
 from arcade_torch.envs_jax.render.palette import MAUVE, RED, SKY, YELLOW
 
-from .conftest import batched, draw, going_on, one
+from .conftest import batched, draw, fresh, going_on, one, step
 
 SIDES = {"NavigatorEasy": 8, "NavigatorMedium": 10, "NavigatorHard": 12}
-KEY = jax.random.PRNGKey(0)
 UP, DOWN, LEFT, RIGHT, FIRE = range(5)
-COMPILED = {}
-
-
-def step(game, state, action):
-    key = (game.id, game.rules)
-    if key not in COMPILED:
-        COMPILED[key] = jax.jit(game.step)
-    new, reward, terminated, truncated = COMPILED[key](KEY, state, np.int32(action))
-    return new, float(reward), bool(terminated), bool(truncated)
-
-
-@functools.cache
-def fresh(id, rules="default", count=4096):
-    """First states of many envs, with numpy leaves."""
-    return jax.tree.map(
-        np.asarray, jax.jit(jax.vmap(make(id, rules=rules).reset))(env_keys(0, count))
-    )
 
 
 def chart(game, tnt=(), treasure=None, x=0, y=0, **changes):

@@ -18,7 +18,7 @@ from arcade_torch.agents import TrainConfig, load, preset, train
 from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_checkpoint, load_latest
 from arcade_torch.agents.runs.files import CsvLog, checksum
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS, RunFolder
-from arcade_torch.agents.training import Trainer
+from arcade_torch.agents.trainer import Trainer
 from tests.fuzz.contract import attempt, content, fuzz, unchanged
 from tests.fuzz.hostile import NAMES, anything, json_bytes, mutated, mutated_value, seeds
 

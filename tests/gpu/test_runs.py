@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from arcade_torch.agents import load, preset, train, training
+from arcade_torch.agents import load, preset, train, trainer
 from tests.agents.test_training import assert_goes_on_to_the_bit, assert_same_run, kill_and_resume
 
 pytestmark = pytest.mark.gpu
@@ -20,7 +20,7 @@ def _repeatable(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Convolutions that give the same bits twice; on the CPU no C++ compiler is asked for."""
     monkeypatch.setattr(torch.backends.cudnn, "deterministic", True)
     if device == "cpu":
-        monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")
+        monkeypatch.setattr(trainer, "COMPILE_BACKEND", "eager")
     torch.compiler.reset()
 
 

@@ -33,7 +33,7 @@ from torchrl.modules.utils import get_primers_from_module
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from arcade_torch.models import MemoryModule, make_memory, sequence_checks
+from arcade_torch.models import MemoryModule, make_memory, recurrence
 from tests.models.test_memory_module import Countdown
 
 N, T = 4, 24
@@ -194,10 +194,10 @@ def test_on_a_gpu_the_host_waits_for_the_first_batch_of_a_shape_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = []
-    any_flag = sequence_checks._any
-    monkeypatch.setattr(sequence_checks, "_is_host", lambda _: False)
+    any_flag = recurrence._any
+    monkeypatch.setattr(recurrence, "_is_host", lambda _: False)
     monkeypatch.setattr(
-        sequence_checks, "_any", lambda flags: looks.append(flags.shape) or any_flag(flags)
+        recurrence, "_any", lambda flags: looks.append(flags.shape) or any_flag(flags)
     )
     memory = module()
     for _ in range(3):
@@ -284,10 +284,10 @@ def test_on_a_gpu_the_host_waits_for_the_first_steps_without_a_state_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = []
-    monkeypatch.setattr(sequence_checks, "_is_host", lambda _: False)
-    monkeypatch.setattr(sequence_checks, "_any", lambda flags: looks.append(flags) is not None)
+    monkeypatch.setattr(recurrence, "_is_host", lambda _: False)
+    monkeypatch.setattr(recurrence, "_any", lambda flags: looks.append(flags) is not None)
     memory = MemoryModule(make_memory("gru", 8, 8), "features", "remembered")
     flags = torch.ones(N, 1, dtype=torch.bool)
     for _ in range(20):
         memory(TensorDict({"features": torch.randn(N, 8), "is_init": flags}, [N]))
-    assert len(looks) == sequence_checks.STEPS_LOOKED_AT
+    assert len(looks) == recurrence.STEPS_LOOKED_AT

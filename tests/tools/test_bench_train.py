@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from arcade_torch.agents import training
+from arcade_torch.agents import trainer
 from arcade_torch.agents.learner import Learner
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import train as bench
@@ -26,7 +26,7 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
         "gradient_step",
         lambda self, rows, frames: (steps.append(frames), step(self, rows, frames)),
     )
-    monkeypatch.setattr(training, "COMPILE_BACKEND", "eager")
+    monkeypatch.setattr(trainer, "COMPILE_BACKEND", "eager")
     words = [
         "--networks",
         "small",

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools import gap_and_bias
 from arcade_torch.tools.comparable import find_runs

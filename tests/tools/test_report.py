@@ -17,6 +17,7 @@ from arcade_torch.tools import gap_and_bias, report, reports
 from arcade_torch.tools.figures.style import agent_colours, drawing, svg
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
+from arcade_torch.tools.reports import findings
 from arcade_torch.tools.runs import Score
 from tests.tools.fabricated import small_study, write_run, write_study
 
@@ -176,43 +177,45 @@ def table(mlp: list[float], lru: list[float]) -> Any:
 
 
 def test_the_headline_claims_only_what_the_interval_allows() -> None:
-    clear = reports.score_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "gap", "lru")
+    clear = findings.score_sentence(table([0.1, 0.12, 0.11], [0.8, 0.82, 0.81]), "gap", "lru")
     assert ": over these 3 seeds memory narrows the observability gap by 0.70" in clear
-    many = reports.score_sentence(table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "gap", "lru")
+    many = findings.score_sentence(
+        table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "gap", "lru"
+    )
     assert ": memory narrows the observability gap by 0.70" in many
-    worse = reports.score_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "gap", "lru")
+    worse = findings.score_sentence(table([0.8, 0.82, 0.81], [0.1, 0.12, 0.11]), "gap", "lru")
     assert "memory widens the observability gap by 0.70" in worse
-    vague = reports.score_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "gap", "lru")
+    vague = findings.score_sentence(table([0.1, 0.9, 0.5], [0.2, 0.9, 0.6]), "gap", "lru")
     assert "contains zero, so 3 seeds do not settle it" in vague
-    ahead = reports.score_sentence(
+    ahead = findings.score_sentence(
         table([0.1, 0.12, 0.11] * 2, [0.8, 0.82, 0.81] * 2), "pomdp", "lru"
     )
     assert ahead.startswith(
         "On the POMDP lru reaches a normalised return of 0.81, the memory-free agent 0.11, a diff"
     )
     assert "a difference of +0.70 [+0." in ahead
-    single = reports.score_sentence(table([0.1], [0.9]), "gap", "lru")
+    single = findings.score_sentence(table([0.1], [0.9]), "gap", "lru")
     assert "single seed" in single and "narrows" not in single
 
 
 def test_few_seeds_come_with_a_caution() -> None:
-    assert "With 2 seeds" in reports.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
-    assert "no intervals" in reports.coverage_sentence(table([0.1], [0.3]))
+    assert "With 2 seeds" in findings.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
+    assert "no intervals" in findings.coverage_sentence(table([0.1], [0.3]))
 
 
 def test_the_way_from_random_to_oracle_is_a_share() -> None:
-    said = reports.learning_sentence(
+    said = findings.learning_sentence(
         "X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0}
     )
     assert "mlp 25 %" in said and "a seed of mlp did not get above random" in said
-    assert reports.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
+    assert findings.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
 
 
 def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert (
-        reports.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
+        findings.learning_sentence("X", "full", {"mlp": [0.1]}, {"random": 0.5, "state": 0.5}) == ""
     )
     same = {
         player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")

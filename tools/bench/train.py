@@ -10,9 +10,10 @@ from typing import Any
 
 import torch
 
-from arcade_torch.agents.config import TrainConfig, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
-from arcade_torch.agents.training import Trainer
+from arcade_torch.agents.trainer import Trainer
 from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads

@@ -8,7 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from arcade_torch.agents.config import Checked, Options, Range, TrainConfig, differing_fields
+from arcade_torch.agents.checked import Checked, Options, Range
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
 from arcade_torch.tools.board.entry import (
     MOST_BYTES,

@@ -13,18 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
-from arcade_torch.agents.config import (
-    GROUPS,
-    Checked,
-    Options,
-    PositiveOrZero,
-    Range,
-    Seed,
-    TrainConfig,
-    coerce,
-    flatten,
-    require,
-)
+from arcade_torch.agents.checked import Checked, Options, PositiveOrZero, Range, coerce, require
+from arcade_torch.agents.config import GROUPS, Seed, TrainConfig
+from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import read_bytes, write_json
 from arcade_torch.tools.board.protocol import OBSERVATIONS, PROTOCOL, TWINS, Protocol
 
@@ -349,8 +340,8 @@ def settings_of(configs: Iterable[TrainConfig]) -> tuple[dict[str, Any], list[di
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of `arcade_torch.agents.config.flatten`; a ``ValueError`` where a name is both a
-    value and a table.
+    """The inverse of `agents.differences.flatten`; a ``ValueError`` where a name is both a value
+    and a table.
 
     Example:
         >>> nested({"device": "cpu", "ppo.gamma": 0.9})

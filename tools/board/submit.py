@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import TrainConfig, differing_values
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_values
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.tools.board.entry import (
     BoardRun,

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import tyro
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import write_atomic, write_json
 from arcade_torch.tools.bench import registry
 from arcade_torch.tools.files import Table, format_value, write_csv

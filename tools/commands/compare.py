@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.commands.study import Resumable, check_memories_of
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.imports import is_from_user

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.options import Command
 from arcade_torch.tools.text import say
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import tyro
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import import_again, load_agent
 from arcade_torch.tools.options import Command, at_least, at_most, name_and_value

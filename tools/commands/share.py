@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import read_bytes, write_atomic
 from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import import_again

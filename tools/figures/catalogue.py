@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import NamedTuple
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.figures import (
     NUMBERS,
     PICTURES,

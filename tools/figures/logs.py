@@ -9,7 +9,9 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 
 from arcade_torch.agents import preset
-from arcade_torch.agents.config import TrainConfig, flatten, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import (
@@ -35,15 +37,8 @@ SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LIMIT = "writing the same bytes"
 
 NOT_SETTINGS = (
-    "env",
-    "observability",
-    "memory",
-    "seed",
-    "algorithm",
-    "device",
-    "threads",
-    "checkpoint_every",
-)
+    "env", "observability", "memory", "seed", "algorithm", "device", "threads", "checkpoint_every",
+)  # fmt: skip
 """Fields that tell runs apart, or decide nothing."""
 ALGORITHMS = get_args(get_type_hints(TrainConfig)["algorithm"])
 
@@ -450,10 +445,6 @@ def _flat_settings(config: Mapping[str, Any], algorithm: str) -> dict[str, str]:
     settings = dict[str, str]()
     for name, value in flatten(kept).items():
         if value != {}:
-            settings[name.removeprefix(f"{algorithm}.")] = _text(value)
+            # 0 and 0.0 are the same number
+            settings[name.removeprefix(f"{algorithm}.")] = str(plain_number(value))
     return settings
-
-
-def _text(value: Any) -> str:
-    """A setting in one form: 0 and 0.0 are the same number."""
-    return str(plain_number(value))

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents.config import require
-from arcade_torch.models.memory import Key
+from arcade_torch.agents.checked import require
+from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys
 
 

@@ -7,7 +7,7 @@ from typing import Literal, TypedDict
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from arcade_torch.models.memory import Key
+from arcade_torch.models.recurrence import Key
 
 Channels = Literal["first", "last"]
 Kind = Literal["q", "logits", "probs"]

@@ -7,74 +7,34 @@ one call, any other module with a state step by step, as it acts. A policy that 
 state in one module cannot be cut in two; its features are the frames.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
-    TensorDictSequential,
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
-    EGreedyModule,
     GRUModule,
     LSTMModule,
-    QValueModule,
     set_recurrent_mode,
 )
 
-from arcade_torch.models.memory import Key, MemoryModule
-from arcade_torch.tools.measures.keys import Keys, Kind, Names, action_index
-
-STANDARD_OUTPUTS: Mapping[Key, Kind] = {"action_value": "q", "logits": "logits", "probs": "probs"}
-"""What the outputs under TorchRL's usual names are."""
-OFFERS: Mapping[Kind, tuple[str, ...]] = {
-    "q": ("q", "value"),
-    "logits": ("logits", "probs"),
-    "probs": ("logits", "probs"),
-}
-"""How outputs of a kind can be read; with a value beside them also as "value"."""
-CHOOSERS = (QValueModule, EGreedyModule, ProbabilisticTensorDictModule)
-"""Modules that choose an action and compute nothing that a measure looks at."""
-IN_A_ROW = (TensorDictSequential.forward, ProbabilisticTensorDictSequential.forward)
-"""What runs the modules of a sequence one after the other, and does nothing else."""
-
-
-@dataclass(frozen=True)
-class Output:
-    """Which entry the measures look at, what it is, and where the value of a state stands."""
-
-    key: Key
-    kind: Kind
-    value_key: Key | None = None
-
-    @property
-    def keys(self) -> list[Key]:
-        """The entries, the value last."""
-        return [self.key] if self.value_key is None else [self.key, self.value_key]
-
-    @property
-    def offers(self) -> tuple[str, ...]:
-        """How the outputs can be read."""
-        beside = () if self.value_key is None else ("value",)
-        return OFFERS[self.kind] + beside
-
-    def read(self, out: Tensor, target: str) -> Tensor:
-        """Read outputs [..., A], with a value [..., A + 1], as one of `offers`."""
-        actions = out if self.value_key is None else out[..., :-1]
-        if target == "value":
-            return actions.amax(-1, keepdim=True) if self.kind == "q" else out[..., -1:]
-        if self.kind == "logits" and target == "probs":
-            return actions.softmax(-1)
-        if self.kind == "probs" and target == "logits":
-            return actions.log()
-        return actions
+from arcade_torch.models.memory_module import MemoryModule
+from arcade_torch.models.recurrence import Key
+from arcade_torch.tools.measures.keys import Names, action_index
+from arcade_torch.tools.measures.tensordict_keys import (
+    OFFERS,
+    find_input_keys,
+    find_output,
+    find_state_keys,
+    needed_parts,
+    parts_of,
+    unravelled,
+)
 
 
 class TensorDictPolicy:
@@ -98,12 +58,12 @@ class TensorDictPolicy:
 
     def __init__(self, module: TensorDictModuleBase, names: Names) -> None:
         self.module = module
-        parts = list(_parts(module))
-        self.state_keys = _state_keys(module, names.get("state_keys"))
-        self.keys = _input_keys(module, self.state_keys, names)
-        self.reads_last_action = self.keys.last_action in _unravelled(module.in_keys)
-        self.output = _output(parts, names)
-        needed = _needed(parts, self.output.keys)
+        parts = list(parts_of(module))
+        self.state_keys = find_state_keys(module, names.get("state_keys"))
+        self.keys = find_input_keys(module, self.state_keys, names)
+        self.reads_last_action = self.keys.last_action in unravelled(module.in_keys)
+        self.output = find_output(parts, names)
+        needed = needed_parts(parts, self.output.keys)
         self.only_part = needed[0] if len(needed) == 1 else None
         self._encoder, self._rest = self._split(needed)
         self._features = self._boundary()
@@ -120,8 +80,8 @@ class TensorDictPolicy:
         encoder = list[TensorDictModuleBase]()
         rest = list[TensorDictModuleBase]()
         for part in needed:
-            reads = _unravelled(part.in_keys)
-            writes = _unravelled(part.out_keys)
+            reads = unravelled(part.in_keys)
+            writes = unravelled(part.out_keys)
             if reads <= visible and not writes & touched:
                 encoder.append(part)
                 visible |= writes
@@ -135,12 +95,12 @@ class TensorDictPolicy:
         """What the encoder, or the env, hands to the rest: in the order in which it is read."""
         encoded = {self.keys.pixels}
         for part in self._encoder:
-            encoded |= _unravelled(part.out_keys)
+            encoded |= unravelled(part.out_keys)
         features = list[Key]()
         written = set[Key]()
         for part in self._rest:
             features += [unravel_key(key) for key in part.in_keys if unravel_key(key) in encoded]
-            written |= _unravelled(part.out_keys)
+            written |= unravelled(part.out_keys)
         features += [key for key in self.output.keys if key in encoded - written]
         if not features:
             raise ValueError(
@@ -206,7 +166,7 @@ class TensorDictPolicy:
         start: TensorDictBase,
     ) -> TensorDictBase:
         """Run one module over sequences, write its outputs into ``steps``, and return the state."""
-        keys = [key for key in self.state_keys if key in _unravelled(module.in_keys)]
+        keys = [key for key in self.state_keys if key in unravelled(module.in_keys)]
         if isinstance(module, MemoryModule):
             return _read_with_memory(module, steps, is_init, state)
         if not keys:
@@ -248,112 +208,6 @@ class TensorDictPolicy:
             return action_index(action, self.keys.action), after
         out = torch.cat([step[key] for key in self.output.keys], -1)
         return self.output.read(out, OFFERS[self.output.kind][0]).argmax(-1), after
-
-
-def _unravelled(keys: Sequence[Any]) -> set[Key]:
-    return {unravel_key(key) for key in keys}
-
-
-def _parts(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
-    """The modules of a sequence in their order, those of sequences inside of it too."""
-    if isinstance(module, TensorDictSequential) and type(module).forward in IN_A_ROW:
-        for index in range(len(module)):
-            yield from _parts(module[index])
-    else:
-        yield module
-
-
-def _state_keys(
-    module: TensorDictModuleBase, named: Sequence[Key] | Mapping[Key, Key] | None
-) -> dict[Key, Key]:
-    """Keys of the recurrent state, and where the next one is written: under "next" unless named."""
-    if isinstance(named, Mapping):
-        return {unravel_key(key): unravel_key(after) for key, after in named.items()}
-    written = _unravelled(module.out_keys)
-    keys = dict[Key, Key]()
-    for key in module.in_keys if named is None else named:
-        after = unravel_key(("next", key))
-        if named is not None or after in written:
-            keys[unravel_key(key)] = after
-    missing = [after for after in keys.values() if after not in written]
-    if missing:
-        raise ValueError(
-            f"the policy must write the next state under {missing}, got {sorted(written, key=str)}:"
-            " name pairs, state_keys={state key: key of the next state}"
-        )
-    return keys
-
-
-def _input_keys(module: TensorDictModuleBase, state_keys: Mapping[Key, Key], names: Names) -> Keys:
-    """Where a policy reads; a ValueError if it reads more than a measure hands over."""
-    last_action = unravel_key(names.get("last_action_key", "last_action"))
-    is_init = unravel_key(names.get("is_init_key", "is_init"))
-    pixels = names.get("pixels_key")
-    read = [unravel_key(key) for key in module.in_keys]
-    handed_over = {last_action, is_init, "is_init", *state_keys}
-    others = [key for key in dict.fromkeys(read) if key not in handed_over]
-    if pixels is None and len(others) == 1:
-        pixels = others[0]
-    if others != [pixels]:
-        wanted = "the frames" if pixels is None else f"the frames ({pixels!r})"
-        raise ValueError(
-            f"the policy must read {wanted}, the last action, start flags and its state alone, got "
-            f"{others} beside what is known: name pixels_key, last_action_key, is_init_key or "
-            "state_keys"
-        )
-    action = unravel_key(names.get("action_key", "action"))
-    return Keys(unravel_key(pixels), action, last_action, is_init)
-
-
-def _output(parts: Sequence[TensorDictModuleBase], names: Names) -> Output:
-    """What the measures look at: what the actions are chosen by, or an entry with a usual name."""
-    written = set[Key]()
-    kinds = dict[Key, Kind]()
-    for part in parts:
-        written |= _unravelled(part.out_keys)
-        kinds |= _kinds_read_by(part)
-    for usual, kind_of_usual in STANDARD_OUTPUTS.items():
-        if usual in written:
-            kinds.setdefault(usual, kind_of_usual)
-    named = names.get("output_key")
-    key = next(iter(kinds), None) if named is None else unravel_key(named)
-    kind = names.get("output_kind") or (None if key is None else kinds.get(key))
-    if key is None or kind is None or key not in written:
-        raise ValueError(
-            f"the policy must write action_value, logits or probs [*, A], got {key!r} among "
-            f"{sorted(written, key=str)}: name output_key, and say what it is with output_kind "
-            '("q", "logits" or "probs")'
-        )
-    value = unravel_key(names.get("value_key", "state_value"))
-    has_value = kind != "q" and value in written
-    return Output(key, kind, value if has_value else None)
-
-
-def _kinds_read_by(part: TensorDictModuleBase) -> dict[Key, Kind]:
-    """What a module that chooses actions takes its inputs for."""
-    if isinstance(part, QValueModule):
-        return {unravel_key(part.in_keys[0]): "q"}
-    kinds = dict[Key, Kind]()
-    if isinstance(part, ProbabilisticTensorDictModule):
-        for name, key in zip(part.dist_keys, part.in_keys, strict=True):
-            if name in ("logits", "probs"):
-                kinds[unravel_key(key)] = name
-    return kinds
-
-
-def _needed(
-    parts: Sequence[TensorDictModuleBase], keys: Sequence[Key]
-) -> list[TensorDictModuleBase]:
-    """The modules without which some entries could not be computed, in their order."""
-    wanted = set(keys)
-    needed = list[TensorDictModuleBase]()
-    for part in reversed(parts):
-        written = _unravelled(part.out_keys)
-        if written & wanted and not isinstance(part, CHOOSERS):
-            needed.append(part)
-            wanted -= written
-            wanted |= _unravelled(part.in_keys)
-    return needed[::-1]
 
 
 def _start_of(

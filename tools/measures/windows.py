@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.envs import EpisodeBatch
 from arcade_torch.tools.measures.keys import Keys, Names

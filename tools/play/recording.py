@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, make

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import read_csv, read_text
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, Game

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.gym.batch import NumpyBatch, seed_keys

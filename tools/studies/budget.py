@@ -46,7 +46,7 @@ class Size(NamedTuple):
 
 def measure_speed(study: Study) -> Speed:
     """Time some updates of every memory of a study, on the POMDP of its first game."""
-    from arcade_torch.agents.training import Trainer
+    from arcade_torch.agents.trainer import Trainer
 
     seconds_a_frame = 0.0
     build_s = list[float]()

@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.comparable import FREE

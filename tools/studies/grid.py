@@ -9,7 +9,9 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-from arcade_torch.agents.config import Options, Range, Seed, TrainConfig, coerce, flatten, require
+from arcade_torch.agents.checked import Options, Range, coerce, require
+from arcade_torch.agents.config import Seed, TrainConfig
+from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_text
 from arcade_torch.tools.names import AgentKey, agent_names, find_baselines

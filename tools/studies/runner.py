@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.config import TrainConfig, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars

@@ -17,7 +17,7 @@ from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, load_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.agents.runs.states import check_state
-from arcade_torch.agents.training import Trainer
+from arcade_torch.agents.trainer import Trainer
 
 OVERLAP = {"overlap": 4, "time_limit": "bootstrap"}
 CONFIGS: dict[str, dict[str, Any]] = {

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from arcade_torch.agents.config import TrainConfig, differing_fields
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.presets import preset
 from arcade_torch.tools.board.entry import (
     MOST_BYTES,

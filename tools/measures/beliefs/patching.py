@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.policy import Progress, policy_of
 from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent

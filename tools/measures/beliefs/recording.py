@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.policy import Progress, policy_of
 from arcade_torch.tools.measures.windows import held_out
 

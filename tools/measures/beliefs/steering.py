@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from arcade_torch.agents.config import SEED_LIMIT, require
+from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.beliefs.measure import Targets
 from arcade_torch.tools.measures.beliefs.patching import NOBODY, Patches, draw_donors
 from arcade_torch.tools.measures.beliefs.recording import (

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
 from arcade_torch.tools.measures.frames import pictures, white_of

@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
 from arcade_torch.tools.measures.keys import Names

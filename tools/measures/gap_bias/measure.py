@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.measures import bootstrap
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval

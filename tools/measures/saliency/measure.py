@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.config import require
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.frames import channel_axis
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import (

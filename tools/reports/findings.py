@@ -1,0 +1,145 @@
+"""The findings of a report as sentences, computed from numbers: they claim a difference only where
+its interval excludes zero.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from arcade_torch.tools.figures.style import TWIN_NAMES
+from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias
+from arcade_torch.tools.reports.subject import TRUSTED_COVERAGE
+
+
+def score_sentences(table: GapBias, subject: str) -> list[str]:
+    """All findings, those about the subject first, and then about the agent with the highest return
+    on the POMDP.
+    """
+    rows = []
+    for row in table.rows:
+        if table.baselines[row.agent] not in (None, row.agent):
+            rows.append(row)
+    rows.sort(key=lambda row: (row.agent != subject, -row.pomdp.value))
+    sentences = []
+    for row in rows:
+        for name in SENTENCES:
+            sentences.append(score_sentence(table, name, row.agent))
+    return sentences
+
+
+def score_sentence(table: GapBias, name: str, agent: str) -> str:
+    """One of `SENTENCES` about an agent with memory, and how sure it is."""
+    memory_free = table.row(table.baselines[agent] or table.baseline)
+    return SENTENCES[name](table, memory_free, table.row(agent))
+
+
+def gap_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What partial observability costs an agent with memory, and one without."""
+    fact = (
+        f"Partial observability costs the memory-free agent {memory_free.gap.value:.2f} of "
+        f"normalised return and {agent.agent} {agent.gap.value:.2f}"
+    )
+    difference = table.difference("gap", memory_free.agent, agent.agent)
+    size = abs(difference.value)
+    seeds = min(memory_free.seeds, agent.seeds)
+    if not difference.exists:
+        return (
+            f"{fact}: a difference of {difference.value:+.2f} with a single seed, which says "
+            "nothing about others."
+        )
+    if not difference.excludes_zero:
+        side = "smaller" if difference.value > 0 else "larger"
+        return (
+            f"{fact}: with memory the gap is {size:.2f} {side}, but the interval "
+            f"{_ends(difference)} contains zero, so {seeds} seeds do not settle it."
+        )
+    coverage = min(memory_free.coverage, agent.coverage)
+    memory = "memory" if coverage >= TRUSTED_COVERAGE else f"over these {seeds} seeds memory"
+    effect = "narrows" if difference.value > 0 else "widens"
+    near, far = sorted((abs(difference.low), abs(difference.high)))
+    return f"{fact}: {memory} {effect} the observability gap by {size:.2f} [{near:.2f}, {far:.2f}]."
+
+
+def pomdp_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What an agent with memory reaches where observations are partial, and one without."""
+    fact = (
+        f"On the POMDP {agent.agent} reaches a normalised return of {agent.pomdp.value:.2f}, the "
+        f"memory-free agent {memory_free.pomdp.value:.2f}"
+    )
+    difference = table.difference("pomdp", agent.agent, memory_free.agent)
+    if not difference.exists:
+        return f"{fact}."
+    if difference.excludes_zero:
+        return f"{fact}, a difference of {difference.value:+.2f} {_ends(difference)}."
+    return f"{fact}; the interval of the difference {_ends(difference)} contains zero."
+
+
+def bias_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
+    """What memory costs where it is not needed."""
+    effect = "costs" if agent.bias.value < 0 else "adds"
+    fact = (
+        f"On the MDP, where memory is not needed, {agent.agent} {effect} "
+        f"{abs(agent.bias.value):.2f} against the memory-free agent"
+    )
+    if not agent.bias.exists:
+        return f"{fact}."
+    if agent.bias.excludes_zero:
+        return f"{fact} (bias {_ends(agent.bias)})."
+    return f"{fact}, which is within the noise (bias {_ends(agent.bias)} contains zero)."
+
+
+SENTENCES = {"gap": gap_sentence, "pomdp": pomdp_sentence, "bias": bias_sentence}
+"""The findings of a report, in their order: number of the table -> who writes its sentence."""
+
+
+def _ends(interval: Interval) -> str:
+    """An interval as a report writes it."""
+    return f"[{interval.low:+.2f}, {interval.high:+.2f}]"
+
+
+def coverage_sentence(table: GapBias) -> str:
+    """How much the intervals are worth with so few seeds."""
+    if not table.coverage:
+        return (
+            "With a single seed there are no intervals: repeat with more seeds before believing a "
+            "difference."
+        )
+    seeds, share = min(table.coverage.items())
+    return (
+        f"Intervals are nominal {100 * table.confidence:g} % percentile bootstrap over seeds. "
+        f"With {seeds} seeds such an interval held the true gap in {100 * share:.0f} % of "
+        "simulated "
+        "studies, so it is narrower than it claims."
+    )
+
+
+def way(value: float, levels: Mapping[str, float]) -> float | None:
+    """The share of the way from the random policy to the oracle; None where that is not known."""
+    low = levels.get("random")
+    high = levels.get("state")
+    if low is None or high is None or high == low:
+        return None
+    return (value - low) / (high - low)
+
+
+def learning_sentence(
+    game: str, twin: str, finals: Mapping[str, Sequence[float]], levels: Mapping[str, float]
+) -> str:
+    """Where the agents of one task ended between the random policy and the oracle; empty where that
+    is not known.
+    """
+    shares = list[str]()
+    below = list[str]()
+    for agent, returns in finals.items():
+        share = way(sum(returns) / len(returns), levels)
+        if share is None:
+            return ""
+        shares.append(f"{agent} {100 * share:.0f} %")
+        if min(returns) <= levels["random"]:
+            below.append(agent)
+    if not shares:
+        return ""
+    task = f"{game} {TWIN_NAMES[twin]}"
+    fact = f"{task}, share of the way from random to oracle: {', '.join(shares)}"
+    if below:
+        return f"{fact}; a seed of {' and of '.join(below)} did not get above random."
+    return f"{fact}, every seed above random."
