@@ -317,9 +317,8 @@ class TrainConfig(Checked):
     device: Device = "cpu"
     """Torch device of the network and the learner."""
     amp: bool = False
-    """Take the encoder in bfloat16 on a GPU, or on a processor that multiplies it faster than
-    float32 (x86: with AMX; without, nothing changes): other numbers; the rest stays float32. Agents
-    act as they were trained."""
+    """Take the encoder in bfloat16, and the rest in float32: other numbers, faster on a GPU and on
+    x86 with AMX, slower on x86 without. Agents act as they were trained."""
     compile: bool = False
     """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and
     rounding of its own. Meant for GPUs: two cores are no faster with it. What is saved is the same;

@@ -5,22 +5,11 @@ from random play (``calibrate``); both do nothing where there is nothing to do. 
 range 0..255 are accepted as well, and gradients reach them.
 """
 
-import platform
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 __all__ = ["Encoder", "PaperEncoder", "SmallEncoder"]
-
-
-BFLOAT16_PAYS: bool = (
-    platform.machine().lower() not in ("x86_64", "amd64")
-    or getattr(torch.cpu, "_is_amx_tile_supported", bool)()
-)
-"""Whether this processor multiplies bfloat16 faster than float32. Without the tiles of AMX, x86
-takes a sixth to a third longer for an encoder (measured on a Xeon with AVX-512 and bfloat16).
-"""
 
 
 class Encoder(nn.Module):
@@ -42,8 +31,8 @@ class Encoder(nn.Module):
         self.stored_shape = stored_shape
         self.feature_size = feature_size
         self.amp = False
-        """Whether convolutions and products are taken in bfloat16, on devices where that is faster
-        (:data:`BFLOAT16_PAYS`); weights and features stay as they are.
+        """Whether convolutions and products are taken in bfloat16; weights and features stay as
+        they are.
         """
         self.register_buffer("like", torch.empty(0), persistent=False)
         self.like: Tensor
@@ -79,7 +68,7 @@ class Encoder(nn.Module):
             ValueError: the last three dimensions are neither, or the frames are floats in 0..1.
         """
         frames = self._frames(pixels)
-        if self._rounds(frames):
+        if self.amp:
             with torch.autocast(frames.device.type, torch.bfloat16):
                 features = self.features(frames)
             features = features.to(self.like.dtype)
@@ -90,10 +79,6 @@ class Encoder(nn.Module):
     def features(self, frames: Tensor) -> Tensor:
         """Encode compressed frames [N, *stored_shape] -> [N, E]."""
         raise NotImplementedError
-
-    def _rounds(self, frames: Tensor) -> bool:
-        """Whether these frames are encoded in bfloat16."""
-        return self.amp and (frames.device.type != "cpu" or BFLOAT16_PAYS)
 
     def _frames(self, pixels: Tensor) -> Tensor:
         """Compressed frames with one batch dimension, [N, *stored_shape]."""
@@ -327,7 +312,7 @@ class SmallEncoder(Encoder):
         mean = self._patches(self.mean.permute(1, 2, 0))
         weight = self.conv1.weight * self.inverse_rms  # rather the weights than every pixel
         weight = weight.permute(0, 2, 3, 1).flatten(1)  # [C, k * k * 3], the order of a patch
-        layers = self._in_bfloat16 if self._rounds(frames) else self._in_float32
+        layers = self._in_bfloat16 if self.amp else self._in_float32
         return F.leaky_relu_(F.layer_norm(layers(frames, mean, weight), (self.feature_size,)))
 
     def _in_float32(self, frames: Tensor, mean: Tensor, weight: Tensor) -> Tensor:

@@ -30,7 +30,6 @@ from arcade_torch.models import (
     Encoder,
     PaperEncoder,
     SmallEncoder,
-    encoders,
     make_actor_critic,
     make_network,
     memory_names,
@@ -236,9 +235,8 @@ def test_a_run_with_graphs_is_a_run(algorithm: str, tmp_path: Path, cuda: str) -
 
 @pytest.mark.parametrize("kind", [PaperEncoder, SmallEncoder])
 def test_amp_features_and_gradients_are_float32_and_close_to_exact_ones(
-    kind: type[Encoder], monkeypatch: pytest.MonkeyPatch
+    kind: type[Encoder],
 ) -> None:
-    monkeypatch.setattr(encoders, "BFLOAT16_PAYS", True)
     encoder = kind(128)  # type: ignore[call-arg]
     frames = torch.randint(256, (4, 128, 128, 3), dtype=torch.uint8)
     exact = encoder(frames)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional as F
 
-from arcade_torch.models import PaperEncoder, SmallEncoder, encoders
+from arcade_torch.models import PaperEncoder, SmallEncoder
 
 
 def frames(*shape, size=128):
@@ -254,11 +254,10 @@ def test_frames_that_were_divided_by_255_already_are_refused(make):
 
 
 @pytest.mark.parametrize("side", [32, 64])
-def test_in_bfloat16_the_small_encoder_is_as_near_as_its_rounding(side, monkeypatch):
+def test_in_bfloat16_the_small_encoder_is_as_near_as_its_rounding(side):
     """Pixels minus their mean are exact there: what is left is the rounding of weights and
     layers.
     """
-    monkeypatch.setattr(encoders, "BFLOAT16_PAYS", True)
     encoder = SmallEncoder(128, side, side)
     pixels = frames(40) // 2
     encoder.calibrate(pixels)
@@ -274,18 +273,6 @@ def test_in_bfloat16_the_small_encoder_is_as_near_as_its_rounding(side, monkeypa
     smooth = pixels.float().requires_grad_()
     encoder(smooth).square().sum().backward()
     assert (smooth.grad != 0).any()
-
-
-@pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])
-def test_a_processor_that_is_slower_in_bfloat16_stays_with_float32(make, monkeypatch):
-    """A Xeon without AMX took a sixth to a third longer for the same frames with amp."""
-    encoder = make(128)
-    pixels = frames(3)
-    exact = encoder(pixels)
-    encoder.amp = True
-    for pays in (False, True):
-        monkeypatch.setattr(encoders, "BFLOAT16_PAYS", pays)
-        assert torch.equal(encoder(pixels), exact) is not pays
 
 
 @pytest.mark.parametrize("make", [PaperEncoder, SmallEncoder])

@@ -87,7 +87,12 @@ class Train(Command):
         from arcade_torch.agents.runs.folder import wait_until_free
         from arcade_torch.agents.training import train
         from arcade_torch.tools.exploring import stopped_exploring
-        from arcade_torch.tools.machine import PARENT_VARIABLE, keep_freed_memory, watch_parent
+        from arcade_torch.tools.machine import (
+            PARENT_VARIABLE,
+            bfloat16_is_slower,
+            keep_freed_memory,
+            watch_parent,
+        )
         from arcade_torch.tools.progress import Bars, describe_row
         from arcade_torch.tools.runs import Run
 
@@ -108,6 +113,8 @@ class Train(Command):
         if self.check_memory and is_first:
             check_memory_of(run)
         wait_until_free(folder, self.wait)
+        if is_first and run.amp and run.device == "cpu" and bfloat16_is_slower():
+            say("this processor multiplies float32 faster than bfloat16: --amp costs time here")
         with Bars(unit="frames", first_line_s=0.0) as bars:
 
             def show(row: Any) -> None:
