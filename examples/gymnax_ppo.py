@@ -38,10 +38,9 @@ WIDTH = 64
 def make_agent(env: arcade_torch.JaxEnv, memory: str) -> ActorValueOperator:
     """Observation -> layer -> memory, then a head for the logits and one for the value."""
     size = env.observation_spec["observation"].shape[-1]
-    remember = MemoryModule(make_memory(memory, WIDTH, WIDTH), in_key="x", out_key="y")
     common = TensorDictSequential(
         TensorDictModule(nn.Sequential(nn.Linear(size, WIDTH), nn.Tanh()), ["observation"], ["x"]),
-        remember,
+        MemoryModule(make_memory(memory, WIDTH, WIDTH), in_key="x", out_key="y"),
     )
     actor = ProbabilisticActor(
         TensorDictModule(nn.Linear(WIDTH, env.action_spec.space.n), ["y"], ["logits"]),

@@ -57,6 +57,8 @@ class MemoryModule(TensorDictModuleBase):
     Source: TorchRL's recurrent-state life cycle, ``LSTMModule`` and ``GRUModule``.
 
     Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> from arcade_torch.models import make_memory
         >>> from torchrl.modules import set_recurrent_mode
         >>> memory = make_memory("mingru", 3, 4)
