@@ -59,20 +59,22 @@ def frames_class(frames: int) -> str:
 
 @cache
 def suites() -> tuple[Suite, ...]:
-    """The ten Easy games, the three quick ones, and the Easy games by what their POMDP asks of a
-    memory.
+    """The ten Easy games, the three quick ones, the ten Medium games, and the Easy games by what
+    their POMDP asks of a memory.
     """
     from arcade_torch.envs_jax import make
     from arcade_torch.envs_jax.game import MEMORY_KINDS
     from arcade_torch.envs_jax.registry import GAMES, resolve_id
 
     easy = [resolve_id(f"{game}Easy") for game in GAMES]
+    medium = tuple(resolve_id(f"{game}Medium") for game in GAMES)
     kinds: dict[str, list[str]] = {kind: [] for kind in MEMORY_KINDS}
     for game in easy:
         kinds[make(game).memory_kind].append(game)
     groups = [
         Suite("easy", tuple(easy), "The ten Easy games"),
         Suite("quick", QUICK, "The three quick games"),
+        Suite("medium", medium, "The ten Medium games"),
     ]
     for kind, games in kinds.items():
         title = "No memory" if kind == "none" else kind.capitalize()

@@ -30,10 +30,13 @@ def test_the_committed_page_is_what_the_entries_give() -> None:
     assert page.partition(BEGIN)[2].partition(END)[0].strip() == board(ROOT / "results").strip()
 
 
-def test_the_suites_are_the_ten_easy_games_the_quick_ones_and_a_group_for_each_kind() -> None:
+def test_the_suites_are_ten_easy_games_ten_medium_ones_the_quick_and_a_group_for_each_kind() -> (
+    None
+):
     by_name = {suite.name: suite.games for suite in suites()}
     assert len(by_name["easy"]) == 10
-    kinds = [games for name, games in by_name.items() if name not in ("easy", "quick")]
+    assert by_name["medium"] == tuple(game.replace("Easy", "Medium") for game in by_name["easy"])
+    kinds = [games for name, games in by_name.items() if name not in ("easy", "medium", "quick")]
     assert sorted(sum(kinds, ())) == sorted(by_name["easy"]), "each game in one group"
     assert by_name["counting"] == ("CountRecallEasy-v0",)
 
