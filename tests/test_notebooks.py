@@ -23,7 +23,7 @@ def _build() -> Any:
 
 build = _build()
 SHORT = 128  # frames, with the preset that learns nothing in seconds
-WITH_AGENTS = ("saliency", "recall_density", "counterfactual", "contamination")
+WITH_AGENTS = ("saliency", "recall_density", "counterfactual", "contamination", "attribution")
 """Notebooks with agents of the package, which train nothing."""
 WINDOW = 1280  # the least that the collector of torchrl_pipeline gives
 
