@@ -19,9 +19,14 @@ def few_games(ids: Iterable[str]) -> list:
 
 def few_memories(names: Iterable[str]) -> list:
     """Names of memories as parameters of a test, all but `MEMORIES` marked slow."""
-    return [_parameter(name, name in MEMORIES) for name in names]
+    return few(names, MEMORIES)
 
 
-def _parameter(value: str, often: bool):
+def few(values: Iterable, often: Iterable) -> list:
+    """Values as parameters of a test, all but those of `often` marked slow."""
+    return [_parameter(value, value in often) for value in values]
+
+
+def _parameter(value, often: bool):
     marks = [] if often else [pytest.mark.slow]
-    return pytest.param(value, id=value, marks=marks)
+    return pytest.param(value, id=str(value), marks=marks)

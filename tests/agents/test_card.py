@@ -19,6 +19,7 @@ from arcade_torch.agents.trainer import Trainer
 from arcade_torch.agents.training import own_random_numbers
 from arcade_torch.models import make_network, memory_names
 
+from ..few import MEMORIES as MEMORIES_OFTEN
 from .fake_device import prepare
 from .repeated import Repeated
 from .test_training import assert_same_run
@@ -27,15 +28,20 @@ ROOT = Path(__file__).resolve().parents[2]
 every_algorithm = pytest.mark.parametrize("algorithm", ["pqn", "ppo", "dqn"])
 
 
-def test_on_a_fake_device_nothing_runs_on_the_cpu_is_copied_or_waits() -> None:
-    """Acting, preparing a window and a gradient step of all algorithms with all memories."""
+@pytest.mark.parametrize(
+    "memories", [MEMORIES_OFTEN, pytest.param((), id="all", marks=pytest.mark.slow)]
+)
+def test_on_a_fake_device_nothing_runs_on_the_cpu_is_copied_or_waits(
+    memories: tuple[str, ...],
+) -> None:
+    """Acting, preparing a window and a gradient step of all algorithms."""
     if not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"):
         pytest.skip("this torch has no such backend: the function is a private one")
-    command = [sys.executable, "-m", "tests.agents.fake_device"]
+    command = [sys.executable, "-m", "tests.agents.fake_device", *memories]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines() if line.startswith("| ")]
-    assert len(rows) == 1 + 3 * len(memory_names()) * 3
+    assert len(rows) == 1 + 3 * len(memories or memory_names()) * 3
     for row in rows[1:]:
         assert [int(number) for number in row[4:]] == [0, 0, 0], done.stdout
 

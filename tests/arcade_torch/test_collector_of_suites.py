@@ -16,7 +16,7 @@ from arcade_torch import ArcadeCollector
 from arcade_torch.agents import PQNLoss
 from arcade_torch.models import MemoryModule, make_memory
 from arcade_torch.rollout_buffer import final_key
-from tests.arcade_torch.test_from_jax import N, all_envs, made
+from tests.arcade_torch.test_from_jax import N, few_envs, made
 
 T = 10
 
@@ -49,7 +49,7 @@ def different(one: TensorDictBase, two: TensorDictBase) -> list[Any]:
     return [key for key in keys if not torch.equal(one[key], two[key])]
 
 
-@all_envs
+@few_envs
 def test_iteration_gives_the_data_of_torchrls_collector(name: str) -> None:
     env = made(name, seed=3)
     options = {"frames_per_batch": N * T, "total_frames": 4 * N * T}
@@ -59,7 +59,7 @@ def test_iteration_gives_the_data_of_torchrls_collector(name: str) -> None:
     assert not different(ours, stock)
 
 
-@all_envs
+@few_envs
 @pytest.mark.parametrize(("mode", "overlap"), [("all", 0), ("truncated", 4)])
 def test_sequences_hold_the_data_of_a_rollout(name: str, mode: Any, overlap: int) -> None:
     env = made(name, seed=3)
@@ -92,7 +92,7 @@ def assert_next_observations(batch: Any, path: TensorDictBase, env: Any, mode: s
         assert torch.equal(dense[known], expected[known])
 
 
-@all_envs
+@few_envs
 def test_a_saved_collector_goes_on_with_the_same_batches(name: str) -> None:
     one = collector_of(name, overlap=3)
     one.collect()

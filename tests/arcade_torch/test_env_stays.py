@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, EnvCreator, ParallelEnv, SerialEnv, StepCounte
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.factory import make
 from tests.arcade_torch.stub import GAME, MIXED
+from tests.few import few
 
 N, T = 3, 4
 
@@ -113,7 +114,7 @@ def test_what_the_refusal_of_a_copy_advises_works() -> None:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("kind", [ParallelEnv, SerialEnv])
-@pytest.mark.parametrize("created", [False, True])
+@pytest.mark.parametrize("created", few([False, True], often=[True]))
 def test_factories_go_on_working(kind: Any, created: bool) -> None:
     factory: Any = partial(make, "SignpostEasy", num_envs=N)
     options = {"mp_start_method": "spawn"} if kind is ParallelEnv else {}

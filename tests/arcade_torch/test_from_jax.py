@@ -15,6 +15,7 @@ from torchrl.envs.utils import check_env_specs
 from arcade_torch import from_jax
 from arcade_torch.envs_jax.batch import env_keys
 from arcade_torch.models import MemoryModule, make_memory
+from tests.few import few
 
 N = 5
 
@@ -127,6 +128,7 @@ ENVS = {
     "tree": (Tree, {"max_steps": 6}),
 }
 all_envs = pytest.mark.parametrize("name", ENVS)
+few_envs = pytest.mark.parametrize("name", few(ENVS, often=["both", "tree"]))
 
 
 def made(name: str, num_envs: int = N, **options: Any) -> Any:
@@ -139,7 +141,7 @@ def rollout(env: Any, steps: int = 25, seed: int = 0) -> Any:
     return env.rollout(steps, break_when_any_done=False)
 
 
-@all_envs
+@few_envs
 def test_torchrl_s_checker_passes(name: str) -> None:
     check_env_specs(made(name), seed=0)
 
@@ -181,7 +183,7 @@ def test_ends_are_told_apart_and_the_final_observation_is_the_true_one(name: str
     assert (data["observation"][:, 1:][following][:, 1] == 0).all()
 
 
-@all_envs
+@few_envs
 def test_an_env_walks_the_same_path_in_every_batch(name: str) -> None:
     many, one = made(name, 7), made(name, 3)
     root, few = many.reset(), one.reset()
@@ -192,7 +194,7 @@ def test_an_env_walks_the_same_path_in_every_batch(name: str) -> None:
         assert (step[:3] == small).all() and (root[:3] == few).all()
 
 
-@all_envs
+@few_envs
 def test_the_fused_step_gives_the_bits_of_step_and_reset(name: str) -> None:
     one, twin = made(name), made(name)
     root, other = one.reset(), twin.reset()
@@ -205,7 +207,7 @@ def test_the_fused_step_gives_the_bits_of_step_and_reset(name: str) -> None:
         assert (root.select(*other.keys(True, True)) == other).all()
 
 
-@all_envs
+@few_envs
 def test_a_snapshot_determines_the_future(name: str) -> None:
     env = made(name)
     root = env.reset()

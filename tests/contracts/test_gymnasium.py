@@ -17,6 +17,12 @@ SIZES, TWINS = (128, 256), ("full", "partial")
 HAS_PYGAME = importlib.util.find_spec("pygame") is not None
 # Every game once; difficulties and sizes take turns.
 COVER = [(f"{game}{DIFFICULTIES[i % 3]}-v0", SIZES[i % 2]) for i, game in enumerate(GAMES)]
+# All of them with `make test-slow`: of a twin each game, of both half of them.
+CASES = [
+    pytest.param(*case, twin, marks=[] if i % 2 == TWINS.index(twin) else [pytest.mark.slow])
+    for i, case in enumerate(COVER)
+    for twin in TWINS
+]
 
 
 def check(id: str, obs_size: int, observability: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,8 +39,7 @@ def check(id: str, obs_size: int, observability: str, monkeypatch: pytest.Monkey
         check_env(env.unwrapped, skip_render_check=not HAS_PYGAME)
 
 
-@pytest.mark.parametrize("observability", TWINS)
-@pytest.mark.parametrize(("id", "obs_size"), COVER)
+@pytest.mark.parametrize(("id", "obs_size", "observability"), CASES)
 def test_gymnasium_s_checker_passes(
     id: str, obs_size: int, observability: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

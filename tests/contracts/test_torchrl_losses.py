@@ -38,6 +38,7 @@ from arcade_torch.agents.ppo import PPOLoss, make_actor
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.models import memory_names
 from tests.contracts.pomdp import ACTIONS, CONTROL, STEPS, collected, explorer, network
+from tests.few import few_memories
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/losses.md"
 MEMORIES = (
@@ -244,7 +245,7 @@ def test_every_memory_is_in_the_matrix() -> None:
     assert set(memory_names()) == set(MEMORIES)
 
 
-@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.parametrize("memory", few_memories(MEMORIES))
 @pytest.mark.parametrize("loss", LOSSES)
 def test_the_memory_learns_in_the_loss(loss: str, memory: str) -> None:
     assert outcome(loss, memory) == "yes"

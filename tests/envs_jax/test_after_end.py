@@ -14,7 +14,7 @@ from arcade_torch.envs_jax import BatchedGame, MixedGames, env_keys, gymnax, mak
 from arcade_torch.envs_jax.game import UNSET
 
 from ..arcade_torch.stub import CoinGame, StubGame
-from ..few import few_games
+from ..few import few, few_games
 from ..test_own_game import Toy
 from .conftest import ALL_IDS
 
@@ -109,7 +109,7 @@ BATCHES = {
 }
 
 
-@pytest.mark.parametrize("which", BATCHES)
+@pytest.mark.parametrize("which", few(BATCHES, often=["both"]))
 def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     batched = BATCHES[which]()
     no = jnp.zeros(ENVS, bool)
@@ -139,7 +139,7 @@ def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     assert np.array_equal(again.done[~mask], outcome.done[-1][~mask])
 
 
-@pytest.mark.parametrize("which", BATCHES)
+@pytest.mark.parametrize("which", few(BATCHES, often=["both"]))
 def test_a_batch_that_says_that_every_episode_runs_steps_to_the_same_bits(which):
     """A batch without flags has nothing to hold; the bridge carries such batches."""
     batched = BATCHES[which]()
@@ -222,7 +222,7 @@ def test_an_eager_state_can_be_donated(id):
     jax.jit(game.step, donate_argnums=1)(jax.random.PRNGKey(1), state, jnp.int32(1))
 
 
-@pytest.mark.parametrize("which", BATCHES)
+@pytest.mark.parametrize("which", few(BATCHES, often=["both"]))
 def test_a_batch_can_be_donated(which):
     batched = BATCHES[which]()
     step = jax.jit(lambda batch: batched.step(batch, batch.last_action)[0], donate_argnums=0)

@@ -22,6 +22,7 @@ from arcade_torch.models.sb3 import (
     MemoryPolicy,
     MultiInputMemoryPolicy,
 )
+from tests.few import few_memories
 
 B, T, D, H = 3, 11, 4, 8
 every_memory = pytest.mark.parametrize("name", memory_names())
@@ -92,7 +93,7 @@ def test_a_state_of_zeros_is_the_initial_one(name: str) -> None:
     torch.testing.assert_close(y, wanted)
 
 
-@every_memory
+@pytest.mark.parametrize("name", few_memories(memory_names()))
 def test_it_is_trained_and_what_was_acted_is_replayed(name: str) -> None:
     model = agent(memory=name)
     _, callback = model._setup_learn(64)
