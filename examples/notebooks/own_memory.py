@@ -37,10 +37,13 @@ class FirstAndNow(nn.Module):
 
     def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
         """x [B, T, D], state [B], is_init bool [B, T] to (y [B, T, H], state [B])."""
-        first, empty, seen = state["first"], state["empty"], []
+        first = state["first"]
+        empty = state["empty"]
+        seen = []
         for t in range(x.shape[1]):
             begins = is_init[:, t, None] | empty
-            first, empty = torch.where(begins, x[:, t], first), torch.zeros_like(empty)
+            first = torch.where(begins, x[:, t], first)
+            empty = torch.zeros_like(empty)
             seen.append(first)
         y = self.mix(torch.cat([torch.stack(seen, dim=1), x], dim=-1))
         return torch.relu(y), TensorDict({"first": first, "empty": empty}, batch_size=[len(x)])

@@ -40,7 +40,8 @@ for name, (memory, twin) in AGENTS.items():
 # $$S_t[y, x] = \sum_a \sum_c \left(\frac{\partial Q(s_n, a)}{\partial o_t[y, x, c]}\right)^2$$
 
 # %%
-rows, shares = [], {}
+rows = []
+shares = {}
 for name, agent in agents.items():
     env = arcade_torch.make("SignpostEasy", num_envs=1, observability=AGENTS[name][1])
     window = greedy_window(agent, env, seed=1)

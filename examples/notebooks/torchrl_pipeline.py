@@ -48,7 +48,9 @@ for picture, axis in zip(first["pixels"], axes, strict=False):
 
 # %%
 WIDTH = 128
-encoder, memory, head = SmallEncoder(), make_memory("lru", WIDTH, WIDTH), nn.Linear(WIDTH, 5)
+encoder = SmallEncoder()
+memory = make_memory("lru", WIDTH, WIDTH)
+head = nn.Linear(WIDTH, 5)
 body = TensorDictSequential(
     TensorDictModule(encoder, ["pixels"], ["features"]),
     MemoryModule(memory, in_key="features", out_key="remembered"),
@@ -60,7 +62,8 @@ actor = ProbabilisticActor(
     return_log_prob=True,
 )
 agent = ActorValueOperator(body, actor, ValueOperator(nn.Linear(WIDTH, 1), in_keys=["remembered"]))
-policy, critic = agent.get_policy_operator(), agent.get_value_operator()
+policy = agent.get_policy_operator()
+critic = agent.get_value_operator()
 
 # %% [markdown]
 # Whatever reads a window of steps runs in recurrent mode: advantages, and the loss. The windows
