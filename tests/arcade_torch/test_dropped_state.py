@@ -120,10 +120,9 @@ def test_a_bare_env_says_once_that_the_state_is_dropped(policy: nn.Module, run: 
 @pytest.mark.parametrize("env", [stub_env, lambda: suite_env()], ids=["ours", "from_jax"])
 def test_a_rollout_that_stops_at_the_first_end_says_so_too(env: Callable[[], Any]) -> None:
     """The default of ``rollout``; it said nothing of ``LSTMModule``."""
-    with pytest.warns(UserWarning, match=MESSAGE) as warned, torch.no_grad():
-        for stops in (True, False):
-            env().rollout(3, torchrls(), break_when_any_done=stops)
-    assert len([one for one in warned if "a memory forgets" in str(one.message)]) == 1
+    with pytest.warns(UserWarning, match=MESSAGE), torch.no_grad():
+        env().rollout(3, torchrls())
+    silent(lambda: rollout(env(), torchrls()))  # once in all
 
 
 @pytest.mark.parametrize("policy", [ours(), torchrls()])
