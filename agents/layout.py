@@ -161,16 +161,21 @@ def _ends(batch: TensorDictBase, time_limit: str) -> tuple[Tensor, Tensor]:
 
 def _check_order(batch: TensorDictBase, cut: Tensor) -> None:
     """Refuse a stock batch of shuffled steps."""
-    counted = "step_count" in batch and ("next", "step_count") in batch
-    if "final_index" in batch or not counted:
+    if "final_index" in batch:
         return
-    before = _flat(batch, "step_count")
-    after = _flat(batch, ("next", "step_count"))
-    follows = cut[:, :-1] | (after[:, :-1] == before[:, 1:])
-    if not bool(follows.all()):
-        raise ValueError(
-            "step_count must be that of whole sequences, never shuffled; got a jump within a row"
-        )
+    follows = {}
+    if "step_count" in batch and ("next", "step_count") in batch:
+        after = _flat(batch, ("next", "step_count"))
+        follows["step_count"] = after[:, :-1] == _flat(batch, "step_count")[:, 1:]
+    trajectory = ("collector", "traj_ids")
+    if trajectory in batch:  # steps of two envs may be counted as if they were of one
+        numbers = _flat(batch, trajectory)
+        follows["('collector', 'traj_ids')"] = numbers[:, :-1] == numbers[:, 1:]
+    for name, same in follows.items():
+        if not bool((cut[:, :-1] | same).all()):
+            raise ValueError(
+                f"{name} must be that of whole sequences, never shuffled; got a jump within a row"
+            )
 
 
 def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
@@ -254,6 +259,13 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
         return
     first = batch.get("initial_state", None)
     if first is not None:
+        missing = [key for key in inputs.state_keys if key not in first]
+        if missing:
+            raise ValueError(
+                f"initial_state must hold {missing[0]!r}, which a network of the loss reads: let "
+                "it run while collecting, TensorDictSequential(critic, actor); got "
+                f"{', '.join(map(str, first.keys()))}"
+            )
         out["initial_state"] = first.select(*inputs.state_keys)
         if burn_in and not inputs.reads_first_state_only:
             _begin_with(out["burn_in"], first, inputs)

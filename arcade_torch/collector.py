@@ -383,7 +383,10 @@ class ArcadeCollector(BaseCollector):
             weights = TensorDict.from_module(weights)
         elif isinstance(weights, dict):
             weights = TensorDict(weights, []).unflatten_keys(".")
-        TensorDict.from_module(self.policy).data.update_(weights.data)
+        # torch.compile puts a module into another one
+        weights = weights.get("_orig_mod", weights)
+        policy = getattr(self.policy, "_orig_mod", self.policy)
+        TensorDict.from_module(policy).data.update_(weights.data)
 
     def state_dict(self) -> OrderedDict[str, Any]:
         """Everything that determines the coming batches: env, recurrent state, overlap, counters,
@@ -425,8 +428,13 @@ class ArcadeCollector(BaseCollector):
 
         Raises:
             ValueError: It is of another game, or of other sizes, or has an overlap with other
-                ``final_frames``.
+                ``final_frames``, or of a collector of TorchRL's.
         """
+        if "sizes" not in state_dict:
+            raise ValueError(
+                "the state_dict is of no ArcadeCollector; of TorchRL's, load the weights alone: "
+                "policy.load_state_dict(state_dict['policy_state_dict'])"
+            )
         saved = list(state_dict["sizes"])
         sizes = [self._num_envs, self._steps, self._overlap]
         if saved != sizes:

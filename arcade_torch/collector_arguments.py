@@ -1,10 +1,22 @@
 """What ``ArcadeCollector`` refuses, in one clear line each."""
 
+import inspect
+from collections.abc import Collection
 from typing import Any, get_args
 
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.jax_env import JaxEnv
 from arcade_torch.rollout_buffer import FinalFrames
+
+
+def _parameters(policy: Any) -> Collection[str]:
+    """The names of what a policy takes that is no TensorDict module; empty where nobody can say."""
+    if policy is None or hasattr(policy, "in_keys"):
+        return ()
+    try:
+        return inspect.signature(getattr(policy, "forward", policy)).parameters
+    except (TypeError, ValueError):  # of a function that is compiled
+        return ()
 
 
 def check_arguments(
@@ -14,7 +26,7 @@ def check_arguments(
     if not isinstance(env, ArcadeEnv | JaxEnv):
         raise TypeError(
             f"env is a {type(env).__name__}, expected an ArcadeEnv or what from_jax gives; others "
-            "go with torchrl's Collector"
+            "go with torchrl's Collector, a function that makes one is called first"
         )
     if isinstance(env, ArcadeEnv) and env.one_hot:
         raise ValueError(
@@ -24,6 +36,12 @@ def check_arguments(
         raise TypeError(
             f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or "
             "None for random actions"
+        )
+    tensors = [str(key) for key in env.observation_keys if key in _parameters(policy)]
+    if tensors:
+        raise TypeError(
+            f"policy takes the tensor {', '.join(tensors)}, expected one that takes a TensorDict: "
+            f"pass TensorDictModule(policy, {tensors}, ['action'])"
         )
     num_envs = env.num_envs
     if frames_per_batch < num_envs or frames_per_batch % num_envs:

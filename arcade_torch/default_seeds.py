@@ -1,11 +1,10 @@
 """Notices envs that play the very same episodes because nobody gave them a seed."""
 
-import logging
-import multiprocessing
-import warnings
 import weakref
 from collections.abc import Hashable
 from typing import Any
+
+from arcade_torch.process import in_worker, warn
 
 
 class DefaultSeed(int):
@@ -39,8 +38,7 @@ def warn_of_twins(env: Any) -> None:
     noted = [envs for envs in _LIVE.values() if env in envs]
     if not noted or _warned:
         return
-    in_worker = multiprocessing.parent_process() is not None
-    if in_worker:
+    if in_worker():
         others = "every worker process that makes its env so"
     elif any(len(envs) > 1 for envs in noted):
         others = "another env of this process that was made so"
@@ -52,7 +50,4 @@ def warn_of_twins(env: Any) -> None:
         "each its own "
         "(arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them"
     )
-    if in_worker:  # where TorchRL silences warnings
-        logging.getLogger("arcade_torch").warning(says)
-    else:
-        warnings.warn(says, stacklevel=2)
+    warn(says)

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch.utils.dlpack import from_dlpack
 
+from arcade_torch.process import warn
+
 _WIDE = {torch.int64: torch.int32, torch.uint64: torch.uint32, torch.float64: torch.float32}
 # below it JAX copies; on a GPU its programs refuse the argument
 _ALIGNMENT_BYTES = {"cpu": 64, "cuda": 16}
@@ -146,9 +148,8 @@ def warn_frames_are_copied() -> None:
         if importlib.util.find_spec(package.replace("-", "_"))
         else "is missing"
     )
-    warnings.warn(
+    warn(
         f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied "
         "to the GPU. "
-        f"Install it with: pip install 'jax[cuda{major}]'",
-        stacklevel=2,
+        f"Install it with: pip install 'jax[cuda{major}]'"
     )

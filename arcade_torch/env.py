@@ -2,7 +2,7 @@
 JAX wrote.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -83,7 +83,8 @@ class ArcadeEnv(EnvBase):
         state_in_td: Adds ``state`` (what ``get_state`` gives) to the root and to ``"next"``, and
             makes every step start from the ``state`` it is handed, so that a planner can branch.
             The twin is the one that was set last; resets go on with the random keys of the last
-            step, whichever branch that was on.
+            step, whichever branch that was on. ``FrameSkipTransform``, which steps from one
+            tensordict again and again, repeats the first step there.
         task_in_td: Whether there is a key ``task``; None: if there are several games.
         debug: Whether actions are checked on CUDA too.
 
@@ -205,7 +206,8 @@ class ArcadeEnv(EnvBase):
     def __reduce__(self) -> NoReturn:
         raise TypeError(
             "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to "
-            "its set_state()"
+            "its set_state(); workers take a function that makes one, such as "
+            "functools.partial(arcade_torch.make, ...)"
         )
 
     def set_observability(self, observability: Observability) -> None:
@@ -288,13 +290,28 @@ class ArcadeEnv(EnvBase):
         """
         return self._live.generation, self._live.view
 
+    def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """TorchRL's ``rollout``, which warns where a policy's recurrent state is dropped."""
+        steps: TensorDictBase = super().rollout(*args, **kwargs)
+        validation.check_rollout(self, steps)
+        return steps
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Go on from what ``state_dict`` gave; an empty one, which TorchRL's ``Collector`` saves of
+        an env, leaves the episodes as they are, with a warning.
+        """
+        validation.warn_of_empty(state_dict)
+        return super().load_state_dict(state_dict, strict and len(state_dict) > 0, assign)
+
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""
         return {**self.get_state().to_dict(), "ends": self._live.ends.clone()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        saved = TensorDict(state, batch_size=self.batch_size, device=self.device).clone()
+        saved = validation.saved_state(state, self.num_envs, self.device).clone()
         self._go_on_from(saved, saved.get("ends", None))
 
     def step_raw(

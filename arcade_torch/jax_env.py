@@ -1,6 +1,6 @@
 """``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -146,13 +146,28 @@ class JaxEnv(EnvBase):
         self._go_on(self._snapshots.load(state))
         return self._root()
 
+    def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """TorchRL's ``rollout``, which warns where a policy's recurrent state is dropped."""
+        steps: TensorDictBase = super().rollout(*args, **kwargs)
+        validation.check_rollout(self, steps)
+        return steps
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """Go on from what ``state_dict`` gave; an empty one, which TorchRL's ``Collector`` saves of
+        an env, leaves the episodes as they are, with a warning.
+        """
+        validation.warn_of_empty(state_dict)
+        return super().load_state_dict(state_dict, strict and len(state_dict) > 0, assign)
+
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""
         return {**self.get_state().to_dict(), "ends": self._ended()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        saved = TensorDict(state, batch_size=self.batch_size, device=self.device)
+        saved = validation.saved_state(state, self.num_envs, self.device)
         ends = saved.get("ends", None)
         self._go_on(
             self._snapshots.load(saved), ends.clone() if ends is not None and ends.any() else None

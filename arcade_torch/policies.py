@@ -3,7 +3,7 @@ stored of it.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -15,6 +15,8 @@ from torchrl.modules.utils import get_primers_from_module
 Policy = Callable[[TensorDictBase], TensorDictBase]
 # beside the observation; task: if there are several
 ROOT_KEYS = ("last_action", "is_init", "step_count", "episode_reward", "task")
+ENDS = ("done", "terminated", "truncated")
+"""False at every root, for an episode that has ended begins anew; for policies that read them."""
 
 
 class PolicyRunner:
@@ -49,8 +51,12 @@ class PolicyRunner:
         reads = () if policy is None else getattr(policy, "in_keys", root_keys)
         prefixes = [path_of(key) for key in reads] + [("is_init",)]
         self.reads = tuple(key for key in root_keys if _is_below(path_of(key), prefixes))
+        self._ends = {}
+        if policy is not None:
+            no = torch.zeros(batch_size, 1, dtype=torch.bool, device=device)
+            self._ends = {key: no for key in ENDS if key in getattr(policy, "in_keys", ENDS)}
         # what is never stored as something that the policy wrote
-        self._known = {path_of(key)[0] for key in root_keys} | {"action"}
+        self._known = {path_of(key)[0] for key in root_keys} | {"action", *ENDS}
         # A module that reads is_init begins anew by itself. Stored states show what it begins with.
         self._sets_initial = store_states or "is_init" not in reads
         self._initial = TensorDict({}, batch_size=self._size, device=device)
@@ -109,9 +115,11 @@ class PolicyRunner:
         if self._sets_initial and len(state.keys()):
             state = self.begin_anew(state, obs["is_init"])
         # the same at every step: graphs hold one layout
-        entries = {key: obs[key] for key in self.reads if key in obs}
+        entries = {key: obs[key] for key in self.reads if key in obs} | self._ends
         td = TensorDict(entries | dict(state.items()), batch_size=self._size, device=self._device)
         td = self._policy(td)
+        if not isinstance(td, TensorDictBase) or "action" not in td:
+            _refuse_output(td)
         carried = TensorDict({}, batch_size=self._size, device=self._device)
         stored: dict[NestedKey, torch.Tensor] = {}
         states = set(map(path_of, state.keys(True, True)))
@@ -129,6 +137,17 @@ class PolicyRunner:
         if is_state and not self._store_states:
             return False
         return self._store is None or _is_below(path, self._store)
+
+
+def _refuse_output(given: Any) -> NoReturn:
+    """Say what a policy has to give in the place of what it gave."""
+    kind = f"a {type(given).__name__}"
+    if isinstance(given, TensorDictBase):
+        kind = f"{', '.join(map(str, given.keys()))}, but no 'action'"
+    raise TypeError(
+        f"the policy gives {kind}, expected the TensorDict that it was called with, and in it "
+        "'action'; a module of tensors goes as TensorDictModule(module, ['pixels'], ['action'])"
+    )
 
 
 def _is_below(path: tuple[str, ...], prefixes: Iterable[tuple[str, ...]]) -> bool:

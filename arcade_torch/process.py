@@ -1,9 +1,12 @@
-"""Refuses processes in which JAX would hang or cannot start. Loads no JAX, and is loaded with the
-package.
+"""Refuses processes in which JAX would hang or cannot start, and warns from workers too. Loads no
+JAX, and is loaded with the package.
 """
 
+import logging
+import multiprocessing
 import os
 import sys
+import warnings
 
 _started_in: int | None = None  # the first process known to have started JAX
 
@@ -32,6 +35,19 @@ def check_process() -> None:
             "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it "
             "needs no workers"
         )
+
+
+def in_worker() -> bool:
+    """Whether another process started this one."""
+    return multiprocessing.parent_process() is not None
+
+
+def warn(says: str) -> None:
+    """Warn; in a worker by a line of the log, for there TorchRL silences warnings."""
+    if in_worker():
+        logging.getLogger("arcade_torch").warning(says)
+    else:
+        warnings.warn(says, stacklevel=3)
 
 
 def missing_platform() -> str:

@@ -3,15 +3,16 @@ clear line each.
 """
 
 import functools
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 
 from arcade_torch.envs_jax.validation import format_value, plain
+from arcade_torch.process import warn
 
 # integers of torch: the type of numpy under which negative numbers are large
 _UNSIGNED = {
@@ -162,9 +163,41 @@ def keep_what_was_written(td: TensorDictBase, following: TensorDictBase) -> None
         return
     unknown = written.exclude(*following.keys(True, True))
     following.update(unknown)
-    keys = tuple(unknown.keys(True, True))
+    keys = unknown.keys(True, True)
     if keys:
-        warn_state_is_dropped(*keys)
+        warn_state_is_dropped(*sorted(keys, key=str))
+
+
+def check_rollout(env: EnvBase, steps: TensorDictBase) -> None:
+    """Say so if a policy wrote for the next step what ``rollout`` dropped, since no spec of the env
+    names it.
+    """
+    specs = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec)
+    carried = set()
+    for spec in specs:
+        carried.update(spec.keys(True, True))
+    dropped = set(steps["next"].keys(True, True)) - carried
+    if dropped:
+        warn_state_is_dropped(*sorted(dropped, key=str))
+
+
+def warn_of_empty(state_dict: Mapping[str, Any]) -> None:
+    """Say that an empty ``state_dict`` moves no episode."""
+    if not state_dict:
+        warn(
+            "the state_dict holds no env, as that of TorchRL's Collector: the episodes go on where "
+            "they are. ArcadeCollector saves them, or save env.state_dict() yourself"
+        )
+
+
+def saved_state(state: Mapping[str, Any], num_envs: int, device: torch.device | None) -> TensorDict:
+    """A saved state as TensorDict [num_envs]; raises ValueError if it is of another size."""
+    for name, value in state.items():
+        if isinstance(value, torch.Tensor) and len(value) != num_envs:
+            raise ValueError(
+                f"the saved entry {name!r} is of {len(value)} envs, this env has {num_envs}"
+            )
+    return TensorDict(dict(state), batch_size=[num_envs], device=device)
 
 
 def only_marked(
@@ -187,11 +220,10 @@ def warn_state_is_dropped(*keys: NestedKey) -> None:
     specs name.
     """
     names = ", ".join(".".join((key,) if isinstance(key, str) else key) for key in keys)
-    warnings.warn(
+    warn(
         f"the policy wrote {names} for the next step, which does not get there, so a memory "
         "forgets: act in "
-        "TransformedEnv(env, get_primers_from_module(policy)), or with ArcadeCollector",
-        stacklevel=2,
+        "TransformedEnv(env, get_primers_from_module(policy)), or with ArcadeCollector"
     )
 
 

@@ -2,6 +2,8 @@
 steps of the batch follow each other.
 """
 
+import logging
+import multiprocessing
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
@@ -265,12 +267,11 @@ class SequenceChecks:
                 return
         if _any(~is_init):
             self._has_warned = True
-            warnings.warn(
+            _warn(
                 f"no recurrent state {'.'.join(state_keys[0])!r} at a step whose is_init is false, "
                 "so the memory begins anew at every step: act in TransformedEnv(env, "
                 "get_primers_from_module(policy)), or with ArcadeCollector; for sequences, switch "
-                f"set_recurrent_mode(True) on. See {GUIDE}#recurrent-policies",
-                stacklevel=2,
+                f"set_recurrent_mode(True) on. See {GUIDE}#recurrent-policies"
             )
 
 
@@ -289,6 +290,14 @@ def _empty_nodes(state: TensorDictBase) -> list[tuple[str, ...]]:
         if isinstance(value, TensorDictBase) and value.is_empty():
             empty.append((key,) if isinstance(key, str) else tuple(key))
     return empty
+
+
+def _warn(says: str) -> None:
+    """Warn; in a worker by a line of the log, for there TorchRL silences warnings."""
+    if multiprocessing.parent_process() is not None:
+        logging.getLogger(__name__).warning(says)
+    else:
+        warnings.warn(says, stacklevel=3)
 
 
 def _is_host(flags: Tensor) -> bool:

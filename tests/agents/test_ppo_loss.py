@@ -266,6 +266,14 @@ def test_the_documented_call_works_for_one_tower_and_for_two(memory, towers):
         torch.testing.assert_close(p.grad, gradient)
 
 
+def test_a_critic_whose_memory_did_not_run_while_collecting_is_named():
+    network = toy_actor_critic(3)
+    batch = with_two_states(stream(4, 9, seed=3)).sequences()
+    del batch["initial_state", "memory", "critic"]
+    with pytest.raises(ValueError, match=r"initial_state must hold .*critic.*while collecting"):
+        SequenceGAE(network.critic)(batch)
+
+
 def test_torchrls_losses_train_actor_and_critic_of_one_tower():
     network = make_actor_critic("small", "gru", hidden_size=16)
     env = arcade_torch.make("SkittlesEasy", num_envs=4, seed=1)

@@ -147,6 +147,18 @@ def test_shuffled_steps_are_refused_and_ordered_ones_are_not(shape):
             read(shuffled.clone())
 
 
+def test_steps_of_two_envs_that_count_on_are_refused():
+    """A flat storage puts the rows one behind the other, and a slice may lie across the seam."""
+    batch = numbered(stream(1, 8, seed=3, ends=0.0, seams=0.0))
+    read_all = list(readers(store="step"))
+    for read in read_all:
+        read(batch.clone())
+    batch["collector", "traj_ids"][:, 4:] += 1
+    for read in read_all:
+        with pytest.raises(ValueError, match=r"^\('collector', 'traj_ids'\) must be .*whole"):
+            read(batch.clone())
+
+
 def test_slices_that_begin_within_episodes_are_refused_where_their_states_would_be_dropped():
     batch = numbered(stream(4, 12, seed=3, ends=0.1))
     torch.manual_seed(0)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
@@ -655,6 +656,12 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
             "final_frames is 'some', allowed: 'all', 'truncated', 'none'",
         ),
         ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
+        (
+            {"policy": lambda pixels: pixels},
+            TypeError,
+            "policy takes the tensor pixels, expected one that takes a TensorDict: pass "
+            "TensorDictModule(policy, ['pixels'], ['action'])",
+        ),
     ],
 )
 def test_wrong_arguments_are_explained(
@@ -664,7 +671,52 @@ def test_wrong_arguments_are_explained(
         stub_collector(options.pop("policy", scripted), **options)
 
 
+@pytest.mark.parametrize(
+    ("policy", "gives"),
+    [
+        (lambda td: td["last_action"], "a Tensor"),
+        (lambda td: None, "a NoneType"),
+        (lambda td: td.select("pixels"), "pixels, but no 'action'"),
+    ],
+)
+def test_what_a_policy_has_to_give_is_explained(policy: Any, gives: str) -> None:
+    with pytest.raises(TypeError, match=f"^the policy gives {gives}, expected the TensorDict"):
+        stub_collector(policy).collect()
+
+
+@pytest.mark.parametrize("keys", [("done", "terminated", "truncated"), ("truncated",)])
+def test_a_policy_may_read_whether_an_episode_has_ended(keys: tuple[str, ...]) -> None:
+    """As in TorchRL's ``Collector``; where policies act, none has."""
+    policy = TensorDictModule(
+        lambda frames, *ends: frames[:, 0, 0, 0].long() % 5 * ~torch.cat(ends, 1).any(1),
+        ["pixels", *keys],
+        ["action"],
+    )
+    for module in (policy, lambda td: policy(td)):  # functions name no keys
+        ours = next(stub_collector(module).iterator())
+        stock = Collector(stub_env(GAME, 3), module, frames_per_batch=N * T, total_frames=N * T)
+        theirs = next(iter(stock))
+        assert ours["action"].any() and torch.equal(ours["action"], theirs["action"])
+        assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
+
+
+def test_a_compiled_policy_takes_the_weights_of_one_that_is_not() -> None:
+    def module() -> TensorDictModule:
+        head = nn.Sequential(nn.Linear(1, 5), nn.Flatten(0, -2))
+        act = TensorDictModule(lambda q: q.argmax(-1), ["q"], ["action"])
+        read = TensorDictModule(lambda frames: frames[:, 0, 0, :1].float(), ["pixels"], ["x"])
+        return TensorDictSequential(read, TensorDictModule(head, ["x"], ["q"]), act)
+
+    compiled = torch.compile(module(), backend="eager")
+    for one, other in ((compiled, module()), (module(), compiled)):
+        stub_collector(one).update_policy_weights_(other)
+        for a, b in zip(one.parameters(), other.parameters(), strict=True):
+            assert torch.equal(a, b)
+
+
 def test_wrong_envs_are_explained() -> None:
+    with pytest.raises(TypeError, match=r"env is a function, .* is called first"):
+        ArcadeCollector(stub_env, scripted, N * T)  # type: ignore[arg-type]
     with pytest.raises(
         TypeError, match=r"TransformedEnv, expected an ArcadeEnv or what from_jax gives; others go"
     ):

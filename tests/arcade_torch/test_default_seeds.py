@@ -13,7 +13,7 @@ import torch
 from torchrl.envs import ParallelEnv, SerialEnv
 
 import arcade_torch
-from arcade_torch import ArcadeCollector, default_seeds
+from arcade_torch import ArcadeCollector, default_seeds, process
 
 SAID = "this env has the default seed, 0, and plays the very same episodes as"
 
@@ -78,7 +78,7 @@ def test_honest_uses_hear_nothing() -> None:
 def test_a_worker_process_is_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(default_seeds.multiprocessing, "parent_process", lambda: object())
+    monkeypatch.setattr(process.multiprocessing, "parent_process", lambda: object())
     make(seed=0).reset()
     assert not caplog.messages
     make().reset(), make().reset()

@@ -2,17 +2,20 @@
 only then.
 """
 
+import multiprocessing
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import jax.numpy as jnp
 import pytest
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.data import Categorical
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from torchrl.modules import LSTMModule, QValueModule
 from torchrl.modules.utils import get_primers_from_module
@@ -20,6 +23,7 @@ from torchrl.modules.utils import get_primers_from_module
 from arcade_torch import validation
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.jax_env import from_jax
 from arcade_torch.models import MemoryModule, make_memory
 from tests.arcade_torch.stub import GAME
 
@@ -39,6 +43,20 @@ def not_warned_yet() -> Iterator[None]:
 
 def stub_env(**options: Any) -> ArcadeEnv:
     return ArcadeEnv(GAME, N, **options)
+
+
+def suite_env() -> Any:
+    """An env that is not ours, whose one number stands under the key that our policies read."""
+
+    class Count:
+        def reset(self, key: Any) -> Any:
+            return jnp.zeros((8, 1, 1)), jnp.int32(0)
+
+        def step(self, key: Any, state: Any, action: Any) -> Any:
+            return jnp.ones((8, 1, 1)), state + 1, 1.0, state >= 4, {}
+
+    spec = Categorical(5, shape=(N,))
+    return from_jax(Count(), num_envs=N, obs_key="pixels", action_spec=spec)
 
 
 def policy_of(*memory: TensorDictModule, hidden: str) -> TensorDictSequential:
@@ -97,6 +115,26 @@ def test_a_bare_env_says_once_that_the_state_is_dropped(policy: nn.Module, run: 
     assert not torch.allclose(
         dropped["action_value"], whole["action_value"], atol=1e-3
     )  # it is no false alarm
+
+
+@pytest.mark.parametrize("env", [stub_env, lambda: suite_env()], ids=["ours", "from_jax"])
+def test_a_rollout_that_stops_at_the_first_end_says_so_too(env: Callable[[], Any]) -> None:
+    """The default of ``rollout``; it said nothing of ``LSTMModule``."""
+    with pytest.warns(UserWarning, match=MESSAGE), torch.no_grad():
+        env().rollout(3, torchrls())
+    silent(lambda: rollout(env(), torchrls()))  # once in all
+
+
+@pytest.mark.parametrize("policy", [ours(), torchrls()])
+def test_a_worker_process_says_so_in_the_log(
+    policy: nn.Module, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """TorchRL silences warnings in the processes of its collectors."""
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: object())
+    silent(lambda: rollout(stub_env(), policy))
+    assert sum("a memory forgets" in message for message in caplog.messages) == 1
+    of_the_memory = sum("begins anew at every step" in message for message in caplog.messages)
+    assert of_the_memory == isinstance(policy[1], MemoryModule)
 
 
 def test_the_warning_is_one_line_that_names_the_entries() -> None:
