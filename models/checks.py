@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from arcade_torch.models.laws import MemoryLawError, laws_of, subject_of
+from arcade_torch.models.law_subject import MemoryLawError, subject_of
+from arcade_torch.models.laws import laws_of
 
 __all__ = ["LawResult", "MemoryLawError", "check_memory", "law_results"]
 
