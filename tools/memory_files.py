@@ -7,7 +7,7 @@ from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.tools.errors import one_line
-from arcade_torch.tools.imports import imported, is_from_user
+from arcade_torch.tools.imports import is_from_user
 
 SKIP = "--no-check-memory trains it unchecked"
 
@@ -63,8 +63,10 @@ def _width(cell: Any, input_size: int) -> int:
 
 
 def _place(error: Exception) -> str:
-    """The last line of an imported file that an error came through, such as `` (yours.py:23)``."""
-    for at in reversed(traceback.extract_tb(error.__traceback__)):
-        if at.filename in imported():
-            return f" ({Path(at.filename).name}:{at.lineno})"
-    return ""
+    """The last line of a user that an error came through, such as `` (yours.py:23)``."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package not in ("arcade_torch", "torch", "tensordict"):
+            place = f" ({Path(frame.f_code.co_filename).name}:{line})"
+    return place
