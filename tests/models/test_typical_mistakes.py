@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from arcade_torch.models import MemoryLawError, check_memory
+from arcade_torch.models import MemoryLawError, MemoryModule, check_memory, make_network
 
 WIDTH = 4
 
@@ -289,3 +289,24 @@ def test_no_draw_hides_a_flag_of_one_row_that_resets_others(seed: int) -> None:
     """Before: these seeds had no start of the other rows where the two compared had none."""
     with pytest.raises(MemoryLawError, match="a flag of one row that resets others"):
         check_memory(AnyRowResets(), seed=seed)
+
+
+class TupleState(Cell):
+    def initial_state(self, batch_size: int) -> Any:
+        return (super().initial_state(batch_size)["h"],)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda memory: MemoryModule(memory),
+        lambda memory: make_network("small", memory=lambda *_: memory),
+    ],
+    ids=["MemoryModule", "make_network"],
+)
+def test_a_module_that_is_no_memory_is_refused_where_it_is_handed_over(use: Any) -> None:
+    """Before: an AttributeError from within, or a network with a tuple for a state."""
+    with pytest.raises(TypeError, match=r"LSTM has no initial_state\(batch_size\).*own_memory"):
+        use(nn.LSTM(3, WIDTH))
+    with pytest.raises(TypeError, match="TupleState gives a tuple, and not a TensorDict"):
+        use(TupleState())
