@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-__all__ = ["MemoryLawError", "Subject", "is_continuous", "leaves", "pairs_of", "subject_of"]
+__all__ = ["MemoryLawError", "Subject", "leaves", "pairs_of", "subject_of"]
 
 # Largest difference allowed between two ways to compute the same thing; see ``_difference``.
 TOLERANCES = {
@@ -115,11 +115,6 @@ def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     if tensor.is_complex():
         return tensor.to(dtype.to_complex())
     return tensor.to(dtype) if tensor.is_floating_point() else tensor
-
-
-def is_continuous(tensor: Tensor) -> bool:
-    """Whether a tensor holds real or complex numbers, through which gradients flow."""
-    return tensor.is_floating_point() or tensor.is_complex()
 
 
 def _difference(p: Tensor, q: Tensor) -> float:

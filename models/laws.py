@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from arcade_torch.models.law_subject import MemoryLawError, Subject, is_continuous, leaves, pairs_of
+from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
 
 __all__ = ["Law", "laws_of"]
@@ -95,11 +95,18 @@ def _check_states(s: Subject, law: str, batch: int, begin: TensorDict, after: Te
             "from the parameters",
         )
     for path, (_, dtype) in expected.items():
-        is_number = dtype.is_floating_point or dtype.is_complex
-        if is_number and torch.finfo(dtype).eps > torch.finfo(s.dtype).eps:
+        name = ".".join(path)
+        if dtype.is_complex:
             raise MemoryLawError(
                 law,
-                f"{'.'.join(path)} of the state is {dtype} where the parameters are {s.dtype}",
+                f"{name} of the state is {dtype}, and specs of TorchRL know no complex numbers",
+                "a state that is not taken apart: hold torch.view_as_real(h), and begin forward "
+                "with torch.view_as_complex",
+            )
+        if dtype.is_floating_point and torch.finfo(dtype).eps > torch.finfo(s.dtype).eps:
+            raise MemoryLawError(
+                law,
+                f"{name} of the state is {dtype} where the parameters are {s.dtype}",
                 "zeros without a dtype, or a cast: take weight.new_zeros(...)",
             )
 
@@ -276,7 +283,7 @@ def _no_leak(s: Subject, law: str) -> float:
     )
     x, state, flags = s.inputs(2, 9)
     flags[:, 4] = True
-    carried = [v.requires_grad_() for v in leaves(state).values() if is_continuous(v)]
+    carried = [v.requires_grad_() for v in leaves(state).values() if v.is_floating_point()]
     x.requires_grad_()
     y, _ = s.module(x, state, flags)
     if not y.requires_grad:
@@ -298,7 +305,9 @@ def _no_leak(s: Subject, law: str) -> float:
         symptom = "outputs after a start depend on what was before it"
         worst = max(worst, s.compare(law, symptom, cause, (y[:, 4:], changed[:, 4:])))
         flags[:, 0] = True
-        poisoned = state.apply(lambda v: torch.full_like(v, torch.nan) if is_continuous(v) else v)
+        poisoned = state.apply(
+            lambda v: torch.full_like(v, torch.nan) if v.is_floating_point() else v
+        )
         clean, after_clean = s.module(x, s.initial(2), flags)
         survived, after_poison = s.module(x, poisoned, flags)
         symptom = "a NaN in the carried state comes through a start at index 0"
@@ -360,7 +369,7 @@ def _averages(s: Subject, law: str) -> float:
 def _gradients(s: Subject, law: str) -> float:
     x, state, flags = s.inputs(2, 5)
     flags[0, 2] = True
-    keys = [k for k, v in leaves(state).items() if is_continuous(v)]
+    keys = [k for k, v in leaves(state).items() if v.is_floating_point()]
     names = [name for name, p in s.module.named_parameters() if p.requires_grad]
     parameters = [s.module.get_parameter(name).detach().clone() for name in names]
     arguments = [

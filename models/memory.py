@@ -254,4 +254,4 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
             f"initial_state of {name} gives a {type(state).__name__}, and not a TensorDict: "
             'TensorDict({"h": ...}, batch_size=[batch_size])'
         )
-    return state  # type: ignore[return-value]
+    return state

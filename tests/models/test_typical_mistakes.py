@@ -86,11 +86,8 @@ class RunningMean(Cell):
         return super().read(x - self.mean)
 
 
-class ComplexTimesZero(Cell):
-    """A complex state that is reset by a product."""
-
-    def fresh(self, begins: Tensor, h: Tensor) -> Tensor:
-        return h * (~begins).to(h.dtype)
+class ComplexState(Cell):
+    """Its primer is an error of TorchRL."""
 
     def initial_state(self, batch_size: int) -> TensorDict:
         return self.state_of(super().initial_state(batch_size)["h"] + 0j)
@@ -210,7 +207,7 @@ def test_the_model_without_a_mistake_passes() -> None:
         (Dropout, "equal calls give equal results", "take dropout=0"),
         (BatchNorm, "equal calls give equal results", "take dropout=0 and nn.LayerNorm"),
         (RunningMean, "equal calls give equal results", "training mode and evaluation mode differ"),
-        (ComplexTimesZero, "nothing leaks over a start", "select with torch.where"),
+        (ComplexState, "shapes are fixed", "hold torch.view_as_real(h)"),
         (MadeInForward, "weights are registered", "new weights: out.bias, out.weight"),
         (TrainableTensor, "weights are registered", "scale of TrainableTensor"),
     ],
@@ -252,8 +249,15 @@ class ComplexWeight(Cell):
         super().__init__()
         self.rotation = nn.Parameter(torch.polar(torch.full([WIDTH], 0.9), torch.ones(WIDTH)))
 
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        given = super().state_of(torch.view_as_complex(state["h"]))
+        return super().forward(x, given, is_init)
+
     def read(self, x: Tensor) -> Tensor:
         return super().read(x) * self.rotation
+
+    def state_of(self, h: Tensor) -> TensorDict:
+        return super().state_of(torch.view_as_real(h))
 
     def initial_state(self, batch_size: int) -> TensorDict:
         return self.state_of(self.rotation.new_zeros(batch_size, WIDTH))
