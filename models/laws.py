@@ -1,150 +1,38 @@
 """The laws of a memory model, each a function of a copy of the module that is put to the test."""
 
-import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
 
-__all__ = ["Law", "MemoryLawError", "Subject", "laws_of", "subject_of"]
+__all__ = ["Law", "laws_of"]
 
 GUARD = 1e-4  # what a small number in a denominator may cost the law of averages
-
-# Largest difference allowed between two ways to compute the same thing; see ``_difference``.
-TOLERANCES = {
-    torch.float64: 1e-7,
-    torch.float32: 1e-4,
-    torch.bfloat16: 0.1,
-    torch.float16: 0.01,
-}
-
-
-class MemoryLawError(AssertionError):
-    """A memory model breaks one of the laws.
-
-    Attributes:
-        law: name of the law, as in the keys that :func:`check_memory` returns.
-        discrepancy: largest absolute difference found, NaN if the law is not about numbers.
-    """
-
-    def __init__(
-        self, law: str, symptom: str, cause: str, discrepancy: float = float("nan")
-    ) -> None:
-        super().__init__(f"law {law!r} is broken: {symptom}. Likely cause: {cause}.")
-        self.law = law
-        self.discrepancy = discrepancy
-
-
-@dataclass
-class Subject:
-    """The copy under test and what the laws need to poke it."""
-
-    module: nn.Module
-    input_size: int
-    dtype: torch.dtype
-    tolerance: float
-
-    def random(self, batch: int, steps: int) -> Tensor:
-        """Random x [batch, steps, D] where the parameters are."""
-        weight = next(self.module.parameters(), torch.zeros(0))
-        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(
-            weight.device, self.dtype
-        )
-
-    def inputs(
-        self, batch: int, steps: int, resets: float = 0.0
-    ) -> tuple[Tensor, TensorDict, Tensor]:
-        """Random x, a state that some steps have led to, and start flags."""
-        x = self.random(batch, steps)
-        warm = self.random(batch, 3)
-        with torch.no_grad():
-            _, state = self.module(
-                warm, self.initial(batch), torch.zeros_like(warm[..., 0], dtype=torch.bool)
-            )
-        return x, state, (torch.rand(batch, steps) < resets).to(x.device)
-
-    def initial(self, batch: int) -> TensorDict:
-        """The state at the start of an episode, TensorDict [batch]."""
-        return self.module.initial_state(batch)  # type: ignore[operator]
-
-    def compare(
-        self,
-        law: str,
-        symptom: str,
-        cause: str,
-        *pairs: tuple[Tensor, Tensor],
-        tolerance: float | None = None,
-    ) -> float:
-        """Largest difference of the pairs; raises if above the tolerance or not a number."""
-        worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
-        if not worst <= (self.tolerance if tolerance is None else tolerance):
-            raise MemoryLawError(law, f"{symptom} (largest difference {worst:.2g})", cause, worst)
-        return worst
-
-
-def subject_of(
-    module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
-) -> Subject:
-    """The copy of a module that is checked."""
-    size = getattr(module, "input_size", None) if input_size is None else input_size
-    if not isinstance(size, int):
-        raise ValueError(
-            "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
-        )
-    if not hasattr(module, "initial_state"):
-        raise TypeError(
-            f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
-        )
-    if dtype not in TOLERANCES:
-        allowed = ", ".join(map(str, TOLERANCES))
-        raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
-    if tolerance is None:
-        tolerance = TOLERANCES[dtype]
-    return Subject(copy.deepcopy(module).to(dtype).eval(), size, dtype, tolerance)
-
 
 Law = Callable[[Subject, str], float]
 """Called with the subject and the name of the law; gives the largest discrepancy."""
 
 
-def _difference(p: Tensor, q: Tensor) -> float:
-    """Largest difference, as a share of the largest entry where that is above 1: sums over many
-    steps are large, and so is their rounding. Computed in float64.
-    """
-    wide = torch.complex128 if p.is_complex() else torch.float64
-    p = p.to(wide)
-    q = q.to(wide)
-    size = q.abs().max().clamp_min(1.0)
-    return float((p - q).abs().max() / size)
-
-
-def _leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
-    """The tensors of a state, by path."""
-    return {
-        key if isinstance(key, tuple) else (key,): state.get(key) for key in state.keys(True, True)
-    }
-
-
-def _pairs(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
-    """Tensors of two states side by side."""
-    return [(leaf, q.get(key)) for key, leaf in _leaves(p).items()]
-
-
+@torch.no_grad()
 def _shapes(s: Subject, law: str) -> float:
     for batch, steps in ((1, 1), (3, 1), (2, 5)):
         _check_one_shape(s, law, batch, steps)
-    x, state, flags = s.inputs(2, 5, 0.3)
-    before = state.clone()
-    s.module(x, state, flags)
-    return s.compare(
-        law,
-        "forward changed the state that it was given",
-        "an in-place write",
-        *_pairs(before, state),
+    copied = s.copied()
+    x, state, flags = copied.inputs(2, 5, 0.3)
+    flags[0, 0] = True
+    given = (x.clone(), state.clone(), flags.clone())
+    copied.module(x, state, flags)
+    symptom = "forward changed the {} that it was given"
+    cause = "an in-place write"
+    return max(
+        s.compare(law, symptom.format("state"), cause, *pairs_of(given[1], state)),
+        s.compare(law, symptom.format("x"), cause, (given[0], x)),
+        s.compare(law, symptom.format("is_init"), cause, (given[2], flags)),
     )
 
 
@@ -152,7 +40,9 @@ def _check_one_shape(s: Subject, law: str, batch: int, steps: int) -> None:
     """Types, shapes and dtypes of the outputs of ``batch`` sequences of ``steps`` steps."""
     x = s.random(batch, steps)
     begin = s.initial(batch)
-    out = s.module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
+    # a copy: what a module keeps of a call in itself is another law's
+    module = s.copied().module
+    out = module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
     parts = (begin, *(out if isinstance(out, tuple) else (out,)))
     if [isinstance(part, TensorDictBase) for part in parts] != [True, False, True]:
         types = ", ".join(type(part).__name__ for part in parts)
@@ -163,7 +53,7 @@ def _check_one_shape(s: Subject, law: str, batch: int, steps: int) -> None:
         )
 
     y, after = out
-    width = getattr(s.module, "hidden_size", None)
+    width = getattr(module, "hidden_size", None)
     fits = y.ndim == 3 and y.shape[:2] == (batch, steps)
     if not fits or (width is not None and y.shape[2] != width):
         raise MemoryLawError(
@@ -171,7 +61,30 @@ def _check_one_shape(s: Subject, law: str, batch: int, steps: int) -> None:
             f"x {list(x.shape)} gave y {list(y.shape)}, not [B, T, H]",
             "time and batch are exchanged, or hidden_size is not the width of y",
         )
+    if y.dtype != s.dtype:
+        raise MemoryLawError(
+            law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype"
+        )
+    if not y.isfinite().all():
+        raise MemoryLawError(
+            law,
+            "y has entries that are NaN or infinite",
+            "a division by 0, the logarithm or the root of a number below 0, or weights of "
+            "torch.empty that nothing has filled",
+        )
+    _check_states(s, law, batch, begin, after)
 
+
+def _check_states(s: Subject, law: str, batch: int, begin: TensorDict, after: TensorDict) -> None:
+    """Batch size, shapes and dtypes of the first state and of one that forward returned."""
+    for source, state in ((f"initial_state({batch})", begin), ("forward", after)):
+        if list(state.batch_size) != [batch]:
+            raise MemoryLawError(
+                law,
+                f"the state of {source} has batch_size {list(state.batch_size)}, not [{batch}]",
+                "TensorDict(..., batch_size=[B]) is missing, or a tensor does not have the batch "
+                "as its first dimension, such as [layers, B, H] of torch.nn.LSTM",
+            )
     expected = _layout(begin)
     returned = _layout(after)
     if expected != returned:
@@ -181,18 +94,100 @@ def _check_one_shape(s: Subject, law: str, batch: int, steps: int) -> None:
             "the state grows, lacks the batch dimension, or does not take dtype and device "
             "from the parameters",
         )
-    if y.dtype != s.dtype:
-        raise MemoryLawError(
-            law, f"{s.dtype} inputs gave {y.dtype}", "a constant or a cast in another dtype"
-        )
+    for path, (_, dtype) in expected.items():
+        name = ".".join(path)
+        if dtype.is_complex:
+            raise MemoryLawError(
+                law,
+                f"{name} of the state is {dtype}, and specs of TorchRL know no complex numbers",
+                "a state that is not taken apart: hold torch.view_as_real(h), and begin forward "
+                "with torch.view_as_complex",
+            )
+        if dtype.is_floating_point and torch.finfo(dtype).eps > torch.finfo(s.dtype).eps:
+            raise MemoryLawError(
+                law,
+                f"{name} of the state is {dtype} where the parameters are {s.dtype}",
+                "zeros without a dtype, or a cast: take weight.new_zeros(...)",
+            )
 
 
 def _layout(state: TensorDict) -> dict[tuple[str, ...], tuple[list[int], torch.dtype]]:
     """Shape and dtype of the tensors of a state, by path."""
     layout = {}
-    for path, tensor in _leaves(state).items():
+    for path, tensor in leaves(state).items():
         layout[path] = (list(tensor.shape), tensor.dtype)
     return layout
+
+
+@torch.no_grad()
+def _calls_repeat(s: Subject, law: str) -> float:
+    copied = s.copied()
+    x, state, flags = copied.inputs(3, 5, 0.3)
+    y, after = copied.module(x, state, flags)
+    again, after_again = copied.module(x, state, flags)
+    worst = s.compare(
+        law,
+        "the same call twice differs",
+        "random numbers, such as F.dropout without training=self.training, or a state that the "
+        "module keeps in itself: what is carried on belongs into the TensorDict that is returned",
+        (y, again),
+        *pairs_of(after, after_again),
+    )
+    trained, after_trained = s.copied().module.train()(x, state, flags)
+    return max(
+        worst,
+        s.compare(
+            law,
+            "training mode and evaluation mode differ",
+            "dropout (0.1 by default in nn.TransformerEncoderLayer), batch normalisation, or noise "
+            "in training: acting and learning, which are both in training mode, would see other "
+            "functions; take dropout=0 and nn.LayerNorm",
+            (y, trained),
+            *pairs_of(after, after_trained),
+        ),
+    )
+
+
+@torch.no_grad()
+def _weights_are_registered(s: Subject, law: str) -> float:
+    registered = {id(weight) for weight in s.module.parameters()}
+    for part in s.module.modules():
+        for name, value in vars(part).items():
+            if all(id(weight) in registered for weight in _weights_in(value)):
+                continue
+            raise MemoryLawError(
+                law,
+                f"parameters() does not list what is in {name} of {type(part).__name__}, a "
+                f"{type(value).__name__}",
+                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
+                "nn.ParameterList or nn.Parameter",
+            )
+    module = s.copied().module
+    before = set(module.state_dict())
+    x = s.random(2, 3)
+    module(x, s.initial(2), torch.zeros_like(x[..., 0], dtype=torch.bool))
+    if new := set(module.state_dict()) - before:
+        raise MemoryLawError(
+            law,
+            f"the first call makes new weights: {', '.join(sorted(new))}",
+            "a layer made in forward, which the optimiser does not know: make it in __init__",
+        )
+    return 0.0
+
+
+def _weights_in(value: Any) -> list[Tensor]:
+    """The weights that an attribute of a module is, or holds in a plain list or dictionary."""
+    if isinstance(value, Tensor):
+        return [value] if value.requires_grad and value.is_leaf else []
+    if isinstance(value, dict):
+        value = list(value.values())
+    weights = list[Tensor]()
+    for entry in value if isinstance(value, list | tuple) else ():
+        if isinstance(entry, nn.Module):
+            weights += entry.parameters()
+        elif isinstance(entry, nn.Parameter):
+            weights.append(entry)
+    return weights
 
 
 def _steps(s: Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
@@ -217,9 +212,10 @@ def _scan_equals_steps(s: Subject, law: str) -> float:
                 "calls of one differ"
             )
             cause = (
-                "an operator that is not associative, a scan that mishandles lengths that are no "
-                "power of two, "
-                "a look into the future, or acting and learning in different code"
+                "a given state that is not used, a returned one that is not the one after the last "
+                "step, a look into the future, time and batch exchanged in a reshape, an operator "
+                "that is not associative, or a scan that mishandles lengths that are no power of "
+                "two"
             )
             if resets:
                 cause = (
@@ -227,7 +223,7 @@ def _scan_equals_steps(s: Subject, law: str) -> float:
                     + cause
                 )
             worst = max(
-                worst, s.compare(law, symptom, cause, (y, stepped), *_pairs(after, stepped_after))
+                worst, s.compare(law, symptom, cause, (y, stepped), *pairs_of(after, stepped_after))
             )
     return worst
 
@@ -251,7 +247,7 @@ def _calls_equal_one(s: Subject, law: str) -> float:
                 "the returned state is not the one after the last step, or the given state is not "
                 "used",
                 (y, torch.cat(parts, dim=1)),
-                *_pairs(after, carried),
+                *pairs_of(after, carried),
             ),
         )
     return worst
@@ -272,8 +268,8 @@ def _packed_equals_apart(s: Subject, law: str) -> float:
                 law,
                 f"an episode of {end - begin} steps packed behind others at index {begin} and run "
                 "on its own differ",
-                "the start flag does not restore initial_state, or restores it after reading the "
-                "first step",
+                "the start flag does not restore initial_state (linear_scan restores zeros), or "
+                "restores it after reading the first step",
                 (y[:, begin:end], alone),
             ),
         )
@@ -287,11 +283,15 @@ def _no_leak(s: Subject, law: str) -> float:
     )
     x, state, flags = s.inputs(2, 9)
     flags[:, 4] = True
-    leaves = [v.requires_grad_() for v in _leaves(state).values() if v.is_floating_point()]
+    carried = [v.requires_grad_() for v in leaves(state).values() if v.is_floating_point()]
     x.requires_grad_()
     y, _ = s.module(x, state, flags)
+    if not y.requires_grad:
+        raise MemoryLawError(
+            law, "no gradient comes from y to x", "torch.no_grad, a detach or .data in forward"
+        )
     after = y[:, 4:].sum()
-    grads = torch.autograd.grad(after, [x, *leaves], allow_unused=True, materialize_grads=True)
+    grads = torch.autograd.grad(after, [x, *carried], allow_unused=True, materialize_grads=True)
     earlier = [grads[0][:, :4], *grads[1:]]
     worst = s.compare(
         law,
@@ -311,13 +311,14 @@ def _no_leak(s: Subject, law: str) -> float:
         clean, after_clean = s.module(x, s.initial(2), flags)
         survived, after_poison = s.module(x, poisoned, flags)
         symptom = "a NaN in the carried state comes through a start at index 0"
-        pairs = ((clean, survived), *_pairs(after_clean, after_poison))
-        return max(worst, s.compare(law, symptom, cause, *pairs))
+        compared = ((clean, survived), *pairs_of(after_clean, after_poison))
+        return max(worst, s.compare(law, symptom, cause, *compared))
 
 
 @torch.no_grad()
 def _rows_independent(s: Subject, law: str) -> float:
     x, state, flags = s.inputs(4, 5, 0.3)
+    flags[:, 3] = torch.tensor([True, False, False, True])  # a start of the others alone
     y, after = s.module(x, state, flags)
     alone, alone_after = s.module(x[1:3], state[1:3], flags[1:3])
     return s.compare(
@@ -326,7 +327,7 @@ def _rows_independent(s: Subject, law: str) -> float:
         "batch statistics, a reshape that mixes batch and time, or a flag of one row that resets "
         "others",
         (y[1:3], alone),
-        *_pairs(after[1:3], alone_after),
+        *pairs_of(after[1:3], alone_after),
     )
 
 
@@ -343,7 +344,7 @@ def _replay_loads(s: Subject, law: str) -> float:
         "states after "
         "each step",
         (y, stepped),
-        *_pairs(states, stepped_states),
+        *pairs_of(states, stepped_states),
     )
 
 
@@ -368,7 +369,7 @@ def _averages(s: Subject, law: str) -> float:
 def _gradients(s: Subject, law: str) -> float:
     x, state, flags = s.inputs(2, 5)
     flags[0, 2] = True
-    keys = [k for k, v in _leaves(state).items() if v.is_floating_point()]
+    keys = [k for k, v in leaves(state).items() if v.is_floating_point()]
     names = [name for name, p in s.module.named_parameters() if p.requires_grad]
     parameters = [s.module.get_parameter(name).detach().clone() for name in names]
     arguments = [
@@ -417,7 +418,9 @@ def _gradients_of_steps(s: Subject, law: str) -> float:
 def laws_of(module: nn.Module, dtype: torch.dtype, gradients: bool) -> dict[str, Law]:
     """The laws that a module has to keep, by name."""
     laws: dict[str, Law] = {
+        "weights are registered": _weights_are_registered,
         "shapes are fixed": _shapes,
+        "equal calls give equal results": _calls_repeat,
         "scan equals step by step": _scan_equals_steps,
         "several calls equal one": _calls_equal_one,
         "packed equals apart": _packed_equals_apart,

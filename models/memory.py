@@ -8,7 +8,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 __all__ = [
-    "Memory", "MemoryContract", "ReplayableMemory", "batch_shape", "replay", "replay_by_steps",
+    "Memory", "MemoryContract", "ReplayableMemory", "batch_shape", "first_state", "replay",
+    "replay_by_steps",
 ]  # fmt: skip
 
 
@@ -233,3 +234,24 @@ def _check_start_flags(is_init: Any, x: Tensor) -> None:
 def batch_shape(batch_size: int | Sequence[int]) -> list[int]:
     """A batch size, one number or several, as a list."""
     return [batch_size] if isinstance(batch_size, int) else list(batch_size)
+
+
+def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDict:
+    """The ``initial_state`` of anybody's module.
+
+    Raises:
+        TypeError: the module is no memory model: it has no such method, or gives no TensorDict.
+    """
+    name = type(memory).__name__
+    if not hasattr(memory, "initial_state"):
+        raise TypeError(
+            f"{name} has no initial_state(batch_size), which gives a TensorDict: see "
+            "docs/guides/memory.md, and examples/own_memory.py for torch.nn.LSTM"
+        )
+    state = memory.initial_state(batch_size)  # type: ignore[operator]
+    if not isinstance(state, TensorDictBase):
+        raise TypeError(
+            f"initial_state of {name} gives a {type(state).__name__}, and not a TensorDict: "
+            'TensorDict({"h": ...}, batch_size=[batch_size])'
+        )
+    return state

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models.encoders import Encoder
-from arcade_torch.models.memory import batch_shape, replay
+from arcade_torch.models.memory import batch_shape, first_state, replay
 from arcade_torch.models.recurrence import Key, Recurrence, Store
 from arcade_torch.models.registry import make_memory
 
@@ -114,7 +114,7 @@ class MemoryBlock(nn.Module):
         """The cells' initial states, TensorDict [batch_size] with one entry per layer."""
         states = {}
         for name, cell in zip(self.names, self.cells, strict=True):
-            states[name] = cell.initial_state(batch_size)  # type: ignore[operator]
+            states[name] = first_state(cell, batch_size)
         return TensorDict(states, batch_size=batch_shape(batch_size))
 
 

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import replay
+from arcade_torch.models.memory import first_state, replay
 
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
@@ -51,6 +51,7 @@ class Recurrence:
 
     Raises:
         ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
+        TypeError: the module is no memory model.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class Recurrence:
         self.is_init_key = unravel_key(is_init_key)
         self.default_recurrent_mode = default_recurrent_mode
         prefix = (state_key,) if isinstance(state_key, str) else tuple(state_key)
-        example = memory.initial_state(1)  # type: ignore[operator]
+        example = first_state(memory, 1)
         tensors = _tensors(example)
         self._paths = {(*prefix, *path): path for path in tensors}
         self._empty = _empty_nodes(example)

@@ -7,7 +7,9 @@ docstring is the help, and its `run` does the work.
 
 import difflib
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Iterable, Sequence
@@ -34,8 +36,8 @@ EXIT_INTERRUPTED = program.EXIT_STOPPED
 
 HELP = ("-h", "--help", "help")
 EVERYWHERE = """\
-With any command: --import FILE.py (or MODULE) first imports what registers your own games or memory
-models; --debug shows the traceback of an error."""
+With any command: --import FILE.py (or MODULE) first imports what registers your
+own games or memory models; --debug shows the traceback of an error."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
@@ -95,11 +97,20 @@ GROUPS = {
 
 def usage() -> str:
     """The page that ``arcade-torch --help`` prints."""
-    width = max(map(len, COMMANDS))
-    commands = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
+    longest = max(map(len, COMMANDS))
+    columns = shutil.get_terminal_size(fallback=(999, 24)).columns  # lines stay whole for grep
+    commands = "\n".join(
+        textwrap.fill(
+            f"  {name:<{longest}}  {summary}",
+            width=max(columns, longest + 30),
+            subsequent_indent=" " * (longest + 4),
+        )
+        for name, (_, summary) in COMMANDS.items()
+    )
     return f"""usage: arcade-torch COMMAND [options]
 
-POPGym Arcade for PyTorch: pixel games as MDP/POMDP twins, and what memory does in them.
+POPGym Arcade for PyTorch: pixel games as MDP/POMDP twins, and what memory does
+in them.
 
 {commands}
 
@@ -184,7 +195,7 @@ def _run(words: list[str]) -> int:
 def _carry_out(words: Sequence[str], begun: list[Any]) -> int:
     """Print a page, or run a command, which is added to ``begun`` before; returns the exit code."""
     try:
-        imports, words = take_imports(words)
+        imports, words = take_imports([_with_home(word) for word in words])
         if _is_page(words):
             _print_page(words)
             return EXIT_OK
@@ -203,6 +214,16 @@ def _carry_out(words: Sequence[str], begun: list[Any]) -> int:
     if program.is_asked_to_stop():
         raise KeyboardInterrupt
     return code
+
+
+def _with_home(word: str) -> str:
+    """A word of the command line; in ``--out=~/runs`` shells leave the ``~`` as it is, and a folder
+    of that name would be written.
+    """
+    option, equals, value = word.partition("=")
+    if equals and option.startswith("--"):
+        return f"{option}={os.path.expanduser(value)}"
+    return os.path.expanduser(word)
 
 
 def _is_page(words: Sequence[str]) -> bool:

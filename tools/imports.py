@@ -12,6 +12,7 @@ import hashlib
 import importlib.util
 import os
 import re
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.machinery import SourceFileLoader
@@ -188,14 +189,19 @@ def _is_import(name: object, sha256: object) -> bool:
 
 def _import_again(run: Path, name: str, sha256: str) -> None:
     """Import one file; one that the user has not imported before is not even opened."""
-    if not sha256 or [name, sha256] not in _trusted():
+    option = f"{FLAG} {shlex.quote(name)}"
+    if not sha256:
         raise ImportRefusedError(
-            f"{run} imported {name}, which you have not imported on this machine: pass "
-            f"{FLAG} {name} if you trust it"
+            f"{run} imported the module {name}, and modules are never imported again by "
+            f"themselves: pass {option}"
+        )
+    if [name, sha256] not in _trusted():
+        raise ImportRefusedError(
+            f"{run} imported {name}, which you have not imported on this machine: pass {option} if "
+            "you trust it"
         )
     changed = ImportRefusedError(
-        f"{run} imported {name}, which has changed since: pass {FLAG} {name} to take it as it is "
-        "now"
+        f"{run} imported {name}, which has changed since: pass {option} to take it as it is now"
     )
     if _hashes.get(name, sha256) != sha256:
         raise changed

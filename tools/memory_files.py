@@ -1,6 +1,9 @@
 """Memory models of a user: their check before a training."""
 
+import traceback
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.tools.errors import one_line
@@ -31,12 +34,39 @@ def check_memory_of(config: TrainConfig) -> None:
 
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
     block = next(module for module in network.modules() if isinstance(module, MemoryBlock))
+    cell = block.cells[0]
     try:
-        check_memory(block.cells[0], input_size=block.hidden_size)
+        check_memory(cell, input_size=block.hidden_size)
+        width = _width(cell, block.hidden_size)
     except MemoryLawError as error:
         raise MemoryRefusedError(f"memory {config.memory!r}: {error} {SKIP}") from error
     except Exception as error:
         raise MemoryRefusedError(
             f"memory {config.memory!r} failed when it was checked in float64, "
-            f"{type(error).__name__}: {one_line(error)}; {SKIP}"
+            f"{type(error).__name__}{_place(error)}: {one_line(error)}; {SKIP}"
         ) from error
+    if width != block.hidden_size:
+        raise MemoryRefusedError(
+            f"memory {config.memory!r} was made with hidden_size={block.hidden_size}, and its y is "
+            f"{width} wide: bring it to hidden_size, with a last nn.Linear for example"
+        )
+
+
+def _width(cell: Any, input_size: int) -> int:
+    """How many numbers a memory gives at each step."""
+    import torch
+
+    x = torch.zeros(1, 1, input_size)
+    with torch.no_grad():
+        y, _ = cell(x, cell.initial_state(1), torch.ones(1, 1, dtype=torch.bool))
+    return int(y.shape[-1])
+
+
+def _place(error: Exception) -> str:
+    """The last line of a user that an error came through, such as `` (yours.py:23)``."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if package not in ("arcade_torch", "torch", "tensordict"):
+            place = f" ({Path(frame.f_code.co_filename).name}:{line})"
+    return place

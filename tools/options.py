@@ -101,6 +101,7 @@ def _in_one_line(message: str) -> str:
 
     text = Text.from_ansi(message).plain  # without colours
     parts = [""]
+    options = list[str]()
     for framed in text.splitlines()[1:]:  # the first line is the title
         line = framed.strip("│╰╯ ")
         is_rule = line != "" and not line.strip("─-")
@@ -108,15 +109,22 @@ def _in_one_line(message: str) -> str:
             parts.append("")
         else:
             parts[-1] = f"{parts[-1]} {line}".strip()
+        if parts[-1].startswith(SUGGESTION) and line.startswith("--"):
+            options.append(line.split()[0])
     parts = [part for part in parts if part]
     if not parts:
         return "the options could not be read"
     wrong = parts[0].rstrip(".")
-    for part in parts:
-        if part.startswith(SUGGESTION):
-            option = part.removeprefix(SUGGESTION).split()[0]
-            return f"{wrong}; perhaps you meant {option}"
-    return wrong
+    return f"{wrong}; perhaps you meant {_nearest_options(wrong, options)}" if options else wrong
+
+
+def _nearest_options(wrong: str, options: Sequence[str]) -> str:
+    """Of the options that tyro suggests all that differ from a word in their group alone, such as
+    --ppo.num-envs and --pqn.num-envs, or else the first.
+    """
+    words = re.findall(r"--([\w-]+)", wrong)
+    same = [option for option in options if option.rpartition(".")[2] in words]
+    return " or ".join(same or options[:1])
 
 
 def at_least(options: Any, **least: float) -> None:

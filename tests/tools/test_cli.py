@@ -374,3 +374,37 @@ def test_gap_bias_prints_and_saves_its_table(
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("arcade-torch ")
+
+
+def test_a_home_that_the_shell_left_alone_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: ``--out=~/x`` wrote into a folder that is called ``~``."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["new", "memory", "at_home", "--out=~/at_home.py"]) == cli.EXIT_OK
+    assert (tmp_path / "home/at_home.py").exists()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["home"]
+    capsys.readouterr()
+    err = one_error(capsys, ["list", "--import=~/no_such.py"])
+    assert f"{tmp_path}/home/no_such.py: there is no such file" in err
+
+
+@pytest.mark.parametrize("columns", [80, 60])
+def test_the_page_of_commands_fits_a_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: up to 110 letters a line, whatever the terminal."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert cli.main(["--help"]) == cli.EXIT_OK
+    table = capsys.readouterr().out.partition("in them.")[2].partition("arcade-torch COMMAND")[0]
+    assert max(map(len, table.splitlines())) <= columns
+
+
+def test_an_option_that_every_algorithm_has_is_suggested_for_each(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Before: --dqn.num-envs alone, which a training by PPO refuses."""
+    err = one_error(capsys, ["train", "--num-envs", "16"])
+    assert "perhaps you meant --dqn.num-envs or --ppo.num-envs or --pqn.num-envs (see" in err
+    assert "perhaps you meant --memory (see" in one_error(capsys, ["train", "--memry", "lru"])

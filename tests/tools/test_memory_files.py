@@ -39,6 +39,28 @@ class Lawless(nn.Module):
 register_memory("lawless", Lawless)
 '''
 
+WIDER = """
+import torch
+from tensordict import TensorDict
+from torch import nn
+from arcade_torch.models import register_memory
+
+
+class Wider(nn.Module):
+    def __init__(self, input_size, hidden_size):
+        super().__init__()
+        self.linear = nn.Linear(input_size, hidden_size + 1)
+
+    def forward(self, x, state, is_init):
+        return self.linear(x), state
+
+    def initial_state(self, batch_size):
+        return TensorDict({}, batch_size=[batch_size])
+
+
+register_memory("lawless", Wider)
+"""
+
 
 @pytest.fixture
 def lawless(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
@@ -75,7 +97,20 @@ def test_a_memory_that_fails_in_float64_is_one_line(
     assert cli.main([*lawless, *options]) == cli.EXIT_BAD_INPUT
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert "failed when it was checked in float64, RuntimeError: no kernel for Double" in err
+    line = LAWLESS[: LAWLESS.index("raise RuntimeError")].count("\n") + 1
+    said = f"failed when it was checked in float64, RuntimeError (lawless.py:{line}): no kernel"
+    assert said in err
+
+
+def test_a_width_of_its_own_is_refused_before_the_training(
+    lawless: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: a traceback out of the first update, as a fault of arcade-torch."""
+    (tmp_path / "lawless.py").write_text(WIDER)
+    assert cli.main(lawless) == cli.EXIT_BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "was made with hidden_size=128, and its y is 129 wide" in err
 
 
 def test_a_study_checks_its_memories_first(

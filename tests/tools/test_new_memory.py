@@ -77,7 +77,7 @@ def test_nothing_is_overwritten(path: Path, capsys: pytest.CaptureFixture[str]) 
     [
         ("Mine", "lower case letters"),
         ("../x", "lower case letters"),
-        ("class", "lower case letters"),
+        ("class", "no word of Python's grammar"),
         ("lru", "there is a memory model 'lru' already"),
         ("fart", "there is a memory model 'fart' already"),
         ("random", "would hide the module random of Python"),

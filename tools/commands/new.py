@@ -1,6 +1,7 @@
 """``arcade-torch new memory``."""
 
 import keyword
+import shlex
 import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -40,8 +41,10 @@ class NewMemory(Command):
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
         say(f"written: {path}; change it, and then")
-        say(f"  python {path}  says whether it keeps the laws of a memory")
-        say(f"  arcade-torch compare --import {path} --memory {self.name}  how it does against LRU")
+        file_word = shlex.quote(str(path))
+        words = f"--import {file_word} --memory {self.name}"
+        say(f"  python {file_word}  says whether it keeps the laws of a memory")
+        say(f"  arcade-torch compare {words}  how it does against LRU")
         return 0
 
 
@@ -53,8 +56,9 @@ def memory_source(name: str) -> str:
     """
     from arcade_torch.models.registry import ALIASES, memory_names
 
-    is_name = name.isidentifier() and name == name.lower() and not keyword.iskeyword(name)
-    require(is_name and name.isascii(), "NAME", name, "lower case letters, digits and underscores")
+    is_name = name.isidentifier() and name == name.lower() and name.isascii()
+    require(is_name, "NAME", name, "lower case letters, digits and underscores, no digit first")
+    require(not keyword.iskeyword(name), "NAME", name, "no word of Python's grammar")
     if name in (*memory_names(), *ALIASES):
         raise ValueError(f"there is a memory model {name!r} already: choose another name")
     words = [word.capitalize() for word in name.split("_")]

@@ -50,7 +50,17 @@ _OTHERS = {
 }
 """The same of what is no axis."""
 _FRAMES = Annotated[int, Range("from 1 to 10**15", lambda frames: 1 <= frames <= 10**15)]
-_GRID = {"name", "env", "observability", "memory", "algorithm", "seed", "total_frames", "out"}
+_GRID = {
+    "env": "games",
+    "memory": "memories",
+    "algorithm": "algorithms",
+    "seed": "seeds",
+    "observability": "observability",
+    "total_frames": "total_frames",
+    "name": "name",
+    "out": "name",
+}
+"""Setting of one run -> what decides it in a study."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +120,10 @@ class Study:
             object.__setattr__(self, axis, _axis(axis, getattr(self, axis)))
         for name in self.settings:
             if name in _GRID:
-                raise ValueError(f"settings may not hold {name!r}: the grid decides it")
+                raise ValueError(
+                    f"settings may not hold {name!r}: in a study {_GRID[name]} decides it, which "
+                    "stands above the first [table] of its file"
+                )
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)
         if self.total_frames is not None:

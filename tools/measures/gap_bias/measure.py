@@ -231,7 +231,8 @@ def _baselines(cells: Cells, baseline: str) -> dict[str, str | None]:
     if not memory_free:
         raise ValueError(
             f"no scores for the memory-free agent {baseline!r}, only for "
-            f"{', '.join(agents) or 'nobody'}"
+            f"{', '.join(agents) or 'nobody'}; the gap and the bias of a memory are against one: "
+            f"train --memory {baseline} on the same games and both twins"
         )
     return {agent: memory_free.get(agent) for agent in [*memory_free.values(), *agents]}
 

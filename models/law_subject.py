@@ -1,0 +1,140 @@
+"""What the laws of a memory model are put to, a copy of the module; the error of a broken law."""
+
+import copy
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+__all__ = ["MemoryLawError", "Subject", "leaves", "pairs_of", "subject_of"]
+
+# Largest difference allowed between two ways to compute the same thing; see ``_difference``.
+TOLERANCES = {
+    torch.float64: 1e-7,
+    torch.float32: 1e-4,
+    torch.bfloat16: 0.1,
+    torch.float16: 0.01,
+}
+
+
+class MemoryLawError(AssertionError):
+    """A memory model breaks one of the laws.
+
+    Attributes:
+        law: name of the law, as in the keys that :func:`check_memory` returns.
+        discrepancy: largest absolute difference found, NaN if the law is not about numbers.
+    """
+
+    def __init__(
+        self, law: str, symptom: str, cause: str, discrepancy: float = float("nan")
+    ) -> None:
+        super().__init__(f"law {law!r} is broken: {symptom}. Likely cause: {cause}.")
+        self.law = law
+        self.discrepancy = discrepancy
+
+
+@dataclass
+class Subject:
+    """The copy under test and what the laws need to poke it."""
+
+    module: nn.Module
+    input_size: int
+    dtype: torch.dtype
+    tolerance: float
+
+    def random(self, batch: int, steps: int) -> Tensor:
+        """Random x [batch, steps, D] where the parameters are."""
+        weight = next(self.module.parameters(), torch.zeros(0))
+        return torch.randn(batch, steps, self.input_size, dtype=torch.float64).to(
+            weight.device, self.dtype
+        )
+
+    def inputs(
+        self, batch: int, steps: int, resets: float = 0.0
+    ) -> tuple[Tensor, TensorDict, Tensor]:
+        """Random x, a state that some steps have led to, and start flags."""
+        x = self.random(batch, steps)
+        warm = self.random(batch, 3)
+        with torch.no_grad():
+            _, state = self.module(
+                warm, self.initial(batch), torch.zeros_like(warm[..., 0], dtype=torch.bool)
+            )
+        return x, state, (torch.rand(batch, steps) < resets).to(x.device)
+
+    def copied(self) -> "Subject":
+        """The same, with a copy of the module, for calls that may leave something in it."""
+        return replace(self, module=copy.deepcopy(self.module))
+
+    def initial(self, batch: int) -> TensorDict:
+        """The state at the start of an episode, TensorDict [batch]."""
+        return self.module.initial_state(batch)  # type: ignore[operator]
+
+    def compare(
+        self,
+        law: str,
+        symptom: str,
+        cause: str,
+        *pairs: tuple[Tensor, Tensor],
+        tolerance: float | None = None,
+    ) -> float:
+        """Largest difference of the pairs; raises if above the tolerance or not a number."""
+        worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
+        if not worst <= (self.tolerance if tolerance is None else tolerance):
+            raise MemoryLawError(law, f"{symptom} (largest difference {worst:.2g})", cause, worst)
+        return worst
+
+
+def subject_of(
+    module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
+) -> Subject:
+    """The copy of a module that is checked."""
+    size = getattr(module, "input_size", None) if input_size is None else input_size
+    if not isinstance(size, int):
+        raise ValueError(
+            "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
+        )
+    if not hasattr(module, "initial_state"):
+        raise TypeError(
+            f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
+        )
+    if dtype not in TOLERANCES:
+        allowed = ", ".join(map(str, TOLERANCES))
+        raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
+    if tolerance is None:
+        tolerance = TOLERANCES[dtype]
+    checked = copy.deepcopy(module).eval()
+    # not ``.to(dtype)``, which takes the imaginary part away from complex weights
+    checked._apply(partial(_in_precision, dtype=dtype))
+    return Subject(checked, size, dtype, tolerance)
+
+
+def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """A weight or a buffer as numbers of this precision, complex ones as complex ones."""
+    if tensor.is_complex():
+        return tensor.to(dtype.to_complex())
+    return tensor.to(dtype) if tensor.is_floating_point() else tensor
+
+
+def _difference(p: Tensor, q: Tensor) -> float:
+    """Largest difference, as a share of the largest entry where that is above 1: sums over many
+    steps are large, and so is their rounding. Computed in float64.
+    """
+    wide = torch.complex128 if p.is_complex() else torch.float64
+    p = p.to(wide)
+    q = q.to(wide)
+    size = q.abs().max().clamp_min(1.0)
+    return float((p - q).abs().max() / size)
+
+
+def leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
+    """The tensors of a state, by path."""
+    return {
+        key if isinstance(key, tuple) else (key,): state.get(key) for key in state.keys(True, True)
+    }
+
+
+def pairs_of(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
+    """Tensors of two states side by side."""
+    return [(leaf, q.get(key)) for key, leaf in leaves(p).items()]

@@ -1,0 +1,316 @@
+"""Mistakes that inventors of a memory model make: ``check_memory`` finds each and says what to do.
+
+Those of `test_passed_before` went through it without a word.
+"""
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from arcade_torch.models import MemoryLawError, MemoryModule, check_memory, make_network
+
+WIDTH = 4
+
+
+class Cell(nn.Module):
+    """h_t = 0.9 h_{t-1} + tanh(W x_t), right as it stands; mistakes are overridden methods."""
+
+    input_size = 3
+    hidden_size = WIDTH
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(3, WIDTH)
+
+    def read(self, x: Tensor) -> Tensor:
+        """The inputs [B, T, H] of a chunk."""
+        return torch.tanh(self.linear(x))
+
+    def fresh(self, begins: Tensor, h: Tensor) -> Tensor:
+        """The state before a step, [B, H]."""
+        return torch.where(begins, torch.zeros_like(h), h)
+
+    def written(self, y: Tensor) -> Tensor:
+        """What is given out, [B, T, H]."""
+        return y
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        h = state["h"]
+        inputs = self.read(x)
+        outputs = []
+        for t in range(x.shape[1]):
+            h = 0.9 * self.fresh(is_init[:, t, None], h) + inputs[:, t]
+            outputs.append(h)
+        y = torch.stack(outputs, 1)
+        return self.written(y.real if y.is_complex() else y), self.state_of(h)
+
+    def state_of(self, h: Tensor) -> TensorDict:
+        return TensorDict({"h": h}, batch_size=[len(h)])
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return self.state_of(self.linear.weight.new_zeros(batch_size, WIDTH))
+
+
+class Dropout(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.dropout = nn.Dropout(0.1)
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.dropout(y)
+
+
+class BatchNorm(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm1d(WIDTH)
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.norm(y.transpose(1, 2)).transpose(1, 2)
+
+
+class RunningMean(Cell):
+    """Follows the inputs while it is trained."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(3))
+
+    def read(self, x: Tensor) -> Tensor:
+        if self.training:
+            self.mean = 0.9 * self.mean + 0.1 * x.mean((0, 1)).detach()
+        return super().read(x - self.mean)
+
+
+class ComplexState(Cell):
+    """Its primer is an error of TorchRL."""
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return self.state_of(super().initial_state(batch_size)["h"] + 0j)
+
+
+class MadeInForward(Cell):
+    def written(self, y: Tensor) -> Tensor:
+        if not hasattr(self, "out"):
+            self.out = nn.Linear(WIDTH, WIDTH).to(y.dtype)
+        return self.out(y)
+
+
+class TrainableTensor(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.ones(WIDTH, requires_grad=True)
+
+    def written(self, y: Tensor) -> Tensor:
+        return y * self.scale
+
+
+class WritesOnInput(Cell):
+    def read(self, x: Tensor) -> Tensor:
+        with torch.no_grad():
+            x.clamp_(-1, 1)
+        return super().read(x)
+
+
+class WritesOnFlags(Cell):
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        is_init[:, 0] = True
+        return super().forward(x, state, is_init)
+
+
+class WritesAtStarts(Cell):
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        state["h"][is_init[:, 0]] = 0
+        return super().forward(x, state, is_init)
+
+
+class InList(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = [nn.Linear(WIDTH, WIDTH)]
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.layers[0](y)
+
+
+class Noise(Cell):
+    def written(self, y: Tensor) -> Tensor:
+        return y + torch.randn_like(y)
+
+
+class DropoutLeftOn(Cell):
+    def written(self, y: Tensor) -> Tensor:
+        return F.dropout(y, 0.1)
+
+
+class StateInSelf(Cell):
+    h: Tensor | None = None
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        carried = state if self.h is None else self.state_of(self.h)
+        y, after = super().forward(x, carried, is_init)
+        self.h = after["h"].detach()
+        return y, after
+
+
+class Float32State(Cell):
+    def state_of(self, h: Tensor) -> TensorDict:
+        return super().state_of(h.float())
+
+
+class NoBatchSize(Cell):
+    def state_of(self, h: Tensor) -> TensorDict:
+        return TensorDict({"h": h})
+
+
+class LayersFirst(Cell):
+    """[layers, B, H], as torch.nn.LSTM has it."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        y, after = super().forward(x, super().state_of(state["h"][0]), is_init)
+        return y, TensorDict({"h": after["h"][None]})
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return TensorDict({"h": super().initial_state(batch_size)["h"][None]})
+
+
+class WithoutGradient(Cell):
+    @torch.no_grad()
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        return super().forward(x, state, is_init)
+
+
+class NotANumber(Cell):
+    def written(self, y: Tensor) -> Tensor:
+        return y / torch.zeros_like(y)
+
+
+def refusal(model: type[Cell]) -> MemoryLawError:
+    """What check_memory says of a model."""
+    torch.manual_seed(0)
+    with pytest.raises(MemoryLawError) as caught:
+        check_memory(model())
+    return caught.value
+
+
+def test_the_model_without_a_mistake_passes() -> None:
+    assert max(check_memory(Cell()).values()) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("model", "law", "said"),
+    [
+        (Dropout, "equal calls give equal results", "take dropout=0"),
+        (BatchNorm, "equal calls give equal results", "take dropout=0 and nn.LayerNorm"),
+        (RunningMean, "equal calls give equal results", "training mode and evaluation mode differ"),
+        (ComplexState, "shapes are fixed", "hold torch.view_as_real(h)"),
+        (MadeInForward, "weights are registered", "new weights: out.bias, out.weight"),
+        (TrainableTensor, "weights are registered", "scale of TrainableTensor"),
+    ],
+)
+def test_passed_before(model: type[Cell], law: str, said: str) -> None:
+    error = refusal(model)
+    assert error.law == law
+    assert said in str(error)
+
+
+@pytest.mark.parametrize(
+    ("model", "law", "said"),
+    [
+        (WritesOnInput, "shapes are fixed", "changed the x"),
+        (WritesOnFlags, "shapes are fixed", "changed the is_init"),
+        (WritesAtStarts, "shapes are fixed", "changed the state"),
+        (InList, "weights are registered", "layers of InList, a list"),
+        (Noise, "equal calls give equal results", "random numbers"),
+        (DropoutLeftOn, "equal calls give equal results", "training=self.training"),
+        (StateInSelf, "equal calls give equal results", "the module keeps in itself"),
+        (Float32State, "shapes are fixed", "h of the state is torch.float32"),
+        (NoBatchSize, "shapes are fixed", "has batch_size [], not [1]"),
+        (LayersFirst, "shapes are fixed", "such as [layers, B, H]"),
+        (WithoutGradient, "nothing leaks over a start", "torch.no_grad"),
+        (NotANumber, "shapes are fixed", "NaN or infinite"),
+    ],
+)
+def test_said_something_else_before(model: type[Cell], law: str, said: str) -> None:
+    """An error of torch without a cause, or the law of scans with causes that were none."""
+    error = refusal(model)
+    assert error.law == law
+    assert said in str(error)
+
+
+class ComplexWeight(Cell):
+    """Right: a rotation that is one complex weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rotation = nn.Parameter(torch.polar(torch.full([WIDTH], 0.9), torch.ones(WIDTH)))
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        given = super().state_of(torch.view_as_complex(state["h"]))
+        return super().forward(x, given, is_init)
+
+    def read(self, x: Tensor) -> Tensor:
+        return super().read(x) * self.rotation
+
+    def state_of(self, h: Tensor) -> TensorDict:
+        return super().state_of(torch.view_as_real(h))
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return self.state_of(self.rotation.new_zeros(batch_size, WIDTH))
+
+
+class Ordered(Cell):
+    """Right: a list of layers that are registered as well."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.out = nn.Linear(WIDTH, WIDTH)
+        self.order = [self.out, nn.Identity()]
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.order[0](y)
+
+
+@pytest.mark.parametrize("model", [ComplexWeight, Ordered])
+def test_what_is_right_passes(model: type[Cell]) -> None:
+    """Complex weights lost their imaginary part in the check before."""
+    assert max(check_memory(model()).values()) < 1e-7
+
+
+class AnyRowResets(Cell):
+    """A flag of one row resets all."""
+
+    def fresh(self, begins: Tensor, h: Tensor) -> Tensor:
+        return super().fresh(begins.any(), h)
+
+
+@pytest.mark.parametrize("seed", [0, 6])
+def test_no_draw_hides_a_flag_of_one_row_that_resets_others(seed: int) -> None:
+    """Before: these seeds had no start of the other rows where the two compared had none."""
+    with pytest.raises(MemoryLawError, match="a flag of one row that resets others"):
+        check_memory(AnyRowResets(), seed=seed)
+
+
+class TupleState(Cell):
+    def initial_state(self, batch_size: int) -> Any:
+        return (super().initial_state(batch_size)["h"],)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda memory: MemoryModule(memory),
+        lambda memory: make_network("small", memory=lambda *_: memory),
+    ],
+    ids=["MemoryModule", "make_network"],
+)
+def test_a_module_that_is_no_memory_is_refused_where_it_is_handed_over(use: Any) -> None:
+    """Before: an AttributeError from within, or a network with a tuple for a state."""
+    with pytest.raises(TypeError, match=r"LSTM has no initial_state\(batch_size\).*own_memory"):
+        use(nn.LSTM(3, WIDTH))
+    with pytest.raises(TypeError, match="TupleState gives a tuple, and not a TensorDict"):
+        use(TupleState())
