@@ -93,7 +93,8 @@ def test_a_copy_of_an_env_is_refused_in_one_line(way: str, wrapped: bool) -> Non
         env = TransformedEnv(env, StepCounter())
     message = (
         "an ArcadeEnv cannot be copied or pickled: make a second one, and pass get_state() to its "
-        "set_state()"
+        "set_state(); workers take a function that makes one, such as "
+        "functools.partial(arcade_torch.make, ...)"
     )
     with pytest.raises(TypeError, match=f"^{re.escape(message)}$"):
         copied_by(way, env)
