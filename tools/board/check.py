@@ -35,6 +35,8 @@ MOST_FRAMES_AGAIN = 25_000_000
 """Frames of the longest run that `retrain` makes again."""
 LEAST_TOLERANCE = 0.002
 """Of a score, where every episode has the same return."""
+SIZES = ("parameters", "state_bytes")
+"""What an entry says once for all of its runs: the largest of them."""
 Origin = Literal["kept", "pulled", "retrained"]
 """Where checkpoints come from: a folder, the hub that the entry names, or its settings."""
 _Count = Annotated[int, Range("a whole number from 0", lambda x: 0 <= x <= 10**6)]
@@ -103,6 +105,7 @@ def check(
     is_same = _is_same_machine(entry.made_with, made_with())
     evaluator = Evaluator(protocol)
     differences = list[float]()
+    results = list[Played]()
     equal = 0
     for done, run in enumerate(chosen, 1):
         checkpoint = folders[run.cell] / "checkpoints" / checkpoint_name(entry.frames)
@@ -110,8 +113,11 @@ def check(
         played = evaluator.play(checkpoint, run.twin)
         equal += _check_played(entry, run, played, is_same)
         differences.append(abs(played.score - run.score))
+        results.append(played)
         if progress is not None:
             progress(run.name, done, len(chosen))
+    if len(results) == len(entry.runs):
+        _check_largest(entry, results)
     return CheckRecord(
         entry_sha256=sha256,
         date=datetime.date.today().isoformat(),
@@ -190,9 +196,9 @@ def _check_played(entry: Entry, run: BoardRun, played: Played, is_same: bool) ->
     score is equal to the bit.
     """
     check_observations(f"{run.name}, acting", played.observations)
-    for name in ("parameters", "state_bytes"):
+    for name in SIZES:
         actual = getattr(played, name)
-        if actual != getattr(entry, name):
+        if actual > getattr(entry, name):
             raise EntryRefusedError(
                 f"{name} of {run.name}: {actual:,}, the entry says {getattr(entry, name):,}"
             )
@@ -209,6 +215,17 @@ def _check_played(entry: Entry, run: BoardRun, played: Played, is_same: bool) ->
             f"{run.score!r}; it has to be {allowed}"
         )
     return False
+
+
+def _check_largest(entry: Entry, results: Sequence[Played]) -> None:
+    """Refuse sizes that no run has: an entry says the largest over its games, which may differ."""
+    for name in SIZES:
+        largest = max(getattr(played, name) for played in results)
+        if largest != getattr(entry, name):
+            raise EntryRefusedError(
+                f"{name}: {largest:,} is the largest of the runs, the entry says "
+                f"{getattr(entry, name):,}"
+            )
 
 
 def _is_same_machine(entry: Any, now: Any) -> bool:

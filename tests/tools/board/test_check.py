@@ -4,6 +4,7 @@ import copy
 import json
 import random
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +153,10 @@ def set_parameters(plain: Plain) -> None:
     plain["parameters"] = 12
 
 
+def set_one_parameter_more(plain: Plain) -> None:
+    plain["parameters"] += 1
+
+
 def set_state(plain: Plain) -> None:
     plain["state_bytes"] = 4
 
@@ -174,6 +179,7 @@ FALSIFIED: dict[Callable[[Plain], None], str] = {
     train_the_pomdp_on_the_mdp: "observability is 'full', the entry says 'partial'",
     set_gamma: "differs in pqn.gamma (0.99 != 0.5)",
     set_parameters: f"parameters of {GAME} full, seed 1",
+    set_one_parameter_more: "is the largest of the runs, the entry says",
     set_state: f"state_bytes of {GAME} full, seed 1",
 }
 
@@ -185,6 +191,20 @@ def test_a_falsified_entry_is_refused_in_a_line_that_says_where(
     plain = copy.deepcopy(honest)
     falsify(plain)
     assert FALSIFIED[falsify] in refusal(write(tmp_path, plain), runs)
+
+
+def test_agents_of_some_games_may_be_smaller_than_the_largest(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The preset small has no predictor in Navigator: such an entry was refused."""
+    play = checks.Evaluator.play
+    sizes = iter((honest["parameters"] - 100, *[honest["parameters"]] * 3))
+
+    def play_smaller(self: Any, checkpoint: Path, twin: str) -> Any:
+        return replace(play(self, checkpoint, twin), parameters=next(sizes))
+
+    monkeypatch.setattr(checks.Evaluator, "play", play_smaller)
+    assert check(write(tmp_path, honest), runs, protocol=SHORT).equal == 4
 
 
 def test_other_weights_are_refused_before_they_are_loaded(
