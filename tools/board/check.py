@@ -102,29 +102,17 @@ def check(
         get_missing = {"pulled": pull, "retrained": retrain}[weights]
         get_missing(entry, chosen, runs, progress)
     folders = find_folders(entry, chosen, runs)
-    is_same = _is_same_machine(entry.made_with, made_with())
-    evaluator = Evaluator(protocol)
-    differences = list[float]()
-    results = list[Played]()
-    equal = 0
-    for done, run in enumerate(chosen, 1):
-        checkpoint = folders[run.cell] / "checkpoints" / checkpoint_name(entry.frames)
-        _check_weights(run, checkpoint)
-        played = evaluator.play(checkpoint, run.twin)
-        equal += _check_played(entry, run, played, is_same)
-        differences.append(abs(played.score - run.score))
-        results.append(played)
-        if progress is not None:
-            progress(run.name, done, len(chosen))
+    results, equal = _play_again(entry, chosen, folders, protocol, progress)
     if len(results) == len(entry.runs):
         _check_largest(entry, results)
+    pairs = zip(results, chosen, strict=True)
     return CheckRecord(
         entry_sha256=sha256,
         date=datetime.date.today().isoformat(),
         runs=len(chosen),
         of=len(entry.runs),
         equal=equal,
-        largest_difference=max(differences),
+        largest_difference=max(abs(played.score - run.score) for played, run in pairs),
         weights=weights,
         made_with=made_with(),
     )
@@ -168,6 +156,31 @@ def find_folders(
                 f"no run of {entry.memory} on {run.name} lies below {below}{reason}"
             )
     return folders
+
+
+def _play_again(
+    entry: Entry,
+    chosen: Sequence[BoardRun],
+    folders: dict[tuple[str, str, int], Path],
+    protocol: Protocol,
+    progress: Progress | None,
+) -> tuple[list[Played], int]:
+    """What the runs play now, and how many scores are equal to the bit; refuses what does not
+    agree.
+    """
+    is_same = _is_same_machine(entry.made_with, made_with())
+    evaluator = Evaluator(protocol)
+    results = list[Played]()
+    equal = 0
+    for done, run in enumerate(chosen, 1):
+        checkpoint = folders[run.cell] / "checkpoints" / checkpoint_name(entry.frames)
+        _check_weights(run, checkpoint)
+        played = evaluator.play(checkpoint, run.twin)
+        equal += _check_played(entry, run, played, is_same)
+        results.append(played)
+        if progress is not None:
+            progress(run.name, done, len(chosen))
+    return results, equal
 
 
 def _config_of(folder: Path) -> TrainConfig | None:
