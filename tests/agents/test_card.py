@@ -187,6 +187,7 @@ for place, default in (("a", "cpu"), ("b", "meta")):
 """
 
 
+@pytest.mark.slow
 def test_a_run_on_the_cpu_is_the_same_whatever_torchs_default_device_is(tmp_path: Path) -> None:
     """Before: orders of minibatches and weights were drawn on the default device, or failed."""
     command = [sys.executable, "-c", OTHER_DEFAULT, str(tmp_path)]

@@ -90,7 +90,8 @@ def steps(batch: TensorDictBase) -> TensorDictBase:
 
 
 @pytest.mark.parametrize(
-    ("game", "steps"), [(GAME, 200), (LOCKSTEP, 24), (MIXED, 24)]
+    ("game", "steps"),
+    [(GAME, 200), (LOCKSTEP, 24), pytest.param(MIXED, 24, marks=pytest.mark.slow)],
 )  # 1000 and 120 steps an env
 def test_iteration_gives_the_data_of_torchrls_collector_and_of_rollout(
     game: CompiledGame, steps: int

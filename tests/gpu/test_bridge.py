@@ -241,6 +241,7 @@ print(int((batch["pixels"] * weight).sum()), int((batch["next", "pixels"] * weig
 """
 
 
+@pytest.mark.slow
 def test_where_jax_has_the_cpu_alone_frames_are_copied_and_somebody_says_so(device: str) -> None:
     def run(device: str) -> tuple[str, str]:
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}

@@ -45,6 +45,7 @@ def in_this_process(stage: Stage, log: Path, seconds: float) -> int | None:
     return cli.main(list(stage.argv[2:]))
 
 
+@pytest.mark.slow
 def test_a_rehearsal_runs_every_stage_and_writes_a_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,6 +173,7 @@ def test_what_cannot_be_is_refused_in_one_line() -> None:
         agent(memory="gru", n_lstm_layers=2)
 
 
+@pytest.mark.slow
 def test_a_memory_learns_the_sign() -> None:
     model = RecurrentPPO(
         MemoryPolicy,

@@ -157,7 +157,7 @@ def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(
         ({"total_frames": 0}, "total_frames"),
         ({"name": "a/b"}, "letters, digits"),
         ({"colour": 1}, "unknown key 'colour'"),
-        ({"settings": {"env": "X"}}, "the grid decides"),
+        ({"settings": {"env": "X"}}, "the key games decides it"),
     ],
 )
 def test_bad_studies_are_refused_with_a_reason(changes: dict[str, object], message: str) -> None:

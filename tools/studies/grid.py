@@ -121,8 +121,8 @@ class Study:
         for name in self.settings:
             if name in _GRID:
                 raise ValueError(
-                    f"settings may not hold {name!r}: in a study {_GRID[name]} decides it, which "
-                    "stands above the first [table] of its file"
+                    f"settings may not hold {name!r}: in a study the key {_GRID[name]} decides it, "
+                    "which stands above the first [table] of its file"
                 )
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)

@@ -189,7 +189,10 @@ def oracle_policy(player: Callable[[], Any], actions: int = 5) -> Policy:
 SCREEN = (128, 128, 3)
 
 
-@pytest.mark.parametrize(("name", "most"), [("SignpostEasy", 9), ("CountRecallEasy", 5)])
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [("SignpostEasy", 9), pytest.param("CountRecallEasy", 5, marks=pytest.mark.slow)],
+)
 def test_a_frames_oracle_depends_on_what_it_depends_on(name: str, most: int) -> None:
     game = make_game(name)
     policy = oracle_policy(lambda: make_oracle(game, "frames"))
