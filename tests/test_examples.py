@@ -49,7 +49,7 @@ def test_torchrls_trainer_begins_with_the_policy_that_acted(
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["ppo", "dqn"])
+@pytest.mark.parametrize("name", ["ppo", pytest.param("dqn", marks=pytest.mark.slow)])
 def test_torchrls_configured_trainers_learn_from_what_their_policy_did(name: str) -> None:
     hydra = pytest.importorskip("hydra", reason="needs the hydra extra")
     script = example("torchrl_config/train")

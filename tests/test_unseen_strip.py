@@ -24,7 +24,9 @@ def suits(name: str, size: int) -> Tensor:
     return torch.unique(frames, dim=0)
 
 
-@pytest.mark.parametrize("name", ["AutoEncodeEasy", "CountRecallHard"])
+@pytest.mark.parametrize(
+    "name", ["AutoEncodeEasy", pytest.param("CountRecallHard", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("size", [128, 256])
 def test_the_suit_in_the_corner_is_seen_in_part_at_128_pixels_and_not_at_all_at_256(
     name: str, size: int
