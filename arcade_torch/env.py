@@ -2,7 +2,7 @@
 JAX wrote.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -10,9 +10,9 @@ import jax
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
 
 from arcade_torch import default_seeds, validation
+from arcade_torch.base_env import BaseEnv
 from arcade_torch.compiled import (
     EPISODE_REWARD,
     REWARD,
@@ -49,7 +49,7 @@ class Live:
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
 
 
-class ArcadeEnv(EnvBase):
+class ArcadeEnv(BaseEnv):
     """A batch of N episodes of one game or of several, as a TorchRL environment with
     ``batch_size=[N]``.
 
@@ -289,21 +289,6 @@ class ArcadeEnv(EnvBase):
         notices others'.
         """
         return self._live.generation, self._live.view
-
-    def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
-        """TorchRL's ``rollout``, which warns where a policy's recurrent state is dropped."""
-        steps: TensorDictBase = super().rollout(*args, **kwargs)
-        validation.check_rollout(self, steps)
-        return steps
-
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> Any:
-        """Go on from what ``state_dict`` gave; an empty one, which TorchRL's ``Collector`` saves of
-        an env, leaves the episodes as they are, with a warning.
-        """
-        validation.warn_of_empty(state_dict)
-        return super().load_state_dict(state_dict, strict and len(state_dict) > 0, assign)
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""

@@ -1,6 +1,6 @@
 """``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
 
 from arcade_torch import validation
+from arcade_torch.base_env import BaseEnv
 from arcade_torch.compiled import pack_numbers
 from arcade_torch.devices import pick_devices, wait_for_torch
 from arcade_torch.dlpack import is_host, to_jax, to_torch
@@ -43,7 +43,7 @@ class Episodes(NamedTuple):
     episode_reward: jax.Array  # float32 [N]
 
 
-class JaxEnv(EnvBase):
+class JaxEnv(BaseEnv):
     """N episodes of one JAX environment, as a TorchRL environment with ``batch_size=[N]``; made by
     :func:`from_jax`.
 
@@ -145,21 +145,6 @@ class JaxEnv(EnvBase):
         """
         self._go_on(self._snapshots.load(state))
         return self._root()
-
-    def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
-        """TorchRL's ``rollout``, which warns where a policy's recurrent state is dropped."""
-        steps: TensorDictBase = super().rollout(*args, **kwargs)
-        validation.check_rollout(self, steps)
-        return steps
-
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> Any:
-        """Go on from what ``state_dict`` gave; an empty one, which TorchRL's ``Collector`` saves of
-        an env, leaves the episodes as they are, with a warning.
-        """
-        validation.warn_of_empty(state_dict)
-        return super().load_state_dict(state_dict, strict and len(state_dict) > 0, assign)
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""

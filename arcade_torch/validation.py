@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
 
 from arcade_torch.envs_jax.validation import format_value, plain
 from arcade_torch.process import warn
@@ -166,28 +165,6 @@ def keep_what_was_written(td: TensorDictBase, following: TensorDictBase) -> None
     keys = unknown.keys(True, True)
     if keys:
         warn_state_is_dropped(*sorted(keys, key=str))
-
-
-def check_rollout(env: EnvBase, steps: TensorDictBase) -> None:
-    """Say so if a policy wrote for the next step what ``rollout`` dropped, since no spec of the env
-    names it.
-    """
-    specs = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec)
-    carried = set()
-    for spec in specs:
-        carried.update(spec.keys(True, True))
-    dropped = set(steps["next"].keys(True, True)) - carried
-    if dropped:
-        warn_state_is_dropped(*sorted(dropped, key=str))
-
-
-def warn_of_empty(state_dict: Mapping[str, Any]) -> None:
-    """Say that an empty ``state_dict`` moves no episode."""
-    if not state_dict:
-        warn(
-            "the state_dict holds no env, as that of TorchRL's Collector: the episodes go on where "
-            "they are. ArcadeCollector saves them, or save env.state_dict() yourself"
-        )
 
 
 def saved_state(state: Mapping[str, Any], num_envs: int, device: torch.device | None) -> TensorDict:
