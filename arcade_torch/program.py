@@ -45,7 +45,8 @@ class _Process:
     begun = False  # the handlers are installed
     phase: Literal["loading", "working", "over"] = "loading"  # of the command
     asked = False  # a signal has asked the command to stop
-    hint = "no work was begun"  # what an interruption leaves, and how to go on
+    nothing_begun = "no work was begun"
+    hint = nothing_begun  # what an interruption leaves, and how to go on
     code: int | None = None  # what came of it
 
 
@@ -95,6 +96,14 @@ def working(hint: str) -> Iterator[None]:
         yield
     finally:
         _Process.phase = "over"
+
+
+def wait_for_work() -> None:
+    """After a command, in a process that carries out another: until then a signal ends it at
+    once.
+    """
+    _Process.hint = _Process.nothing_begun
+    _Process.phase = "loading"
 
 
 def is_asked_to_stop() -> bool:

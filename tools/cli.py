@@ -169,9 +169,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     if argv is not None:
         return _run(list(argv))
+    begin()
+    program.leave(_run(sys.argv[1:]))
+
+
+def begin() -> None:
+    """Prepare a process that carries out commands: its streams, its signals, its warnings."""
     program.begin()
     warnings.formatwarning = _format_warning
-    program.leave(_run(sys.argv[1:]))
 
 
 def _run(words: list[str]) -> int:

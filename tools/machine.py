@@ -19,6 +19,7 @@ _MALLOC = {-4: 0, -1: 2**31 - 1, -2: 2**28}
 PARENT_VARIABLE = "ARCADE_TORCH_PARENT"
 """Process id that a worker watches: when that process is gone the worker stops with a
 checkpoint."""
+_WATCH = "watch-parent"
 
 
 def versions() -> dict[str, str]:
@@ -152,5 +153,6 @@ def watch_parent(every_s: float = 2.0) -> None:
             time.sleep(every_s)
         os.kill(os.getpid(), signal.SIGTERM)
 
-    if parent is not None:
-        threading.Thread(target=look, daemon=True, name="watch-parent").start()
+    watches = any(thread.name == _WATCH for thread in threading.enumerate())
+    if parent is not None and not watches:
+        threading.Thread(target=look, daemon=True, name=_WATCH).start()

@@ -1,12 +1,14 @@
 """Run folders as the trainer writes them, without any training."""
 
 import json
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -97,3 +99,12 @@ def write_study(root: Path, study: Study, spread: float = 0.02) -> StudyFolder:
         )
     folder.write_results(study)
     return folder
+
+
+def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
+    """Jobs whose config is Python code, for an engine that executes it."""
+    found = []
+    for name, text in ((f"job{i}", textwrap.dedent(text)) for i, text in enumerate(scripts)):
+        (tmp_path / f"{name}.py").write_text(text)
+        found.append(Job(name, tmp_path / f"{name}.py", tmp_path / name, tmp_path / f"{name}.log"))
+    return found

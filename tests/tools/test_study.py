@@ -5,10 +5,7 @@ fabricated.
 import io
 import json
 import os
-import signal
-import sys
 import textwrap
-import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,12 +17,11 @@ from arcade_torch.agents import preset
 from arcade_torch.agents.presets import preset_names
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
-from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
-from arcade_torch.tools.studies import engines
-from arcade_torch.tools.studies.engines import Inline, Job, JobResult, Processes, RayOptions
+from arcade_torch.tools.studies.engines import Inline, Job, JobResult, RayOptions
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, study_preset
+from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import (
     DiskFullError,
     make_engine,
@@ -34,7 +30,7 @@ from arcade_torch.tools.studies.runner import (
     show_progress,
     study,
 )
-from tests.tools.fabricated import small_study, write_run, write_study
+from tests.tools.fabricated import jobs, small_study, write_run, write_study
 
 
 class Fabricator:
@@ -317,22 +313,6 @@ def test_versions_of_the_first_runs_stay_on_record(
     assert record["command"] == "second" and len(record["runs"]) == 12
 
 
-def jobs(tmp_path: Path, *scripts: str) -> list[Job]:
-    """Jobs whose config is Python code, for `python_engine`."""
-    found = []
-    for name, text in ((f"job{i}", textwrap.dedent(text)) for i, text in enumerate(scripts)):
-        (tmp_path / f"{name}.py").write_text(text)
-        found.append(Job(name, tmp_path / f"{name}.py", tmp_path / name, tmp_path / f"{name}.log"))
-    return found
-
-
-RUN_CONFIG = (
-    sys.executable,
-    "-c",
-    "import pathlib, sys; exec(pathlib.Path(sys.argv[3]).read_text())",
-)
-
-
 def test_the_table_of_results_holds_no_clock_and_the_timings_stand_beside(tmp_path: Path) -> None:
     what = small_study()
     rows = carry_out(what, tmp_path / "s", Fabricator(what))
@@ -406,136 +386,6 @@ def test_a_study_killed_while_it_wrote_its_first_file_is_begun_again(
     assert [path.name[:12] for path in root.iterdir()] == [".study.json."]
     StudyFolder(root).claim(what)
     assert StudyFolder(root).load() == what
-
-
-def python_engine(workers: int = 2) -> Processes:
-    return Processes(workers, program=RUN_CONFIG, poll_s=0.02)
-
-
-def test_worker_processes_run_side_by_side_and_report_how_they_ended(tmp_path: Path) -> None:
-    wait = f"""
-        import pathlib, time
-        here = pathlib.Path({str(tmp_path)!r})
-        (here / "NAME").touch()
-        while len(list(here.glob("up*"))) < 2: time.sleep(0.02)
-    """
-    texts = [
-        wait.replace("NAME", "up0"),
-        wait.replace("NAME", "up1"),
-        "raise SystemExit('broken: no disk')",
-    ]
-    results = {result.name: result for result in python_engine().run(jobs(tmp_path, *texts))}
-    assert [results[f"job{i}"].error for i in range(3)] == ["", "", "broken: no disk"]
-
-
-def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
-    (result,) = python_engine().run(jobs(tmp_path, "import os; os.kill(os.getpid(), 9)"))
-    assert result.error == "ended by signal 9"
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin")
-def test_each_worker_has_a_core_of_its_own_and_one_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cores = available_cores()[:2]
-    monkeypatch.setattr(engines, "available_cores", lambda: cores)
-    text = f"""
-        import os, pathlib, time
-        here = pathlib.Path({str(tmp_path)!r})
-        for _ in range(500):  # the engine pins it just after its start
-            if len(os.sched_getaffinity(0)) > 1: time.sleep(0.02)
-        core, = os.sched_getaffinity(0)
-        (here / f"core-{{core}}-{{os.environ['OMP_NUM_THREADS']}}").touch()
-        (here / f"up-{{os.getpid()}}").touch()
-        while len(list(here.glob("up-*"))) < COUNT: time.sleep(0.02)
-    """
-    count = len(cores)
-    text = text.replace("COUNT", str(count))
-    assert all(
-        result.error == "" for result in python_engine(count).run(jobs(tmp_path, *[text] * count))
-    )
-    assert len(list(tmp_path.glob("core-*-1"))) == count
-
-
-def test_only_a_study_that_takes_all_cores_gives_each_run_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two studies of one worker each were both pinned to the first core."""
-    pinned: list[set[int]] = []
-    monkeypatch.setattr(engines, "available_cores", lambda: [3, 7])
-    monkeypatch.setattr(
-        os, "sched_setaffinity", lambda process, cores: pinned.append(cores), raising=False
-    )
-    for workers, wanted in ((1, [{3, 7}] * 2), (3, [{3, 7}] * 2), (2, [{3}, {7}]), (0, [{3}, {7}])):
-        list(Processes(workers, program=("true",), poll_s=0.01).run(jobs(tmp_path, "", "")))
-        assert pinned == wanted
-        pinned.clear()
-
-
-def test_closing_the_engine_asks_workers_to_stop_and_lets_them_save(tmp_path: Path) -> None:
-    text = f"""
-        import pathlib, signal, sys, time
-        here = pathlib.Path({str(tmp_path)!r})
-        def save(*_):
-            (here / "saved").touch(); sys.exit(130)
-        signal.signal(signal.SIGTERM, save)
-        (here / "up").touch()
-        time.sleep(60)
-    """
-    results = python_engine().run(jobs(tmp_path, "pass", text, "pass"))
-    next(results)
-    while not (tmp_path / "up").exists():
-        time.sleep(0.02)
-    results.close()  # type: ignore[attr-defined]
-    assert (tmp_path / "saved").exists()
-
-
-def test_a_worker_that_ignores_the_request_is_killed_after_the_grace_time(tmp_path: Path) -> None:
-    text = f"""
-        import pathlib, signal, time
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        pathlib.Path({str(tmp_path / "up")!r}).touch()
-        time.sleep(60)
-    """
-    engine = Processes(2, program=RUN_CONFIG, poll_s=0.02, grace_s=0.3)
-    results = engine.run(jobs(tmp_path, text, "import time; time.sleep(0.5)"))
-    next(results)
-    while not (tmp_path / "up").exists():
-        time.sleep(0.02)
-    start = time.monotonic()
-    results.close()  # type: ignore[attr-defined]
-    assert time.monotonic() - start < 30
-
-
-def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
-    import subprocess
-
-    inner = (
-        "import time, pathlib, signal, sys\n"
-        "from arcade_torch.tools.machine import watch_parent\n"
-        "signal.signal(signal.SIGTERM, lambda *_: "
-        f"(pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
-        "watch_parent(every_s=0.05)\n"
-        f"pathlib.Path({str(tmp_path / 'up')!r}).touch()\n"
-        "time.sleep(120)\n"
-    )
-    outer = (
-        "import os, subprocess, sys, time\n"
-        "os.environ['ARCADE_TORCH_PARENT'] = str(os.getpid())\n"
-        f"subprocess.Popen([sys.executable, '-c', {inner!r}])\n"
-        "time.sleep(120)\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", outer], cwd=Path(__file__).resolve().parents[2]
-    )
-    deadline = time.monotonic() + 100
-    while not (tmp_path / "up").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    while not (tmp_path / "saved").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert (tmp_path / "saved").exists()
 
 
 def test_inline_runs_one_after_the_other_and_survives_exceptions(

@@ -13,6 +13,7 @@ from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.studies import engines
 from arcade_torch.tools.studies.engines import Job, carry_out
 from arcade_torch.tools.studies.grid import MOST_BYTES, Study
+from arcade_torch.tools.studies.processes import end_of_worker
 
 
 def job(folder: Path) -> Job:
@@ -36,11 +37,11 @@ def test_a_log_that_is_a_pipe_or_a_link_is_refused(tmp_path: Path) -> None:
     os.mkfifo(log)
     with pytest.raises(ValueError, match=r"run.log is not a regular file"):
         job(tmp_path).add_to_log("text")
-    assert engines._error(1, log) == "exit code 1"
+    assert end_of_worker(1, log) == "exit code 1"
     log.unlink()
-    assert engines._error(1, log) == "exit code 1"
+    assert end_of_worker(1, log) == "exit code 1"
     job(tmp_path).add_to_log("one\narcade-torch: last\n")
-    assert engines._error(1, log) == "last"
+    assert end_of_worker(1, log) == "last"
 
 
 class Returned:

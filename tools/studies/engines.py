@@ -1,5 +1,5 @@
-"""Where the runs of a study are carried out: in this process, in processes of this machine, on a
-Ray cluster.
+"""Where the runs of a study are carried out: in this process or on a Ray cluster; processes of this
+machine stand in `processes`.
 
 An engine takes jobs and yields one result for each as they end. A job is a JSON file, the config of
 a run. Progress needs no channel of its own: every run writes ``progress.json`` into its folder.
@@ -12,12 +12,9 @@ import importlib
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
-import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -29,13 +26,12 @@ from arcade_torch.agents.runs.files import (
     is_inside,
     open_append,
     read_bytes,
-    read_end,
     read_json,
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
 from arcade_torch.tools.imports import VARIABLE, imports_of, load_extensions
-from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores, keep_freed_memory
+from arcade_torch.tools.machine import available_cores, keep_freed_memory
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
@@ -45,13 +41,6 @@ _QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_DEDUP_LOGS": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-}
-
-
-# what one worker has compiled, the others read: five seconds less of a core for each
-_KEEP_PROGRAMS = {
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
-    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
 
 
@@ -131,98 +120,6 @@ class Inline:
             if trace:
                 job.add_to_log(trace)
             yield JobResult(job.name, error)
-
-
-@dataclass
-class Processes:
-    """Local worker processes, one a job; where they are as many as the cores, each on a core of its
-    own.
-    """
-
-    workers: int = 0  # how many at once; one a core by default
-    # start of a worker's command line
-    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools")
-    poll_s: float = 0.1  # between two looks at the workers
-    grace_s: float = GRACE_S
-
-    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
-        """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
-        to save.
-        """
-        # in a folder that nobody else can write to: what is read from it is run
-        with tempfile.TemporaryDirectory(prefix="arcade-torch-") as programs:
-            yield from self._run(list(jobs), programs)
-
-    def _run(self, waiting: list[Job], programs: str) -> Iterator[JobResult]:
-        """The same, with a folder for compiled programs."""
-        cores = available_cores()
-        active = dict[subprocess.Popen[bytes], tuple[Job, set[int]]]()
-        # Fewer workers go where there is room: another study, or shard, may be at work on the same
-        # machine.
-        shared = [set(cores)] * min(self.workers, len(waiting))
-        alone = [{core} for core in cores]
-        free = alone if self.workers in (0, len(cores)) else shared
-        try:
-            while waiting or active:
-                while waiting and free:
-                    job = waiting.pop(0)
-                    where = free.pop(0)
-                    active[self._start(job, where, programs)] = job, where
-                for process in list(active):
-                    if process.poll() is not None:
-                        job, where = active.pop(process)
-                        free.append(where)
-                        yield JobResult(job.name, _error(process.returncode, job.log))
-                time.sleep(self.poll_s)
-        finally:
-            for process in active:
-                process.terminate()
-            deadline = time.monotonic() + self.grace_s
-            for process in active:
-                try:
-                    process.wait(max(0.0, deadline - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
-
-    def _start(self, job: Job, cores: set[int], programs: str) -> "subprocess.Popen[bytes]":
-        job.add_to_log("")
-        environment = dict(os.environ)
-        for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-            environment[variable] = "1"
-        environment[PARENT_VARIABLE] = str(os.getpid())
-        for variable, value in _KEEP_PROGRAMS.items():
-            environment.setdefault(variable, value)
-        environment.setdefault("JAX_COMPILATION_CACHE_DIR", programs)
-        with open_append(job.log) as log:
-            process = subprocess.Popen(
-                [*self.program, "train", *job.words, "--wait", f"{GRACE_S:g}"],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                # the terminal's Ctrl-C goes to the study alone, which then stops its workers
-                start_new_session=True,
-            )
-        if hasattr(os, "sched_setaffinity"):
-            # slower without it, not wrong
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.sched_setaffinity(process.pid, cores)
-        return process
-
-
-def _error(code: int, log: Path) -> str:
-    """Why a worker failed: its last words, and the signal that ended it; empty for success."""
-    if code == 0:
-        return ""
-    try:
-        lines = read_end(log).strip().splitlines()
-    except (OSError, ValueError):  # somebody removed it, or put something else in its place
-        lines = []
-    last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
-    if code < 0:
-        return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")
-    return last or f"exit code {code}"
 
 
 class ClusterLostError(RuntimeError):

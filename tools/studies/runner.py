@@ -20,9 +20,10 @@ from arcade_torch.agents.runs.files import write_json
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.runs import Run
-from arcade_torch.tools.studies.engines import Engine, Inline, Job, Processes, Ray, RayOptions
+from arcade_torch.tools.studies.engines import Engine, Inline, Job, Ray, RayOptions
 from arcade_torch.tools.studies.folder import Row, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
+from arcade_torch.tools.studies.processes import Processes
 
 LOOK_EVERY_S = 0.5
 """The display is drawn this often, or less often where a look at all runs takes long."""

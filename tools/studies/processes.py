@@ -1,0 +1,216 @@
+"""The engine of one machine: processes that carry out the runs of a study, one run after the other.
+
+To import torch, JAX and TorchRL and to compile a game takes ten seconds of a core, as long as a
+third of a short run, so a process that has carried out a run takes another (`arcade_torch.tools.
+worker`). One in which a run has failed, or which has worked for long, is replaced.
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from arcade_torch.agents.runs.files import open_append, read_end
+from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores
+from arcade_torch.tools.studies.engines import GRACE_S, Job, JobResult
+
+MOST_RUNS = 32
+"""Runs that one process carries out."""
+DONE = b"done\n"
+"""What a process says after a run that has succeeded."""
+LONG_S = 600.0
+"""A process that has worked for so many seconds takes no further run: long ones gain nothing."""
+
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# what one worker has compiled, the others read: five seconds less of a core for each
+_KEEP_PROGRAMS = {
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
+
+
+@dataclass
+class Processes:
+    """Local worker processes; where they are as many as the cores, each on a core of its own."""
+
+    workers: int = 0  # how many at once; one a core by default
+    # command line of a worker
+    program: Sequence[str] = (sys.executable, "-m", "arcade_torch.tools.worker")
+    poll_s: float = 0.1  # between two looks at the workers
+    grace_s: float = GRACE_S
+
+    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+        """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
+        to save.
+        """
+        # in a folder that nobody else can write to: what is read from it is run
+        with tempfile.TemporaryDirectory(prefix="arcade-torch-") as programs:
+            yield from self._run(list(jobs), programs)
+
+    def _run(self, waiting: list[Job], programs: str) -> Iterator[JobResult]:
+        """The same, with a folder for compiled programs."""
+        environment = _KEEP_PROGRAMS | {"JAX_COMPILATION_CACHE_DIR": programs} | os.environ
+        environment |= _ONE_THREAD | {PARENT_VARIABLE: str(os.getpid())}
+        places = self._places(len(waiting))
+        workers = [Worker(self.program, environment, cores) for cores in places]
+        try:
+            while waiting or any(worker.job for worker in workers):
+                for worker in workers:
+                    if waiting and worker.job is None:
+                        worker.take(waiting.pop(0))
+                time.sleep(self.poll_s)
+                for worker in workers:
+                    result = worker.result()
+                    if result is not None:
+                        yield result
+        finally:
+            for worker in workers:
+                worker.ask_to_stop()
+            deadline = time.monotonic() + self.grace_s
+            for worker in workers:
+                worker.wait(max(0.0, deadline - time.monotonic()))
+
+    def _places(self, jobs: int) -> list[set[int]]:
+        """The cores of each worker.
+
+        Fewer workers than cores go where there is room: another study, or shard, may be at work on
+        the same machine.
+        """
+        cores = available_cores()
+        if self.workers in (0, len(cores)):
+            return [{core} for core in cores]
+        return [set(cores)] * min(self.workers, jobs)
+
+
+class Worker:
+    """A place for one run at a time, and the process that carries it out.
+
+    Args:
+        program: command line of the process.
+        environment: its environment.
+        cores: the processor cores it may use.
+    """
+
+    job: Job | None
+    """The run that is under way."""
+
+    def __init__(
+        self, program: Sequence[str], environment: dict[str, str], cores: set[int]
+    ) -> None:
+        self.job = None
+        self._program = program
+        self._environment = environment
+        self._cores = cores
+        self._process: subprocess.Popen[bytes] | None = None
+        self._orders: IO[bytes]
+        self._answers: IO[bytes]
+        self._begun_s = 0.0
+        self._runs = 0
+
+    def take(self, job: Job) -> None:
+        """Begin with a run."""
+        self.job = job
+        job.add_to_log("")
+        if self._process is not None and self._is_spent():
+            self._orders.close()
+            self.wait(GRACE_S)
+        if self._process is None or not self._send(job):
+            self._start(job)
+            self._send(job)
+        self._runs += 1
+
+    def result(self) -> JobResult | None:
+        """How the run ended; None while it is under way, and where there is none."""
+        job = self.job
+        process = self._process
+        if job is None or process is None:
+            return None
+        code = process.poll()
+        # after that: what it said before it ended counts
+        answer = self._answers.read()
+        if answer is not None and DONE in answer:
+            self.job = None
+            return JobResult(job.name)
+        if code is None:
+            return None
+        self.job = None
+        self._process = None
+        return JobResult(job.name, end_of_worker(code, job.log))
+
+    def ask_to_stop(self) -> None:
+        """Ask the process to save and end."""
+        if self._process is None:
+            return
+        if self.job is not None:
+            self._process.terminate()
+        with contextlib.suppress(OSError):
+            self._orders.close()
+
+    def wait(self, grace_s: float) -> None:
+        """Wait until the process has ended, and kill it after a time."""
+        process = self._process
+        if process is None:
+            return
+        try:
+            process.wait(grace_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        self._process = None
+
+    def _is_spent(self) -> bool:
+        """Whether another process should carry out the next run."""
+        return self._runs >= MOST_RUNS or time.monotonic() - self._begun_s >= LONG_S
+
+    def _send(self, job: Job) -> bool:
+        """Hand a run to the process; False if the process is no more."""
+        order = {"words": ["train", *job.words, "--wait", f"{GRACE_S:g}"], "log": str(job.log)}
+        try:
+            self._orders.write(json.dumps(order).encode() + b"\n")
+        except OSError:
+            return False
+        return True
+
+    def _start(self, job: Job) -> None:
+        """Start a process; what it says before its first run goes into the log of that."""
+        with open_append(job.log) as log:
+            process = subprocess.Popen(
+                self._program,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=self._environment,
+                bufsize=0,
+                # the terminal's Ctrl-C goes to the study alone, which then stops its workers
+                start_new_session=True,
+            )
+        assert process.stdin is not None and process.stdout is not None
+        os.set_blocking(process.stdout.fileno(), False)
+        if hasattr(os, "sched_setaffinity"):
+            # slower without it, not wrong
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.sched_setaffinity(process.pid, self._cores)
+        self._process = process
+        self._orders = process.stdin
+        self._answers = process.stdout
+        self._begun_s = time.monotonic()
+        self._runs = 0
+
+
+def end_of_worker(code: int, log: Path) -> str:
+    """Why a worker failed: its last words, and the signal that ended it."""
+    try:
+        lines = read_end(log).strip().splitlines()
+    except (OSError, ValueError):  # somebody removed it, or put something else in its place
+        lines = []
+    last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
+    if code < 0:
+        return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")
+    return last or f"exit code {code}"
