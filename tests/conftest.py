@@ -37,6 +37,9 @@ settings.register_profile(
 settings.load_profile("arcade")
 
 
+SLOW_CASES = Path(__file__).with_name("slow_cases.txt")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--device cpu`` rehearses the tests marked `gpu` on the CPU, as far as they make sense
     there; so does the default where there is no card, lest they rot unseen.
@@ -50,7 +53,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skip `gpu` and `ray` tests with a reason where the machine lacks what they need."""
+    """Mark the cases of `slow_cases.txt`, and skip `gpu` and `ray` tests with a reason where the
+    machine lacks what they need.
+    """
+    slow_cases = set(SLOW_CASES.read_text().splitlines())
+    for item in items:
+        if item.nodeid in slow_cases:
+            item.add_marker(pytest.mark.slow)
     needing_gpu = [item for item in items if item.get_closest_marker("gpu")]
     if needing_gpu and _device_of_gpu_tests(config) == "cpu":
         needing_gpu = [

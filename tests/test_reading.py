@@ -129,3 +129,15 @@ def test_names_name_something(folder: str) -> None:
         if name in NO_NAMES:
             wrong.append(f"{place}: {name}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_the_slow_cases_are_cases_of_tests_that_exist() -> None:
+    cases = (ROOT / "tests/slow_cases.txt").read_text().splitlines()
+    missing = []
+    for case in cases:
+        if case.startswith("#"):
+            continue
+        file, _, function = case.partition("[")[0].partition("::")
+        if f"def {function}(" not in (ROOT / file).read_text():
+            missing.append(case)
+    assert not missing
