@@ -138,7 +138,13 @@ def layout(td: Any) -> dict[Any, Any]:
     return {key: (value.dtype, value.device.type) for key, value in td.items(True, True)}
 
 
-def expected() -> dict[str, Any]:
+@pytest.fixture(scope="module")
+def wanted() -> dict[str, Any]:
+    """What is stored by torch's first defaults."""
+    return stored()
+
+
+def stored() -> dict[str, Any]:
     one = collector(overlap=2)
     env = ArcadeEnv(GAME, N, seed=3, state_in_td=True)
     root = env.reset()
@@ -154,13 +160,12 @@ def expected() -> dict[str, Any]:
     }
 
 
-WANTED = expected()
-
-
-def test_defaults_of_torch_change_nothing_of_what_is_stored(defaults: Any) -> None:
+def test_defaults_of_torch_change_nothing_of_what_is_stored(
+    wanted: dict[str, Any], defaults: Any
+) -> None:
     """Before: rewards were float64, float16 or bfloat16 against the spec."""
-    assert expected() == WANTED
-    for entries in WANTED.values():
+    assert stored() == wanted
+    for entries in wanted.values():
         assert {device for _, device in entries.values()} == {"cpu"}
         assert all(
             dtype == torch.float32 for dtype, _ in entries.values() if dtype.is_floating_point
