@@ -27,10 +27,12 @@ def serve(command: Callable[[Sequence[str]], int] = main) -> None:
     """
     begin()
     watch_parent()
+    orders = os.fdopen(os.dup(0))
     answers = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nowhere, 0)  # a command has no input, nor have programs that it starts
     code = EXIT_OK
-    for line in sys.stdin:
+    for line in orders:
         order = json.loads(line)
         with open_append(Path(order["log"])) as log:
             _print_to(log.fileno())

@@ -76,6 +76,14 @@ def test_a_worker_takes_one_run_after_the_other_and_each_has_its_log(tmp_path: P
     assert not is_there(pid_of(tmp_path, 0))
 
 
+def test_a_run_that_reads_its_input_takes_no_order_away(tmp_path: Path) -> None:
+    reads = "import subprocess; assert sys.stdin.read() + input_of_a_program() == ''"
+    program = "subprocess.run(['cat'], capture_output=True, check=True, text=True).stdout"
+    reads = reads.replace("input_of_a_program()", program)
+    parts = jobs(tmp_path, note_pid(tmp_path, 0, reads), note_pid(tmp_path, 1))
+    assert [result.error for result in python_engine(1).run(parts)] == ["", ""]
+
+
 @pytest.mark.parametrize("end", ["raise SystemExit('no luck')", "os._exit(3)", "1 / 0"])
 def test_after_a_run_that_failed_another_process_takes_the_next(tmp_path: Path, end: str) -> None:
     parts = jobs(tmp_path, note_pid(tmp_path, 0, end), note_pid(tmp_path, 1))

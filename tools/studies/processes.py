@@ -118,10 +118,8 @@ class Worker:
         """Begin with a run."""
         self.job = job
         job.add_to_log("")
-        if self._process is not None and self._is_spent():
-            self._orders.close()
+        if self._is_spent() or not self._send(job):
             self.wait(GRACE_S)
-        if self._process is None or not self._send(job):
             self._start(job)
             self._send(job)
         self._runs += 1
@@ -141,33 +139,35 @@ class Worker:
         if code is None:
             return None
         self.job = None
-        self._process = None
+        self.wait(0.0)
         return JobResult(job.name, end_of_worker(code, job.log))
 
     def ask_to_stop(self) -> None:
-        """Ask the process to save and end."""
+        """Ask the process to end, after it has saved a run that is under way."""
         if self._process is None:
             return
         if self.job is not None:
             self._process.terminate()
-        with contextlib.suppress(OSError):
-            self._orders.close()
+        self._orders.close()
 
     def wait(self, grace_s: float) -> None:
         """Wait until the process has ended, and kill it after a time."""
         process = self._process
         if process is None:
             return
+        self._orders.close()
         try:
             process.wait(grace_s)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+        self._answers.close()
         self._process = None
 
     def _is_spent(self) -> bool:
         """Whether another process should carry out the next run."""
-        return self._runs >= MOST_RUNS or time.monotonic() - self._begun_s >= LONG_S
+        seconds = time.monotonic() - self._begun_s
+        return self._process is None or self._runs >= MOST_RUNS or seconds >= LONG_S
 
     def _send(self, job: Job) -> bool:
         """Hand a run to the process; False if the process is no more."""
