@@ -86,6 +86,17 @@ def _wrap_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
     return fixed(wrapped)
 
 
+def as_actions(action: Any, shape: tuple[int, ...]) -> Array:
+    """Actions as int32 of a shape; a ValueError for what would broadcast or be rounded."""
+    given = jnp.asarray(action)
+    if given.shape != shape or not jnp.issubdtype(given.dtype, jnp.integer):
+        raise ValueError(
+            f"action is {given.dtype} {list(given.shape)}, expected integers {list(shape)}, one an "
+            "env"
+        )
+    return given.astype(jnp.int32)
+
+
 def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
     """A game's ``step`` under fixed settings, which changes nothing where the state has ended; see
     :class:`Game`.
@@ -93,7 +104,7 @@ def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(step)
     def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
-        action = jnp.asarray(action, jnp.int32)
+        action = as_actions(action, ())
         if not keeps_ends(state):
             return step(self, raw_key(key), state, action)
         runs = state.terminated is UNSET and state.truncated is UNSET
