@@ -19,6 +19,7 @@ from arcade_torch.devices import wait_for_torch
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch, BatchedGame
+from arcade_torch.envs_jax.settings import is_key
 from arcade_torch.validation import check_tensor
 
 # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
@@ -35,16 +36,11 @@ def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
     return torch.from_numpy(np.empty(0, dtype)).dtype
 
 
-def _is_key(leaf: Any) -> bool:
-    """Whether a leaf is made of keys of ``jax.random.key``."""
-    return bool(jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key))
-
-
 def _bits(leaf: Any) -> Any:
     """The bits of keys of ``jax.random.key``, and of floats that NumPy lacks, such as bfloat16;
     other arrays as they are.
     """
-    if _is_key(leaf):
+    if is_key(leaf):
         return jax.random.key_data(leaf)
     if np.dtype(leaf.dtype).kind != "V":
         return leaf
@@ -53,11 +49,13 @@ def _bits(leaf: Any) -> Any:
 
 def _typed(array: jax.Array, leaf: Any) -> jax.Array:
     """The inverse of ``_bits``: an array of the type of ``leaf``."""
-    if _is_key(leaf):
+    if is_key(leaf):
         kinds: list[Any] = []  # JAX tells it of arrays alone
         jax.eval_shape(lambda keys: kinds.append(jax.random.key_impl(keys)), leaf)
-        return jax.random.wrap_key_data(array, impl=kinds[0])
-    return array if array.dtype == leaf.dtype else jax.lax.bitcast_convert_type(array, leaf.dtype)
+        array = jax.random.wrap_key_data(array, impl=kinds[0])
+    elif array.dtype != leaf.dtype:
+        array = jax.lax.bitcast_convert_type(array, leaf.dtype)
+    return array
 
 
 def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
@@ -104,7 +102,7 @@ class TreeSnapshots:
         for path, leaf in leaves:
             self._keys.append(tuple(jax.tree_util.keystr((key,), simple=True) for key in path))
             self._leaves.append(leaf)
-            plain = jax.eval_shape(_plain, leaf)
+            plain = jax.eval_shape(_bits, leaf)
             self._dtypes.append(np.dtype(plain.dtype))
             self._shapes.append(torch.Size(plain.shape))
         self._num_envs = num_envs

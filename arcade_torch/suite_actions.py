@@ -29,8 +29,8 @@ def action_spec(
     space: Any = getattr(suite.env, "action_space", None)
     if callable(space):
         space = space(*suite.extra)
-    categories = getattr(space, "n", None)
-    if np.ndim(categories) == 0 and categories is not None:
+    categories: Any = getattr(space, "n", None)
+    if categories is not None and np.ndim(categories) == 0:
         return Categorical(int(categories), shape=(num_envs,), dtype=torch.int64, device=device)
     if hasattr(space, "low") and hasattr(space, "high") and hasattr(space, "shape"):
         return _box(suite, space, num_envs, device)

@@ -206,7 +206,7 @@ def _check_attributes(game: Game[Any]) -> None:
         value = getattr(game, attribute, None)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ValueError(f"{name}: {attribute} is {value!r}, wanted an int of 1 or more")
-    limits = getattr(game, "return_range", None)
+    limits: Any = getattr(game, "return_range", None)
     is_pair = isinstance(limits, tuple) and len(limits) == 2
     is_range = is_pair and all(isinstance(limit, int | float) for limit in limits)
     if not is_range or not limits[0] <= limits[1]:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
 from arcade_torch.envs_jax.checks import check_ends
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
+from arcade_torch.envs_jax.settings import as_numpy
 from arcade_torch.envs_jax.validation import check_choice, format_value
 
 Kind = Literal["state", "frames"]
@@ -166,9 +167,7 @@ def _play_block(
     is_init = np.ones(size, bool)
     while running.any():
         check_ends(batched.game, int(lengths.max()))
-        seen = (
-            np.asarray(batched.render(batch)) if frames else jax.tree.map(np.asarray, batch.state)
-        )
+        seen = np.asarray(batched.render(batch)) if frames else as_numpy(batch.state)
         batch, outcome = batched.step(batch, _checked(player.act(seen, is_init), size))
         returns += np.asarray(outcome.reward) * running
         lengths += running

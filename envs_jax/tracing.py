@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
+
+from arcade_torch.envs_jax.settings import as_numpy
 
 _ADDRESS = re.compile("0x[0-9a-f]+")  # of a Python object; another one at every tracing
 
@@ -67,10 +68,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 def _is_equal(one: Any, other: Any) -> bool:
     """Whether two constants have the same bits."""
-    if jax.dtypes.issubdtype(one.dtype, jax.dtypes.prng_key):
-        one = jax.random.key_data(one)
-        other = jax.random.key_data(other)
-    return np.asarray(one).tobytes() == np.asarray(other).tobytes()
+    return bool(as_numpy(one).tobytes() == as_numpy(other).tobytes())
 
 
 def check_array(name: str, subject: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
