@@ -186,11 +186,14 @@ class Game(abc.ABC, Generic[State]):
     return_range: tuple[float, float]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap the methods of the contract that a class defines."""
+        """Wrap the methods of the contract that a class defines, or has of a base that is no
+        game.
+        """
         super().__init_subclass__(**kwargs)
         for name, wrap in _WRAPPERS.items():
-            if name in vars(cls):
-                setattr(cls, name, wrap(vars(cls)[name]))
+            owner = next(base for base in cls.__mro__ if name in vars(base))
+            if owner is cls or not issubclass(owner, Game):
+                setattr(cls, name, wrap(vars(owner)[name]))
 
     @abc.abstractmethod
     def reset(self, key: Array) -> State:

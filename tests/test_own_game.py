@@ -13,6 +13,8 @@ import torch
 
 import arcade_torch
 from arcade_torch.agents.evaluation import evaluate
+from arcade_torch.agents.presets import preset
+from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax import (
     BatchedGame,
     Game,
@@ -232,6 +234,15 @@ def test_whoever_plays_episodes_to_the_end_does_not_wait_for_ever_for_one_that_h
 
     with pytest.raises(ValueError, match=message):
         evaluate(Still(), env=arcade_torch.make("EndlessEasy", num_envs=2))
+
+
+@pytest.mark.slow
+def test_a_training_says_at_once_that_an_episode_has_no_end() -> None:
+    register("EndlessEasy-v0", Endless)
+    trainer = Trainer(preset("smoke", env="EndlessEasy", observability="full"))
+    with pytest.raises(ValueError, match=r"EndlessEasy-v0: an episode runs on after \d+ steps"):
+        for _ in range(8):
+            trainer.update()
 
 
 def test_a_game_that_counts_in_python_is_refused() -> None:

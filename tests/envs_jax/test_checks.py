@@ -205,6 +205,19 @@ def test_an_action_that_would_broadcast_or_be_rounded_is_refused(action):
         jax.eval_shape(batched.step, batch, jnp.asarray(action).repeat(2)[:, None])
 
 
+def test_methods_that_a_game_has_of_another_base_are_wrapped_too():
+    class Rules:
+        def reset(self, key):
+            assert key.dtype == jnp.uint32
+            return State(jnp.arange(3).sum(), jnp.zeros(3, bool))
+
+    class Mixed(Rules, Right):
+        pass
+
+    with jax.enable_x64(True):
+        assert Mixed().reset(jax.random.key(0)).count.dtype == jnp.int32
+
+
 def test_an_attribute_that_is_missing_is_named():
     class Nameless(Right):
         id = None
