@@ -11,6 +11,7 @@ import arcade_torch
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
+from arcade_torch.envs_jax.checks import check_ends
 
 MOST_EPISODES = 2**16
 """Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB
@@ -121,8 +122,8 @@ def evaluate(
             replaces ``episodes``.
 
     Raises:
-        ValueError: ``episodes`` is not positive, ``seed`` is out of range, or ``observability`` is
-            unknown.
+        ValueError: ``episodes`` is not positive, ``seed`` is out of range, ``observability`` is
+            unknown, or an episode does not end in time.
     """
     require(
         1 <= episodes <= MOST_EPISODES,
@@ -159,7 +160,10 @@ def _play(agent: Any, env: Any) -> EvalResult:
     returns = np.zeros(num_envs, np.float32)
     lengths = np.zeros(num_envs, np.int64)
     playing = np.ones(num_envs, bool)
+    steps = 0
     while playing.any():
+        check_ends(env.game, steps)
+        steps += 1
         action, _, state = agent.act(obs, state)
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         ended = step["next", "done"].view(-1).cpu().numpy() & playing

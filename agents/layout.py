@@ -60,8 +60,9 @@ def insert_final_observations(
         batch: sequences [N] of ``ArcadeCollector.collect()`` or rows of them, or a stock TorchRL
             batch [..., L] with dense ``("next", ...)`` observations, read as [N, L]. Entries: what
             the network reads, ``action``, ``is_init``, ``("next", "reward" | "terminated" |
-            "truncated")``; the recurrent state as ``initial_state`` [N], or per step under the
-            network's keys (not needed where all rows begin with an episode).
+            "truncated")``, or ``done`` in the place of the last; the recurrent state as
+            ``initial_state`` [N], or per step under the network's keys (not needed where all rows
+            begin with an episode).
         inputs: of the network.
         time_limit: ``"bootstrap"``: a truncated step needs its true next observation;
             ``"terminal"``: it does not.
@@ -109,6 +110,9 @@ def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
             "the batch must be one without MultiStep: use lmbda; got 'steps_to_next_obs'"
         )
     batch = batch.copy()
+    # an env of TorchRL need not have it; done is there, and beside terminated it says the same
+    if ("next", "truncated") not in batch and ("next", "done") in batch:
+        batch["next", "truncated"] = batch["next", "done"]
     for name, given in names.items():
         if name in ("reward", "terminated", "truncated"):
             batch["next", name] = _get(batch, unravel_key(("next", given)))

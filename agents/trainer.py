@@ -35,6 +35,7 @@ from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS
 from arcade_torch.agents.runs.states import check_state
 from arcade_torch.devices import pick_devices
+from arcade_torch.envs_jax.checks import check_ends
 
 LEARNERS: dict[str, Callable[..., PQN | PPO | DQN]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}
 COMPILE_BACKEND = "inductor"
@@ -127,6 +128,7 @@ class Trainer:
 
         Raises:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
+            ValueError: an episode of a game of one's own does not end in time.
         """
         began = time.perf_counter()
         numbers = self.config.learner
@@ -134,6 +136,7 @@ class Trainer:
         for explorer in self.explorers:
             explorer.eps.fill_(epsilon)
         batch = self.collector.collect()
+        check_ends(self.env.game, int(batch["step_count"].max()))
         new = slice(numbers.steps_before, None)
         last = self.stats.update(
             *(batch["next", key][:, new].squeeze(-1) for key in ("episode_reward", "done"))

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
+from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
-from arcade_torch import validation
+from arcade_torch import suite_actions, validation
 from arcade_torch.base_env import BaseEnv
 from arcade_torch.compiled import pack_numbers
 from arcade_torch.devices import pick_devices, wait_for_torch
@@ -21,13 +21,13 @@ from arcade_torch.final_observations import KeptObservations
 from arcade_torch.process import check_process
 from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import TreeSnapshots
-from arcade_torch.suite import Outcome, Suite, described, name_of
+from arcade_torch.suite import Outcome, Suite, name_of
 
 __all__ = ["JaxEnv", "from_jax"]
 
 _OWN_KEYS = (
     *("action", "last_action", "is_init", "step_count", "episode_reward"),
-    *("reward", "done", "terminated", "truncated", "next"),
+    *("reward", "done", "terminated", "truncated", "next", "_reset", "_step"),
 )
 
 
@@ -81,10 +81,10 @@ class JaxEnv(BaseEnv):
         self.suite = suite
         self._jax_device = jax_device
         self._check_actions = debug or is_host(torch_device)
-        self.action_spec = _action_spec(suite, action_spec, num_envs, torch_device)
-        self._action_dtype = np.dtype(
-            np.int32 if isinstance(self.action_spec, Categorical) else np.float32
-        )
+        self.action_spec = suite_actions.action_spec(suite, action_spec, num_envs, torch_device)
+        one_action = suite_actions.action_of_one(self.action_spec)
+        self._action_dtype = one_action.dtype
+        suite.check(one_action)
         self._reset_rows = jax.jit(self._begin_anew)
         self._step_alone = jax.jit(self._advance)
         self._step_fused = jax.jit(self._advance_and_begin_anew)
@@ -366,17 +366,8 @@ class JaxEnv(BaseEnv):
 
     def _argument(self, action: torch.Tensor) -> np.ndarray | jax.Array:
         """A private copy of the actions for a compiled function, checked."""
-        if isinstance(self.action_spec, Categorical):
-            validation.check_integers(
-                action, self.num_envs, self.action_spec.space.n, self._check_actions
-            )
-            dtype = torch.int32
-        else:
-            validation.check_tensor(action, "action")
-            if action.shape != self.action_spec.shape:
-                expected = list(self.action_spec.shape)
-                raise ValueError(f"action has shape {list(action.shape)}, expected {expected}")
-            dtype = torch.float32
+        suite_actions.check_action(action, self.action_spec, self._check_actions)
+        dtype = torch.int32 if self._action_dtype == np.int32 else torch.float32
         if is_host(self._jax_device):
             return action.detach().to("cpu", dtype, copy=True).numpy()
         return to_jax(action.detach().to(dtype, copy=True))
@@ -441,53 +432,27 @@ def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _leaf_names(obs: Any, obs_key: str | None) -> list[Any]:
     """A key of a tensordict for every leaf of an observation, a string or a tuple of strings."""
     leaves = jax.tree_util.tree_flatten_with_path(obs)[0]
-    if len(leaves) == 1 and not leaves[0][0]:
+    is_array = len(leaves) == 1 and not leaves[0][0]
+    paths = [tuple(jax.tree_util.keystr((key,), simple=True) for key in path) for path, _ in leaves]
+    if obs_key is not None and (not isinstance(obs_key, str) or not obs_key):
+        raise TypeError(f"obs_key is {obs_key!r}, expected a string")
+    if is_array:
         array = leaves[0][1]
         is_picture = array.dtype == np.uint8 and array.ndim == 4
-        return [obs_key or ("pixels" if is_picture else "observation")]
-    names: list[Any] = []
-    for path, _ in leaves:
-        parts = tuple(jax.tree_util.keystr(path, simple=True, separator="/").split("/"))
-        if parts[0] in _OWN_KEYS:
+        paths = [(obs_key or ("pixels" if is_picture else "observation"),)]
+    elif obs_key is not None:
+        arrived = ", ".join("/".join(path) for path in paths)
+        raise ValueError(
+            f"obs_key is {obs_key!r}, and the observation has names of its own: {arrived}; leave "
+            "obs_key out"
+        )
+    for path in paths:
+        if path[0] in _OWN_KEYS:
             raise ValueError(
-                f"the observation has an entry {parts[0]!r}, which is a key of the env itself: "
+                f"the observation has an entry {path[0]!r}, which is a key of the env itself: "
                 "give it another name"
             )
-        names.append(parts[0] if len(parts) == 1 else parts)
-    return names
-
-
-def _action_spec(
-    suite: Suite, given: TensorSpec | None, num_envs: int, device: torch.device
-) -> TensorSpec:
-    """The spec of actions [N, ...], from the env's action space."""
-    if given is not None:
-        if not isinstance(given, Categorical | Bounded | Unbounded) or isinstance(given, OneHot):
-            kind = type(given).__name__
-            raise TypeError(f"action_spec is a {kind}, expected Categorical or Bounded")
-        if given.shape[:1] != (num_envs,):
-            raise ValueError(
-                f"action_spec has shape {list(given.shape)}, expected [{num_envs}, ...]"
-            )
-        return given.to(device)
-    space: Any = getattr(suite.env, "action_space", None)
-    if callable(space):
-        space = space(*suite.extra)
-    categories = getattr(space, "n", None)
-    if categories is not None:
-        return Categorical(int(categories), shape=(num_envs,), dtype=torch.int64, device=device)
-    if hasattr(space, "low") and hasattr(space, "high"):
-        shape = tuple(space.shape)
-        bounds = []
-        for bound in (space.low, space.high):
-            full = np.broadcast_to(np.asarray(bound, np.float32), (num_envs, *shape))
-            bounds.append(torch.from_numpy(full.copy()).to(device))
-        return Bounded(*bounds, shape=(num_envs, *shape), dtype=torch.float32, device=device)
-    raise ValueError(
-        f"the actions of {name_of(suite.env)} are {described(space)}, expected a space with n, or "
-        "with low, high and shape: pass action_spec=, for instance "
-        f"torchrl.data.Categorical(4, shape=({num_envs},))"
-    )
+    return [path[0] if len(path) == 1 else path for path in paths]
 
 
 def from_jax(
@@ -528,9 +493,9 @@ def from_jax(
         The env, for TorchRL's transforms and collectors, and for ``ArcadeCollector``.
 
     Raises:
-        TypeError: The env lacks a function, or its step gives something else.
-        ValueError: A size out of range, an unknown action space, or an observation with a name of
-            the env's own keys.
+        TypeError: The env lacks a function, or one gives something else.
+        ValueError: A size out of range, an unknown action space, an observation with a name of the
+            env's own keys; or functions that are not pure, or that give other arrays each.
 
     Example:
         >>> class Count:  # any object with the two functions

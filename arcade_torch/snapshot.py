@@ -2,7 +2,8 @@
 and loaded.
 
 Leaves are private copies, never views of live JAX memory. Random keys (uint32) travel as int32 of
-the same bits, since tensordict has no arithmetic for unsigned integers.
+the same bits, since tensordict has no arithmetic for unsigned integers; so do keys of
+``jax.random.key`` and bfloat16, which torch does not know from NumPy.
 """
 
 import zlib
@@ -18,6 +19,7 @@ from arcade_torch.devices import wait_for_torch
 from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch, BatchedGame
+from arcade_torch.envs_jax.settings import is_key
 from arcade_torch.validation import check_tensor
 
 # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
@@ -32,6 +34,28 @@ def fingerprint(game_id: str) -> int:
 
 def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
     return torch.from_numpy(np.empty(0, dtype)).dtype
+
+
+def _bits(leaf: Any) -> Any:
+    """The bits of keys of ``jax.random.key``, and of floats that NumPy lacks, such as bfloat16;
+    other arrays as they are.
+    """
+    if is_key(leaf):
+        return jax.random.key_data(leaf)
+    if np.dtype(leaf.dtype).kind != "V":
+        return leaf
+    return jax.lax.bitcast_convert_type(leaf, f"uint{8 * np.dtype(leaf.dtype).itemsize}")
+
+
+def _typed(array: jax.Array, leaf: Any) -> jax.Array:
+    """The inverse of ``_bits``: an array of the type of ``leaf``."""
+    if is_key(leaf):
+        kinds: list[Any] = []  # JAX tells it of arrays alone
+        jax.eval_shape(lambda keys: kinds.append(jax.random.key_impl(keys)), leaf)
+        array = jax.random.wrap_key_data(array, impl=kinds[0])
+    elif array.dtype != leaf.dtype:
+        array = jax.lax.bitcast_convert_type(array, leaf.dtype)
+    return array
 
 
 def _entry(td: TensorDictBase, path: tuple[str, ...]) -> torch.Tensor:
@@ -72,13 +96,15 @@ class TreeSnapshots:
     ) -> None:
         leaves, self._tree = jax.tree_util.tree_flatten_with_path(tree)
         self._keys: list[tuple[str, ...]] = []
+        self._leaves: list[Any] = []
         self._dtypes: list[np.dtype[Any]] = []
         self._shapes: list[torch.Size] = []
         for path, leaf in leaves:
-            name = jax.tree_util.keystr(path, simple=True, separator="/")
-            self._keys.append(tuple(name.split("/")))
-            self._dtypes.append(np.dtype(leaf.dtype))
-            self._shapes.append(torch.Size(leaf.shape))
+            self._keys.append(tuple(jax.tree_util.keystr((key,), simple=True) for key in path))
+            self._leaves.append(leaf)
+            plain = jax.eval_shape(_bits, leaf)
+            self._dtypes.append(np.dtype(plain.dtype))
+            self._shapes.append(torch.Size(plain.shape))
         self._num_envs = num_envs
         self._device = device
         self._jax_device = jax_device
@@ -88,7 +114,8 @@ class TreeSnapshots:
     def export(self, tree: Any) -> TensorDict:
         """Copy a tree out of JAX, every leaf under its path."""
         out = TensorDict({}, batch_size=[self._num_envs], device=self._device)
-        for key, array in zip(self._keys, jax.tree.leaves(tree), strict=True):
+        for key, leaf in zip(self._keys, jax.tree.leaves(tree), strict=True):
+            array = _bits(leaf)
             tensor = to_torch(array, self._device)
             signed = _SIGNED.get(np.dtype(array.dtype))
             out[key] = (tensor if signed is None else tensor.view(signed)).clone()
@@ -104,7 +131,8 @@ class TreeSnapshots:
         self.check_batch(td)
         wait_for_torch(self._device, self._jax_device)
         arrays = []
-        for key, dtype, shape in zip(self._keys, self._dtypes, self._shapes, strict=True):
+        columns = (self._keys, self._leaves, self._dtypes, self._shapes)
+        for key, leaf, dtype, shape in zip(*columns, strict=True):
             name = ".".join(key)
             is_older = key[-1] in self._may_lack and td.get(key, None) is None
             tensor = (
@@ -118,7 +146,7 @@ class TreeSnapshots:
                     f"{self._num_envs} envs expects {dtype} {tuple(shape)}"
                 )
             value = tensor.detach().to("cpu", copy=True).numpy().view(dtype)
-            arrays.append(jax.device_put(value, self._jax_device))
+            arrays.append(_typed(jax.device_put(value, self._jax_device), leaf))
         return jax.tree_util.tree_unflatten(self._tree, arrays)
 
     def spec(self) -> Composite:

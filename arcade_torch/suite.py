@@ -1,12 +1,13 @@
 """An env of another suite, by two functions: gymnax's, or what has their shape."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from arcade_torch import validation
+from arcade_torch.envs_jax.tracing import ContractError, check_same, traced
 
 # names that params and envs of the suites have for a time limit
 _LIMITS = ("max_steps_in_episode", "max_timesteps", "max_steps")
@@ -31,6 +32,10 @@ class Suite:
     """
 
     def __init__(self, env: Any, params: Any = None, max_steps: int | None = None) -> None:
+        if isinstance(params, int | float):
+            raise TypeError(
+                f"params is {params}, expected those of the env: pass num_envs= by name"
+            )
         if params is None:
             params = getattr(env, "default_params", None)
         if max_steps is not None:
@@ -49,7 +54,13 @@ class Suite:
 
     def reset(self, key: jax.Array) -> tuple[Any, Any]:
         """The first observation and state of an episode."""
-        obs, state = self._begin(key, *self.extra)
+        result = self._begin(key, *self.extra)
+        if not isinstance(result, tuple | list) or len(result) != 2:
+            raise ContractError(
+                f"reset of {name_of(self.env)} gives {described(result)}, expected a tuple of "
+                "observation and state"
+            )
+        obs, state = result
         return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, state)
 
     def step(
@@ -58,20 +69,54 @@ class Suite:
         """Take the step number ``count`` of an episode, from 1 on: observation, state, outcome."""
         result = self._go_on(key, state, action, *self.extra)
         if not isinstance(result, tuple) or len(result) not in (5, 6):
-            raise TypeError(
+            raise ContractError(
                 f"step of {name_of(self.env)} gives {described(result)}, expected observation, "
                 "state, reward, done (or terminated, truncated), info"
             )
-        obs, after, reward = result[:3]
-        terminated, truncated = self._ends(result[3:-1], after, count)
-        outcome = Outcome(
-            jnp.asarray(reward, jnp.float32).reshape(()),
-            jnp.asarray(terminated, bool).reshape(()),
-            jnp.asarray(truncated, bool).reshape(()),
-        )
+        obs, after = result[:2]
+        reward, *flags = (self._number(value) for value in result[2:-1])
+        if reward.dtype == bool and flags[0].dtype != bool:
+            raise ContractError(
+                f"step of {name_of(self.env)} gives {reward.dtype} as the reward and "
+                f"{flags[0].dtype} as an end, expected observation, state, reward, done, info in "
+                "this order"
+            )
+        terminated, truncated = self._ends([flag.astype(bool) for flag in flags], after, count)
+        outcome = Outcome(reward.astype(jnp.float32), terminated, truncated)
         return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, after), outcome
 
-    def _ends(self, flags: tuple[Any, ...], after: Any, count: jax.Array) -> tuple[Any, Any]:
+    def check(self, action: Any) -> None:
+        """Refuse an env whose functions do not fit together; nothing is compiled.
+
+        Args:
+            action: Shape and type of the action of one env, a ``jax.ShapeDtypeStruct``.
+
+        Raises:
+            TypeError: ``reset`` or ``step`` gives something else than it has to.
+            ValueError: One cannot be traced or is not pure, or ``step`` gives an observation or a
+                state with other arrays than ``reset``.
+        """
+        name = name_of(self.env)
+        key = jax.ShapeDtypeStruct((2,), jnp.uint32)
+        obs, state = traced(name, "reset", self.reset, key)
+        count = jax.ShapeDtypeStruct((), jnp.int32)
+        following, after, _ = traced(name, "step", self.step, key, state, action, count)
+        check_same(name, "observation", obs, following)
+        check_same(name, "state", state, after)
+
+    def _number(self, value: Any) -> jax.Array:
+        """A reward or a flag as a scalar array."""
+        is_one = hasattr(value, "dtype") or isinstance(value, bool | int | float)
+        array = jnp.asarray(value) if is_one else None
+        if array is None or array.size != 1:
+            given = described(value) if array is None else f"{array.dtype} {list(array.shape)}"
+            raise ContractError(
+                f"step of {name_of(self.env)} gives {given} as a reward or an end, expected one "
+                "number: envs of several agents are not taken"
+            )
+        return array.reshape(())
+
+    def _ends(self, flags: list[jax.Array], after: Any, count: jax.Array) -> tuple[Any, Any]:
         """``terminated`` and ``truncated`` of a step, whatever the env itself tells apart.
 
         An env that only knows ``done`` is taken to be truncated by an end at the time limit.
@@ -80,13 +125,23 @@ class Suite:
         if len(flags) == 2:
             return flags[0], jnp.logical_or(flags[1], is_limit)
         if self.tells_truncation:
-            truncated = self.env.is_truncated(after, *self.extra)
+            truncated = self._number(self.env.is_truncated(after, *self.extra))
             return flags[0], jnp.logical_or(truncated, is_limit)
         return jnp.logical_and(flags[0], jnp.logical_not(is_limit)), is_limit
 
 
 def _function(env: Any, name: str) -> Callable[..., Any]:
-    """``reset_env`` or ``step_env``, else ``reset`` or ``step``."""
+    """``reset_env`` or ``step_env``, else ``reset`` or ``step``.
+
+    A wrapper that defines ``step`` and hands on ``step_env`` of what it wraps, and a subclass that
+    overrides ``step`` alone, are refused: what they do would be left out.
+    """
+    if hasattr(env, f"{name}_env") and _depth(env, name) < _depth(env, f"{name}_env"):
+        raise TypeError(
+            f"{name_of(env)} has a {name} of its own, but {name}_env is that of what it wraps or "
+            f"is derived from, and from_jax calls {name}_env, for gymnax's {name} begins episodes "
+            f"by itself: give {name_of(env)} its own {name}_env"
+        )
     function = getattr(env, f"{name}_env", None) or getattr(env, name, None)
     if not callable(function):
         raise TypeError(
@@ -99,10 +154,22 @@ def _function(env: Any, name: str) -> Callable[..., Any]:
     return checked
 
 
+def _depth(env: Any, name: str) -> int:
+    """How far from an object something that it has is defined: in itself, its class, the bases in
+    their order, or somewhere else, to which ``__getattr__`` leads.
+    """
+    places = [vars(env) if hasattr(env, "__dict__") else {}, *map(vars, type(env).__mro__)]
+    for depth, place in enumerate(places):
+        if name in place:
+            return depth
+    return len(places)
+
+
 def _limit_of(params: Any) -> int | None:
-    """The time limit that params name."""
+    """The time limit that params name, a mapping or an object."""
+    entries = params if isinstance(params, Mapping) else None
     for name in _LIMITS:
-        limit = getattr(params, name, None)
+        limit = getattr(params, name, None) if entries is None else entries.get(name)
         if limit is not None:
             return int(limit)
     return None

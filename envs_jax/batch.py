@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, keeps_ends
+from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, as_actions, keeps_ends
 from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
@@ -140,7 +140,7 @@ class BatchedGame(Generic[State]):
         An episode that has ended stays as it is: state, counts and both flags, with the reward 0,
         and its random key.
         """
-        action = jnp.asarray(action, jnp.int32)
+        action = as_actions(action, batch.step_count.shape)
         stepped, outcome = self._step_running(self.without_ends(batch), action)
         if not has_ends(batch):
             return stepped, outcome

@@ -2,7 +2,6 @@
 anything; on request also what random play shows.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Game, keeps_ends
 from arcade_torch.envs_jax.settings import compiled
+from arcade_torch.envs_jax.tracing import check_array, check_same, leaves, traced
 
 _OURS = "arcade_torch.envs_jax."
 _STEPS_TO_PLAY = 100  # a running episode is played to its end
@@ -22,7 +22,7 @@ _ROUNDING = 1e-4  # of a return
 def check_game(game: Game[Any], play: bool = False) -> None:
     """Refuse a game whose functions do not fit together, or whose frames nobody could use.
 
-    Traces ``reset``, ``step``, ``render`` and ``facts`` once each, for shapes and types alone; that
+    Traces ``reset``, ``step``, ``render`` and ``facts`` twice each, for shapes and types; that
     takes milliseconds. ``make`` and ``BatchedGame`` call it for every game that is not one of this
     package.
 
@@ -32,11 +32,11 @@ def check_game(game: Game[Any], play: bool = False) -> None:
             every step. That compiles ``reset`` and ``step``, and takes seconds.
 
     Raises:
-        ValueError: A function cannot be traced, gives something of a wrong shape or type, or
-            ``step`` changes the structure of the state; or an attribute is missing or of no use.
-            With ``play`` also: a code has no picture, a reward or a state entry is not a number, an
-            episode ends too late or is truncated too early, or a return is out of range. One line:
-            the game, what arrived, what is wanted.
+        ValueError: A function cannot be traced, depends on what Python keeps between calls, or
+            gives something of a wrong shape or type; ``step`` changes the structure of the state;
+            or an attribute is missing or of no use. With ``play`` also: a code has no picture, a
+            reward or a state entry is not a number, an episode ends too late or is truncated too
+            early, or a return is out of range. One line: the game, what arrived, what is wanted.
 
     Example:
         >>> from arcade_torch.envs_jax import make
@@ -45,8 +45,8 @@ def check_game(game: Game[Any], play: bool = False) -> None:
     _check_attributes(game)
     name = game.id
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
-    first = _traced(name, "reset", game.reset, key)
-    stepped = _traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
+    first = traced(name, "reset", game.reset, key)
+    stepped = traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
     if not isinstance(stepped, tuple) or len(stepped) != 4:
         got = (
             f"{len(stepped)} values"
@@ -56,13 +56,13 @@ def check_game(game: Game[Any], play: bool = False) -> None:
         raise ValueError(
             f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated"
         )
-    _check_state(name, first, stepped[0])
-    _check_array(name, "step gives reward as", stepped[1], (), "float32")
-    _check_array(name, "step gives terminated as", stepped[2], (), "bool")
-    _check_array(name, "step gives truncated as", stepped[3], (), "bool")
-    frame = _traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
-    _check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
-    _check_facts(name, _traced(name, "facts", game.facts, first))
+    check_same(name, "state", first, stepped[0])
+    check_array(name, "step gives reward as", stepped[1], (), "float32")
+    check_array(name, "step gives terminated as", stepped[2], (), "bool")
+    check_array(name, "step gives truncated as", stepped[3], (), "bool")
+    frame = traced(name, "render", game.render, first, jax.ShapeDtypeStruct((), jnp.bool_))
+    check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
+    _check_facts(name, traced(name, "facts", game.facts, first))
     if play:
         _check_play(game)
 
@@ -156,9 +156,20 @@ def _check_numbers(game: Game[Any], state: Any, reward: Any, step: int) -> None:
     """Refuse a reward that is not finite, and a state with something that is not a number."""
     if not np.isfinite(reward):
         raise ValueError(f"{game.id}: step {step} gives the reward {float(reward)}")
-    for name, leaf in _leaves(state).items():
+    for name, leaf in leaves(state, "state").items():
         if jnp.issubdtype(leaf.dtype, jnp.floating) and np.isnan(leaf).any():
             raise ValueError(f"{game.id}: step {step} gives state entry {name} as nan")
+
+
+def check_ends(game: Game[Any], steps: int) -> None:
+    """Raise ValueError if an episode still runs after so many steps: one more than ``max_steps``,
+    for by the reference rules some games end a step late.
+    """
+    if steps > game.max_steps:
+        raise ValueError(
+            f"{game.id}: an episode runs on after {steps} steps, and max_steps is "
+            f"{game.max_steps}: step has to give truncated there"
+        )
 
 
 def check_made(game: Any, full_id: str, obs_size: int) -> None:
@@ -195,71 +206,13 @@ def _check_attributes(game: Game[Any]) -> None:
         value = getattr(game, attribute, None)
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ValueError(f"{name}: {attribute} is {value!r}, wanted an int of 1 or more")
-    limits = getattr(game, "return_range", None)
-    if not isinstance(limits, tuple) or len(limits) != 2 or not limits[0] <= limits[1]:
+    limits: Any = getattr(game, "return_range", None)
+    is_pair = isinstance(limits, tuple) and len(limits) == 2
+    is_range = is_pair and all(isinstance(limit, int | float) for limit in limits)
+    if not is_range or not limits[0] <= limits[1]:
         raise ValueError(f"{name}: return_range is {limits!r}, wanted (lowest, highest)")
     if game.num_actions != NUM_ACTIONS:
         raise ValueError(
             f"{name}: num_actions is {game.num_actions!r}, wanted {NUM_ACTIONS}, the same in every "
             "game"
         )
-
-
-def _traced(name: str, method: str, function: Callable[..., Any], *args: Any) -> Any:
-    """What a function would give, by shapes and types."""
-    try:
-        return jax.eval_shape(function, *args)
-    except Exception as error:
-        reason = str(error).strip().partition("\n")[0].rstrip(".")
-        hint = (
-            "; use jnp.where instead of if"
-            if isinstance(error, jax.errors.TracerBoolConversionError)
-            else ""
-        )
-        raise ValueError(
-            f"{name}: {method} cannot be traced by JAX, wanted a pure function of arrays{hint} "
-            f"({type(error).__name__}: {reason})"
-        ) from error
-
-
-def _check_array(name: str, subject: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
-    """Refuse anything but an array of this shape and type."""
-    if not hasattr(value, "shape"):
-        raise ValueError(
-            f"{name}: {subject} a {type(value).__name__}, wanted {dtype} {list(shape)}"
-        )
-    if tuple(value.shape) != shape or value.dtype != dtype:
-        raise ValueError(
-            f"{name}: {subject} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}"
-        )
-
-
-def _check_state(name: str, first: Any, following: Any) -> None:
-    """Refuse a step whose state has other leaves than that of reset."""
-    ours = _leaves(first)
-    theirs = _leaves(following)
-    if not ours:
-        raise ValueError(
-            f"{name}: reset gives a state without any array, wanted a named tuple of arrays"
-        )
-    before: object = jax.tree.structure(first)
-    if before != jax.tree.structure(following):
-        raise ValueError(
-            f"{name}: step gives a state of another structure, with "
-            f"{', '.join(theirs) or 'nothing'}; wanted that of "
-            f"reset, a {type(first).__name__} with {', '.join(ours)}"
-        )
-    for leaf, wanted in ours.items():
-        _check_array(
-            name,
-            f"step gives state entry {leaf} as",
-            theirs[leaf],
-            tuple(wanted.shape),
-            str(wanted.dtype),
-        )
-
-
-def _leaves(state: Any) -> dict[str, Any]:
-    """The arrays of a state by name."""
-    named = jax.tree_util.tree_flatten_with_path(state)[0]
-    return {jax.tree_util.keystr(path).lstrip(".") or "state": leaf for path, leaf in named}

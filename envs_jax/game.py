@@ -86,6 +86,17 @@ def _wrap_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
     return fixed(wrapped)
 
 
+def as_actions(action: Any, shape: tuple[int, ...]) -> Array:
+    """Actions as int32 of a shape; a ValueError for what would broadcast or be rounded."""
+    given = jnp.asarray(action)
+    if given.shape != shape or not jnp.issubdtype(given.dtype, jnp.integer):
+        raise ValueError(
+            f"action is {given.dtype} {list(given.shape)}, expected integers {list(shape)}, one an "
+            "env"
+        )
+    return given.astype(jnp.int32)
+
+
 def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
     """A game's ``step`` under fixed settings, which changes nothing where the state has ended; see
     :class:`Game`.
@@ -93,7 +104,7 @@ def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(step)
     def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
-        action = jnp.asarray(action, jnp.int32)
+        action = as_actions(action, ())
         if not keeps_ends(state):
             return step(self, raw_key(key), state, action)
         runs = state.terminated is UNSET and state.truncated is UNSET
@@ -175,11 +186,14 @@ class Game(abc.ABC, Generic[State]):
     return_range: tuple[float, float]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap the methods of the contract that a class defines."""
+        """Wrap the methods of the contract that a class defines, or has of a base that is no
+        game.
+        """
         super().__init_subclass__(**kwargs)
         for name, wrap in _WRAPPERS.items():
-            if name in vars(cls):
-                setattr(cls, name, wrap(vars(cls)[name]))
+            owner = next(base for base in cls.__mro__ if name in vars(base))
+            if owner is cls or not issubclass(owner, Game):
+                setattr(cls, name, wrap(vars(owner)[name]))
 
     @abc.abstractmethod
     def reset(self, key: Array) -> State:

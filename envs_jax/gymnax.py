@@ -153,7 +153,7 @@ class GymnaxEnv:
             ``truncated`` (bool []), and ``discount`` (float32 []), 0 where the game itself ended
             and 1 elsewhere, also at a time limit.
         """
-        following, _, outcome = self.game.step_autoreset(key, state, jnp.asarray(action, jnp.int32))
+        following, _, outcome = self.game.step_autoreset(key, state, jnp.asarray(action))
         return self._stepped(following, outcome, params)
 
     @fixed
@@ -161,7 +161,7 @@ class GymnaxEnv:
         self, key: Array, state: Any, action: Array | int, params: EnvParams | None = None
     ) -> Stepped:
         """``step`` without the new episode: an end shows the final observation."""
-        following, *outcome = self.game.step(key, state, jnp.asarray(action, jnp.int32))
+        following, *outcome = self.game.step(key, state, jnp.asarray(action))
         return self._stepped(following, outcome, params)
 
     def _stepped(self, state: Any, outcome: Any, params: EnvParams | None) -> Stepped:

@@ -16,8 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
+from arcade_torch.envs_jax.checks import check_ends
 from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
-from arcade_torch.envs_jax.validation import check_choice
+from arcade_torch.envs_jax.settings import as_numpy
+from arcade_torch.envs_jax.validation import check_choice, format_value
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]
@@ -137,7 +139,8 @@ def play(
         Returns and lengths.
 
     Raises:
-        ValueError: ``episodes`` is not positive.
+        ValueError: ``episodes`` is not positive, an episode does not end in time, or the player
+            gives no actions.
     """
     if episodes < 1:
         raise ValueError(f"episodes is {episodes}, expected at least 1")
@@ -163,15 +166,26 @@ def _play_block(
     running = np.ones(size, bool)
     is_init = np.ones(size, bool)
     while running.any():
-        seen = (
-            np.asarray(batched.render(batch)) if frames else jax.tree.map(np.asarray, batch.state)
-        )
-        batch, outcome = batched.step(batch, player.act(seen, is_init).astype(np.int32))
+        check_ends(batched.game, int(lengths.max()))
+        seen = np.asarray(batched.render(batch)) if frames else as_numpy(batch.state)
+        batch, outcome = batched.step(batch, _checked(player.act(seen, is_init), size))
         returns += np.asarray(outcome.reward) * running
         lengths += running
         running &= ~np.asarray(outcome.done)
         is_init = np.zeros(size, bool)
     return Episodes(returns, lengths)
+
+
+def _checked(actions: Any, num_envs: int) -> Actions:
+    """A player's actions as int32 [N]; a ValueError if they are none."""
+    given = np.asarray(actions)
+    is_whole = np.issubdtype(given.dtype, np.integer) and given.shape == (num_envs,)
+    if not is_whole or given.min() < 0 or given.max() >= NUM_ACTIONS:
+        raise ValueError(
+            f"the player gives {given.dtype} {list(given.shape)}, {format_value(given)}, expected "
+            f"integers [{num_envs}] from 0 to {NUM_ACTIONS - 1}"
+        )
+    return given.astype(np.int32)
 
 
 def random_return(game: Game[Any], episodes: int = 1000, seed: int = 0) -> npt.NDArray[np.float32]:

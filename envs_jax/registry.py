@@ -43,11 +43,11 @@ class _Entry(NamedTuple):
 _ENTRIES: dict[str, _Entry] = {}  # by versioned id
 _ALIASES: dict[str, str] = {}  # bare names and aliases: which bare name each means
 _LISTENERS: list[Callable[[str], object]] = []
-_VERSIONED = re.compile(r"^(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>\d+)$")
+_VERSIONED = re.compile(r"(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>0|[1-9][0-9]*)")
 
 
 def register(
-    id: str, factory: Factory | str, aliases: Iterable[str] = (), *, probe: bool = False
+    id: str, factory: Factory, aliases: Iterable[str] = (), *, probe: bool = False
 ) -> None:
     """Add a game: ``make``, Gymnasium, the command line and all tools know it from then on.
 
@@ -62,11 +62,28 @@ def register(
             not one of the benchmark's, listed by :func:`registered_ids` and known to Gymnasium.
 
     Raises:
-        ValueError: The id has no version or is taken, or one of the names is another game's.
+        TypeError: The id is no string, the factory cannot be called, or the aliases are one string.
+        ValueError: The id is not a name of letters and digits with a version, or is taken; or one
+            of the names is another game's.
     """
-    match = _VERSIONED.match(id)
+    if not callable(factory):
+        raise TypeError(
+            f"the factory of {format_value(id)} is {format_value(factory)}, expected the game's "
+            "class, or a function that makes the game"
+        )
+    if isinstance(aliases, str):
+        raise TypeError(f"aliases is {aliases!r}, expected a list: [{aliases!r}]")
+    _add(id, factory, aliases, probe)
+
+
+def _add(id: str, factory: Factory | str, aliases: Iterable[str], probe: bool) -> None:
+    """See :func:`register`; the factory of a game of this package is where its class is."""
+    if not isinstance(id, str):
+        raise TypeError(f"id is {format_value(id)}, expected a string such as 'PairsEasy-v0'")
+    match = _VERSIONED.fullmatch(id)
     if match is None:
-        raise ValueError(f"id {id!r} has no version: write it as 'NameDifficulty-v0'")
+        lacks = "is no name of letters and digits with a" if "-v" in id else "has no"
+        raise ValueError(f"id {id!r} {lacks} version: write it as 'NameDifficulty-v0'")
     if id in _ENTRIES:
         raise ValueError(
             f"id {id!r} is registered already: raise its version or choose another name"
@@ -134,7 +151,7 @@ def resolve_id(id: str) -> str:
         raise TypeError(
             f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'"
         )
-    match = _VERSIONED.match(id)
+    match = _VERSIONED.fullmatch(id)
     name = match["name"] if match else id
     name = _ALIASES.get(name, name)
     newest = _newest()
@@ -188,8 +205,8 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         The game.
 
     Raises:
-        ValueError: Unknown id, size, rules or option value; or a game of one's own that does not
-            keep the contract, see ``check_game``.
+        ValueError: Unknown id, size, rules or option value; or a game of one's own whose factory
+            raises an error, or that does not keep the contract, see ``check_game``.
         TypeError: Unknown option.
 
     Example:
@@ -212,7 +229,17 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         )
     from arcade_torch.envs_jax.checks import check_made
 
-    game = _factory(full_id)(id=full_id, obs_size=obs_size, rules=rules, **options)
+    factory = _factory(full_id)
+    if is_built_in(full_id):
+        return factory(id=full_id, obs_size=obs_size, rules=rules, **options)
+    try:
+        game = factory(id=full_id, obs_size=obs_size, rules=rules, **options)
+    except Exception as error:
+        given = f" with {format_value(options)}" if options else ""
+        raise ValueError(
+            f"the factory of {full_id} failed{given}, {type(error).__name__}: "
+            f"{' '.join(str(error).split())}"
+        ) from error
     check_made(game, full_id, obs_size)
     return game
 
@@ -244,4 +271,4 @@ def option_names(id: str) -> list[str]:
 for _name, _where in (GAMES | PROBES).items():
     for _difficulty in DIFFICULTIES:
         _aliases = [f"NoisyPole{_difficulty}"] if _name == "NoisyCartPole" else []
-        register(f"{_name}{_difficulty}-v0", _where, _aliases, probe=_name in PROBES)
+        _add(f"{_name}{_difficulty}-v0", _where, _aliases, _name in PROBES)

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from arcade_torch.envs_jax.validation import format_value
 
@@ -88,6 +89,20 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
     return jitted
 
 
+def is_key(leaf: Any) -> bool:
+    """Whether an array is one of keys of ``jax.random.key``."""
+    return bool(jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))
+
+
+def as_numpy(tree: Any) -> Any:
+    """A tree of arrays in numpy; keys of ``jax.random.key`` as their bits, uint32 [..., 2]."""
+
+    def convert(leaf: Any) -> Any:
+        return np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf)
+
+    return jax.tree.map(convert, tree)
+
+
 def raw_key(key: Any, ndim: int = 1) -> jax.Array:
     """The random bits of a key, or of many.
 
@@ -108,7 +123,7 @@ def raw_key(key: Any, ndim: int = 1) -> jax.Array:
     """
     if not hasattr(key, "dtype"):
         raise TypeError(f"the random key is {format_value(key)}, {_WANTED}")
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+    if is_key(key):
         kind = str(jax.random.key_impl(key))
         if kind != KEY_KIND:
             raise ValueError(f"the random key is of the kind {kind!r}, {_WANTED}")

@@ -139,6 +139,11 @@ class Recurrence:
         elif self.state_keys:
             self.checks.check_state(tensordict, is_init, self.state_keys)
         rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
+        if x.ndim == 0 or x.shape[:-1].numel() != shape.numel():
+            raise ValueError(
+                f"x is {list(x.shape)} in a batch of shape {list(shape)}, expected one vector a "
+                "step: flatten pictures, and give several agents a batch dimension"
+            )
         x = x.reshape(*rows, x.shape[-1])
         is_init = is_init.reshape(rows)
         if torch.is_autocast_enabled(x.device.type):

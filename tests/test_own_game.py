@@ -9,8 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import torch
 
 import arcade_torch
+from arcade_torch.agents.evaluation import evaluate
+from arcade_torch.agents.presets import preset
+from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax import (
     BatchedGame,
     Game,
@@ -22,7 +26,7 @@ from arcade_torch.envs_jax import (
     registered_ids,
 )
 from arcade_torch.envs_jax.game import Rules
-from arcade_torch.envs_jax.oracles import make_oracle, oracle_return
+from arcade_torch.envs_jax.oracles import make_oracle, oracle_return, random_return
 from arcade_torch.tools import cli
 from arcade_torch.tools.play.recording import scene
 from tests.own_registry import own_registry  # noqa: F401
@@ -190,3 +194,94 @@ def test_a_probe_stays_out_of_the_benchmark_and_of_gymnasium() -> None:
     register("ToyEasy-v0", Toy, probe=True)
     assert "ToyEasy-v0" in probe_ids() and "ToyEasy-v0" not in registered_ids()
     assert "arcade_torch/ToyEasy-v0" not in gymnasium.registry and make("ToyEasy").max_steps == 5
+
+
+@pytest.mark.parametrize("actions", [[4, 7], [[4], [4]], [0.5, 4.0]])
+def test_an_oracle_that_gives_no_actions_is_refused(
+    actions: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Odd(Fire):
+        def act(self, seen: Any, is_init: np.ndarray) -> np.ndarray:
+            return np.asarray(actions)
+
+    register("ToyEasy-v0", Toy)
+    monkeypatch.setattr(Toy, "oracles", {"state": Odd})
+    with pytest.raises(ValueError, match=r"the player gives .*, expected integers \[2\] from 0"):
+        oracle_return(make("ToyEasy"), episodes=2)
+
+
+class Endless(Toy):
+    """Never ends."""
+
+    def step(
+        self, key: jax.Array, state: ToyState, action: jax.Array
+    ) -> tuple[ToyState, Any, Any, Any]:
+        return *super().step(key, state, action)[:3], jnp.bool_(False)
+
+
+def test_whoever_plays_episodes_to_the_end_does_not_wait_for_ever_for_one_that_has_none() -> None:
+    register("EndlessEasy-v0", Endless)
+    message = "EndlessEasy-v0: an episode runs on after 6 steps, and max_steps is 5"
+    with pytest.raises(ValueError, match=message):
+        random_return(make("EndlessEasy"), episodes=2)
+
+    class Still:
+        def initial_state(self, num_envs: int) -> None:
+            return None
+
+        def act(self, obs: Any, state: None) -> Any:
+            return torch.zeros(len(obs), dtype=torch.int64), None, None
+
+    with pytest.raises(ValueError, match=message):
+        evaluate(Still(), env=arcade_torch.make("EndlessEasy", num_envs=2))
+
+
+@pytest.mark.slow
+def test_a_training_says_at_once_that_an_episode_has_no_end() -> None:
+    register("EndlessEasy-v0", Endless)
+    trainer = Trainer(preset("smoke", env="EndlessEasy", observability="full"))
+    with pytest.raises(ValueError, match=r"EndlessEasy-v0: an episode runs on after \d+ steps"):
+        for _ in range(8):
+            trainer.update()
+
+
+def test_a_game_that_counts_in_python_is_refused() -> None:
+    class Counts(Toy):
+        steps = 0
+
+        def step(self, key: jax.Array, state: ToyState, action: jax.Array) -> Any:
+            self.steps += 1
+            return super().step(key, ToyState(state.count * 0 + self.steps), action)
+
+    register("CountsEasy-v0", Counts)
+    with pytest.raises(
+        ValueError, match="CountsEasy-v0: step is another function when it is called again"
+    ):
+        make("CountsEasy")
+
+
+def test_keys_of_the_new_style_and_bfloat16_may_be_part_of_a_state() -> None:
+    class Keyed(Toy):
+        def reset(self, key: jax.Array) -> Any:
+            return {"count": jnp.int32(0), "key": jax.random.key(3), "low": jnp.bfloat16(0.5)}
+
+        def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
+            chance, following = jax.random.split(state["key"])
+            count = state["count"] + 1
+            reward = jax.random.uniform(chance) + state["low"].astype(jnp.float32)
+            after = {"count": count, "key": following, "low": state["low"] + 1}
+            return after, reward, jnp.bool_(False), count >= self.max_steps
+
+        def render(self, state: Any, partial: Any) -> jax.Array:
+            return super().render(ToyState(state["count"]), partial)
+
+    register("KeyedEasy-v0", Keyed)
+    env = arcade_torch.make("KeyedEasy", num_envs=2)
+    env.rollout(2)
+    saved = env.get_state()
+    expected = env.rollout(2, auto_reset=False, tensordict=env.set_state(saved))["next", "reward"]
+    assert len(expected[0].unique()) == 2 and (expected > 2.5).all()
+    another = arcade_torch.make("KeyedEasy", num_envs=2, seed=1)
+    root = another.set_state(saved)
+    given = another.rollout(2, auto_reset=False, tensordict=root)["next", "reward"]
+    assert torch.equal(given, expected)

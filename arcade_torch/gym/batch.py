@@ -15,6 +15,7 @@ import numpy.typing as npt
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.envs_jax.settings import as_numpy, is_key
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory
 from arcade_torch.process import check_process
@@ -88,9 +89,10 @@ class NumpyBatch:
 
     def __getstate__(self) -> dict[str, Any]:
         """The game and everything that determines what comes, as numpy arrays, for ``copy`` and
-        ``pickle``.
+        ``pickle``; keys of ``jax.random.key`` as they are.
         """
-        return {"compiled": self._compiled, "batch": jax.tree.map(np.array, self._batch)}
+        copy = jax.tree.map(lambda x: x if is_key(x) else np.array(x), self._batch)
+        return {"compiled": self._compiled, "batch": copy}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on from there; memory for frames is new."""
@@ -106,7 +108,7 @@ class NumpyBatch:
     @property
     def state(self) -> Any:
         """The game's state, numpy leaves [N, ...]; read only."""
-        return jax.tree.map(np.asarray, self._batch.state)
+        return as_numpy(self._batch.state)
 
     @property
     def info(self) -> Info:

@@ -306,3 +306,13 @@ def test_priorities_are_written_where_torchrl_looks_for_them(burn_in, bootstrap)
     torch.testing.assert_close(
         loss(batch := s.stock())["td_error"], batch["surprise"][:, steps].mean()
     )
+
+
+@pytest.mark.parametrize("kind", [PQNLoss, DQNLoss])
+def test_an_env_that_does_not_tell_truncated_gives_done(kind):
+    batch = stream(4, 12, seed=3).stock()
+    loss = make_loss(toy_network(), kind)
+    expected = loss(batch.clone())["loss"]
+    assert (batch["next", "truncated"] & ~batch["next", "terminated"]).any()
+    given = loss(batch.exclude(("next", "truncated")))["loss"]
+    assert torch.equal(given, expected)

@@ -312,9 +312,8 @@ def test_steps_and_spaces_that_are_not_gymnax_s_are_refused() -> None:
         def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
             return state, 0.0, False
 
-    env = from_jax(Short(), num_envs=2)
     with pytest.raises(TypeError, match="step of Short gives a tuple of 3, expected observation"):
-        env.rollout(2)
+        from_jax(Short(), num_envs=2)
 
     class Spaceless(Plain):
         action_space = None
@@ -328,6 +327,10 @@ def test_steps_and_spaces_that_are_not_gymnax_s_are_refused() -> None:
         def reset(self, key: jax.Array) -> tuple[Any, Any]:
             obs, state = super().reset(key)
             return {"reward": obs}, state
+
+        def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
+            obs, *rest = super().step(key, state, action)
+            return {"reward": obs}, *rest
 
     with pytest.raises(ValueError, match="entry 'reward', which is a key of the env itself"):
         from_jax(Named())

@@ -13,6 +13,7 @@ from arcade_torch.envs_jax import (
     BatchedGame,
     Game,
     check_game,
+    env_keys,
     make,
     probe_ids,
     register,
@@ -137,7 +138,7 @@ WRONG = [
     ),
     (
         {"reset": lambda s, key: (), "step": step_giving()},
-        "reset gives a state without any array, wanted a named tuple of arrays",
+        "reset gives a state without any array",
     ),
     (
         {"reset": lambda s, key: key.no_such},
@@ -146,6 +147,7 @@ WRONG = [
     ({"max_steps": 0}, "max_steps is 0, wanted an int of 1 or more"),
     ({"obs_size": 128.0}, "obs_size is 128.0, wanted an int of 1 or more"),
     ({"return_range": (1.0, 0.0)}, "return_range is (1.0, 0.0), wanted (lowest, highest)"),
+    ({"return_range": ("a", "b")}, "return_range is ('a', 'b'), wanted (lowest, highest)"),
     ({"num_actions": 3}, "num_actions is 3, wanted 5, the same in every game"),
 ]
 
@@ -157,7 +159,7 @@ def test_a_game_that_breaks_the_contract_is_refused_in_one_line(methods, message
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("methods", "message"), WRONG[:1] + WRONG[-8:-7])
+@pytest.mark.parametrize(("methods", "message"), WRONG[:1] + WRONG[-9:-8])
 def test_it_is_refused_when_it_is_first_made_and_when_it_is_batched(methods, message, own_registry):  # noqa: F811
     register("WrongEasy-v0", lambda *, id, obs_size, rules: with_methods(**methods))
     with pytest.raises(ValueError, match=re.escape(message)):
@@ -189,6 +191,31 @@ def test_a_factory_that_does_not_make_what_it_was_asked_for_is_refused(own_regis
         ValueError, match="the factory of NoneEasy-v0 made a NoneType, wanted a Game"
     ):
         make("NoneEasy")
+
+
+@pytest.mark.parametrize("action", [jnp.zeros(1, jnp.int32), 0.5, jnp.bool_(True)])
+def test_an_action_that_would_broadcast_or_be_rounded_is_refused(action):
+    game = Right()
+    state = game.reset(jax.random.PRNGKey(0))
+    with pytest.raises(ValueError, match=r"action is .*, expected integers \[\], one an env"):
+        game.step(jax.random.PRNGKey(0), state, action)
+    batched = BatchedGame(game)
+    batch = batched.init(env_keys(0, 2), jnp.zeros(2, bool))
+    with pytest.raises(ValueError, match=r"action is .*, expected integers \[2\], one an env"):
+        jax.eval_shape(batched.step, batch, jnp.asarray(action).repeat(2)[:, None])
+
+
+def test_methods_that_a_game_has_of_another_base_are_wrapped_too():
+    class Rules:
+        def reset(self, key):
+            assert key.dtype == jnp.uint32
+            return State(jnp.arange(3).sum(), jnp.zeros(3, bool))
+
+    class Mixed(Rules, Right):
+        pass
+
+    with jax.enable_x64(True):
+        assert Mixed().reset(jax.random.key(0)).count.dtype == jnp.int32
 
 
 def test_an_attribute_that_is_missing_is_named():

@@ -100,19 +100,47 @@ def test_registering_needs_a_version_and_a_free_name():
         register("Mine", lambda **_: None)
     with pytest.raises(ValueError, match="registered already"):
         register("CartPoleEasy-v0", lambda **_: None)
+    for id in ("My_Game-v0", "Foo-v007", "FooEasy-v0\n", "FooEasy-v\u0663"):
+        with pytest.raises(ValueError, match="is no name of letters and digits with a version"):
+            register(id, lambda **_: None)
+
+
+def test_what_would_register_something_else_is_refused(monkeypatch):
+    forget_games(monkeypatch)
+    with pytest.raises(TypeError, match="id is 5, expected a string such as 'PairsEasy-v0'"):
+        register(5, lambda **_: None)
+    with pytest.raises(TypeError, match="factory of 'FooEasy-v0' is 'mine:Foo', expected the game"):
+        register("FooEasy-v0", "mine:Foo")
+    with pytest.raises(TypeError, match=r"aliases is 'Bar', expected a list: \['Bar'\]"):
+        register("FooEasy-v0", lambda **_: None, "Bar")
+    assert "FooEasy-v0" not in registered_ids()
+
+
+def test_an_error_of_a_factory_is_told_in_one_line_with_its_options(monkeypatch):
+    def factory(*, id, obs_size, rules, pay=1.0):
+        raise RuntimeError(f"pay is {pay},\nwanted less")
+
+    forget_games(monkeypatch)
+    register("FooEasy-v0", factory)
+    message = r"factory of FooEasy-v0 failed with {'pay': 2}, RuntimeError: pay is 2, wanted less$"
+    with pytest.raises(ValueError, match=message):
+        make("FooEasy", pay=2)
 
 
 @pytest.mark.parametrize("taken", ["MineSweeperEasy", "MineSweeperEasy-v0", "NoisyPoleEasy"])
 def test_no_name_of_a_game_can_be_given_to_another(monkeypatch, taken):
+    def factory(**_):
+        raise NotImplementedError
+
     forget_games(monkeypatch)
     before, meant = registered_ids(), resolve_id(taken)
     with pytest.raises(
         ValueError, match=f"the name '{taken}' belongs to the game '{meant[:-3]}' already"
     ):
-        register("FooEasy-v0", "cartpole:CartPole", ["Foo", taken])
+        register("FooEasy-v0", factory, ["Foo", taken])
     with pytest.raises(ValueError, match="the name 'NoisyPoleEasy' belongs"):
-        register("NoisyPoleEasy-v1", "cartpole:CartPole")
+        register("NoisyPoleEasy-v1", factory)
     assert registered_ids() == before and resolve_id(taken) == meant
     for version in (0, 1):
-        register(f"FooEasy-v{version}", "cartpole:CartPole", ["Foo"])
+        register(f"FooEasy-v{version}", factory, ["Foo"])
     assert resolve_id("Foo") == "FooEasy-v1"

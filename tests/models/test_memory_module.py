@@ -353,3 +353,14 @@ def test_a_write_into_the_output_leaves_the_state_alone(name):
         before = state.clone()
         y.fill_(7.0)
     assert (state == before).all()
+
+
+@pytest.mark.parametrize("sequences", [False, True])
+def test_features_of_more_than_one_vector_a_step_are_refused(sequences):
+    module = MemoryModule(make_memory("gru", 3, 4), in_key="seen", out_key="out")
+    shape = (2, 6) if sequences else (2,)
+    flags = torch.zeros(*shape, 1, dtype=torch.bool)
+    agents = TensorDict({"seen": torch.ones(*shape, 5, 3), "is_init": flags}, shape)
+    message = r"x is \[2, .*5, 3\] in a batch of shape .*, expected one vector a step"
+    with set_recurrent_mode(sequences), pytest.raises(ValueError, match=message):
+        module(agents)
