@@ -145,6 +145,18 @@ def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles:
         report(tmp_path / "s", skip=("saliency",))
 
 
+def test_a_run_without_a_score_is_not_averaged_away(tmp_path: Path, no_oracles: None) -> None:
+    study = small_study(subject="mingru")
+    folder = write_study(tmp_path / "s", study)
+    file = folder.run(study.runs()[0]).path / "eval.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": float("nan")}))
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    page = report(folder.root, skip=parts).read_text()
+    assert "is nan" in page  # in the place of gap and bias
+    assert "since the score of a run is no number" in page
+    assert re.search(r"<td>nan</td><td></td><td class=.many.>nan  0\.520</td>", page)
+
+
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no part 'strips' to skip; parts: saliency, recall"):
         report(tmp_path / "s", skip=("strips",))  # type: ignore[arg-type]

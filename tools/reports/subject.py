@@ -1,5 +1,6 @@
 """The part of a report about its subject: one agent beside every other, and what each costs."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -71,6 +72,8 @@ def _verdict(pair: Pair, tasks: int, subject: str) -> str:
         f"{pair.other_return:.2f}"
     )
     difference = pair.difference
+    if math.isnan(difference.value):
+        return f"{fact}, since the score of a run is no number"
     if not difference.exists:
         return f"{fact}, with a single seed, which says nothing about others"
     if difference.low == difference.high == 0:
