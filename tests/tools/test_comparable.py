@@ -219,7 +219,7 @@ def test_a_folder_that_holds_another_run_than_its_name_says_is_refused(tmp_path:
     other.rename(one)
     (tmp_path / "one").rename(other)
     table = (folder.root / "results.csv").read_bytes()
-    with pytest.raises(ValueError, match="holds a run of .*partial.*, not of .*full") as refusal:
+    with pytest.raises(ValueError, match=r"holds a run of .*partial.*, not of .*full") as refusal:
         report(folder.root)
     assert "\n" not in str(refusal.value)
     assert (folder.root / "results.csv").read_bytes() == table

@@ -12,15 +12,27 @@ from torchrl.modules import LSTMModule
 
 from arcade_torch.tools import (
     Policy,
+    beliefs,
     contamination,
     counterfactual,
     greedy_window,
+    patching,
     recall_density,
     saliency,
 )
 from tests.tools.measures.toys import SIZE, ToyEnv, linear_policy, window
 
 WIDTH = 8
+
+
+class KnownEnv(ToyEnv):
+    """Episodes side by side, with a fact of their states."""
+
+    def facts(self) -> dict[str, Tensor]:
+        """Half of the steps done."""
+        return {"half": self.steps // 2}
+
+
 MEASURES: dict[str, Callable[..., Any]] = {
     "saliency": lambda policy, **names: saliency(policy, window(6).frames, **names),
     "recall density": lambda policy, **names: recall_density(
@@ -32,6 +44,11 @@ MEASURES: dict[str, Callable[..., Any]] = {
     "contamination": lambda policy, **names: contamination(
         policy, ToyEnv([5]), sigmas=(1.0,), delays=(0, 1), starts=1, **names
     ),
+}
+
+OF_STATES: dict[str, Callable[..., Any]] = {
+    "beliefs": lambda policy: beliefs(policy, KnownEnv([5] * 8), episodes=8),
+    "patching": lambda policy: patching(policy, KnownEnv([5] * 8), episodes=8),
 }
 
 
@@ -124,7 +141,7 @@ def with_cell(detaches: bool) -> Any:
 START = {"initial_state": TensorDict({"hidden": torch.zeros(WIDTH)}, [])}
 
 
-@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("measure", [*MEASURES, *OF_STATES])
 @pytest.mark.parametrize(
     "policy",
     [
@@ -139,7 +156,13 @@ def test_a_policy_that_cannot_be_replayed_as_it_acts_is_refused(
 ) -> None:
     torch.manual_seed(0)
     with pytest.raises(ValueError, match=r"^the policy must say of frames in one go what it says"):
-        MEASURES[measure](policy())
+        (MEASURES | OF_STATES)[measure](policy())
+
+
+@pytest.mark.parametrize("measure", OF_STATES)
+def test_a_policy_whose_state_is_in_its_keys_is_measured(measure: str) -> None:
+    torch.manual_seed(0)
+    OF_STATES[measure](sequence(*lstm()))
 
 
 def test_a_memory_that_sees_later_frames_is_refused() -> None:
@@ -162,7 +185,7 @@ def test_a_gradient_that_is_cut_is_no_zero(measure: str) -> None:
     with pytest.raises(ValueError, match=r"^the outputs change with \d of \d frames by which they"):
         MEASURES[measure](with_cell(True), **START)
     with pytest.raises(ValueError, match="no gradient"):
-        MEASURES[measure](sequence(encoder=Frozen(), *lstm()))
+        MEASURES[measure](sequence(*lstm(), encoder=Frozen()))
     counterfactual(with_cell(True), ToyEnv([5, 6]), episodes=2, donors=1, **START)
 
 
