@@ -121,8 +121,22 @@ def find_runs(paths: Sequence[Path]) -> Runs:
         notes.append(
             f"the runs were made with several versions of arcade_torch: {', '.join(versions)}"
         )
-    notes += import_notes(finished)
+    notes += import_notes(finished) + frame_notes(finished)
     return Runs(tuple(finished), notes)
+
+
+def frame_notes(runs: Sequence[Run]) -> list[str]:
+    """A note on games that agents were trained on for different numbers of frames."""
+    frames: dict[str, set[int]] = {}
+    for run in runs:
+        count = run.config.get("total_frames")
+        if isinstance(count, int | float):
+            frames.setdefault(run.game, set()).add(int(count))
+    games = [game for game, counts in frames.items() if len(counts) > 1]
+    if not games:
+        return []
+    counts = ", ".join(f"{count:,}" for count in sorted(frames[games[0]]))
+    return [f"agents were trained for different numbers of frames: {counts} on {listed(games)}"]
 
 
 def import_notes(runs: Sequence[Run]) -> list[str]:
@@ -186,12 +200,13 @@ def check_comparable(runs: Runs) -> None:
 
     Raises:
         ValueError: several versions, rules, sizes or options of a game; a run that stands there
-            twice; seeds of one agent with other settings.
+            twice; seeds, or twins, of one agent with other settings.
     """
     _check_versions(runs)
     _check_rules(runs)
     _check_options(runs)
     _check_seeds(runs)
+    _check_twins(runs)
 
 
 def _check_versions(runs: Runs) -> None:
@@ -230,11 +245,20 @@ def _check_seeds(runs: Runs) -> None:
         for one, other in pairwise(seeds):
             if one.seed == other.seed:
                 raise ValueError(f"{one.path} and {other.path} are the same cell: give one of them")
-            differences = []
-            for name, values in differing_values(one.config, other.config, _CELL | FREE).items():
-                differences.append(f"{name}: {values[0]} and {values[1]}")
-            if differences:
-                raise ValueError(
-                    f"seeds of {agent} on {game} ({twin}) differ in {', '.join(differences)}; give "
-                    "runs with one of them"
-                )
+            _check_settings(f"seeds of {agent} on {game} ({twin})", one, other)
+
+
+def _check_twins(runs: Runs) -> None:
+    """The twins of an agent are told apart by what is hidden, and by nothing else."""
+    first: dict[tuple[str, str], Run] = {}
+    for (agent, game, _), seeds in runs.groups().items():
+        one = first.setdefault((agent, game), seeds[0])
+        _check_settings(f"the twins of {agent} on {game}", one, seeds[0])
+
+
+def _check_settings(what: str, one: Run, other: Run) -> None:
+    differences = []
+    for name, values in differing_values(one.config, other.config, _CELL | FREE).items():
+        differences.append(f"{name}: {values[0]} and {values[1]}")
+    if differences:
+        raise ValueError(f"{what} differ in {', '.join(differences)}; give runs with one of them")

@@ -182,6 +182,49 @@ def test_curves_and_report_refuse_what_the_measures_refuse(tmp_path: Path) -> No
         gap_and_bias(folder.root, draws=10)
 
 
+def test_the_twins_of_an_agent_are_not_compared_where_their_settings_differ(
+    tmp_path: Path,
+) -> None:
+    """Else the gap is that of the settings."""
+    study = small_study()
+    folder = write_study(tmp_path / "s", study)
+    for run in study.runs():
+        if run.memory == "mingru" and run.observability == "partial":
+            change_config(folder.run(run).path, lambda config: config.update(total_frames=4096))
+    with pytest.raises(ValueError, match=r"^the twins of mingru on .* differ in total_frames: "):
+        gap_and_bias(folder.root, draws=10)
+    with pytest.raises(ValueError, match="the twins of mingru"):
+        report(folder.root)
+
+
+def test_agents_that_were_trained_for_other_numbers_of_frames_are_compared_with_a_note(
+    tmp_path: Path,
+) -> None:
+    study = small_study()
+    folder = write_study(tmp_path / "s", study)
+    assert find_runs([folder.root]).notes == []
+    for run in study.runs():
+        if run.memory == "mingru":
+            change_config(folder.run(run).path, lambda config: config.update(total_frames=4096))
+    assert find_runs([folder.root]).notes == [
+        "agents were trained for different numbers of frames: 2,048, 4,096 on MineSweeperEasy"
+    ]
+
+
+def test_a_folder_that_holds_another_run_than_its_name_says_is_refused(tmp_path: Path) -> None:
+    study = small_study()
+    folder = write_study(tmp_path / "s", study)
+    one, other = (folder.run(run).path for run in study.runs()[:2])
+    one.rename(tmp_path / "one")
+    other.rename(one)
+    (tmp_path / "one").rename(other)
+    table = (folder.root / "results.csv").read_bytes()
+    with pytest.raises(ValueError, match=r"holds a run of .*partial.*, not of .*full") as refusal:
+        report(folder.root)
+    assert "\n" not in str(refusal.value)
+    assert (folder.root / "results.csv").read_bytes() == table
+
+
 def test_tables_of_two_studies_are_not_pooled_where_their_settings_differ(tmp_path: Path) -> None:
     for name, seeds, gamma in (("a", [0, 1], 0.9), ("b", [2, 3], 0.99)):
         study = small_study(seeds=seeds, settings={"pqn": {"gamma": gamma}})

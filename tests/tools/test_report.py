@@ -4,6 +4,7 @@ nothing.
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings
 from arcade_torch.tools.runs import Score
-from tests.tools.fabricated import small_study, write_run, write_study
+from tests.tools.fabricated import FINAL, small_study, write_run, write_study
 
 LEVELS = {
     player: Baseline("MineSweeperEasy-v0", player, 256, mean, 0.02, 20.0, 1.0)
@@ -143,6 +144,37 @@ def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles:
         ValueError, match=r"seeds of mingru on MineSweeperEasy \(full\) differ in pqn.gamma"
     ):
         report(tmp_path / "s", skip=("saliency",))
+
+
+def test_a_mean_over_fewer_tasks_is_said_to_be_one(
+    tmp_path: Path, no_oracles: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for twin in ("full", "partial"):
+        monkeypatch.setitem(FINAL, (twin, "gru"), 0.4)
+    games = ["MineSweeperEasy", "CartPoleEasy"]
+    study = small_study(subject="mingru", memories=["gru", "mlp", "mingru"], games=games)
+    folder = write_study(tmp_path / "s", study)
+    for run in study.runs():
+        if (run.game, run.memory, run.observability) == ("CartPoleEasy", "gru", "full"):
+            shutil.rmtree(folder.run(run).path)
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    page = report(folder.root, skip=parts).read_text()
+    assert "gru has no finished run on CartPoleEasy MDP: its means are of the other tasks." in page
+    assert "on the MDP, 1 of 2 tasks, mingru reaches a normalised return of 0.76 and gru" in page
+    # (0.51 + (1 + 0.51) / 2) / 2
+    assert re.search(r"mean of the MDPs</td><td>0\.63[23]</td>", page)
+
+
+def test_a_run_without_a_score_is_not_averaged_away(tmp_path: Path, no_oracles: None) -> None:
+    study = small_study(subject="mingru")
+    folder = write_study(tmp_path / "s", study)
+    file = folder.run(study.runs()[0]).path / "eval.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": float("nan")}))
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    page = report(folder.root, skip=parts).read_text()
+    assert "is nan" in page  # in the place of gap and bias
+    assert "since the score of a run is no number" in page
+    assert re.search(r"<td>nan</td><td></td><td class=.many.>nan  0\.520</td>", page)
 
 
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:

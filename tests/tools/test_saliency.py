@@ -127,4 +127,5 @@ def test_the_encoder_never_sees_more_than_one_chunk() -> None:
         return policy.encode(o)
 
     saliency((counted, policy.remember), frames(9), chunk=4, dtype=F64)
-    assert sizes == [4, 4, 1] * 2  # features, then gradients
+    # the first few alone and together, then features, then gradients
+    assert sizes == [4, 1, 1, 1, 1, *[4, 4, 1] * 2]

@@ -149,7 +149,7 @@ def test_a_study_is_read_from_toml_and_its_settings_become_fields_of_the_config(
         ({"seeds": 0}, "1 to 10000"),
         ({"seeds": [1, 1]}, "names something twice"),
         ({"seeds": [-1]}, "0 or more"),
-        ({"observability": ["some"]}, "full, partial or both"),
+        ({"observability": ["some"]}, "full or partial, or a list of the two"),
         ({"total_frames": 0}, "total_frames"),
         ({"name": "a/b"}, "letters, digits"),
         ({"colour": 1}, "unknown key 'colour'"),

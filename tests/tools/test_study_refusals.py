@@ -49,6 +49,11 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
             {"baseline": "ppo-gru", "algorithms": ["pqn", "ppo"]},
             "this study trains, pqn-mingru, pqn-mlp, ppo-mingru",
         ),
+        (
+            {"sizes": ["1x8"], "settings": {"network_options": {"layers": 2}}},
+            "settings may not hold network_options.layers: in this study the key sizes decides it",
+        ),
+        ({"observability": "both"}, "must be full or partial, or a list of the two"),
         ({"memories": ["mlp", "mlp"]}, "memories names something twice"),
         ({"seeds": [0, 1, 1.0]}, "seeds names something twice"),
         ({"observability": ["full", "full"]}, "observability names something twice"),

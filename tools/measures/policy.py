@@ -39,6 +39,9 @@ from arcade_torch.tools.measures.keys import Channels, Keys, Names
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
 DIFFERENT = 0.1  # of the outputs: more than the rounding of grey levels in a policy
+ROUNDING = 5e-3  # of the outputs: more than batches of other shapes change them, on a card too
+HALF_ROUNDING = 5e-2  # the same in half precision
+FEW = 4  # frames that a policy is tried on before it is measured
 TARGETS = ("q", "logits", "probs", "value")  # outputs that can be asked for by name
 
 
@@ -198,30 +201,70 @@ class Policy:
         return self.forward_frames(frame.unsqueeze(1), actions, flags, state, target=target)
 
     @torch.no_grad()
-    def check_floats(self, frames: Tensor, last_action: Tensor) -> None:
-        """Refuse a TensorDict policy that takes floats for other frames than whole numbers of the
-        same values: gradients and noise need floats.
+    def check(
+        self,
+        frames: Tensor,
+        last_action: Tensor,
+        is_init: Tensor,
+        state: Any,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        """Refuse a policy that a measure would read wrongly: one that says other things when frames
+        are read in one go than when it acts on them one by one, or, of a TensorDict, that takes
+        floats for other frames than whole numbers of the same values.
 
-        ``frames`` [T, ...] and ``last_action`` [T] are those that it saw.
+        ``frames`` [T, ...], ``last_action`` [T] and ``is_init`` [T] are those that it saw from
+        ``state`` on; the first few are tried.
         """
-        if self.step is None or frames.is_floating_point():
-            return
-        target = self.offers[0]
-        first = frames[None, :1]
-        actions = last_action[None, :1]
-        exact = self.forward_frames(first, actions, target=target).double()
-        floats = self.forward_frames(first.float(), actions, target=target).double()
-        if float((exact - floats).norm()) > DIFFERENT * float(exact.norm()):
+        few = slice(0, FEW)
+        actions = last_action[None, few]
+        starts = is_init[None, few].bool()
+        target = resolve(self, "auto")
+        with self.evaluating():
+            features = self.features(frames[few], dtype=dtype)[None]
+            # a policy may change its state in place
+            first = None if state is None else state.clone()
+            alone = [self.features(frame[None], dtype=dtype) for frame in frames[few]]
+            together, _ = self.unroll(features, actions, starts, first, target=target)
+            one_by_one = list[Tensor]()
+            state = None if state is None else state.clone()
+            for t, feature in enumerate(alone):
+                at = slice(t, t + 1)
+                out, state = self.unroll(
+                    feature[None], actions[:, at], starts[:, at], state, target=target
+                )
+                one_by_one.append(out)
+        rounding = ROUNDING if together.dtype.itemsize > 2 else HALF_ROUNDING
+        if not _are_near(torch.cat(one_by_one, 1), together, rounding):
             raise ValueError(
-                f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got other "
-                "outputs: convert frames of any type alike (frames.float() / 255)"
+                "the policy must say of frames in one go what it says of them one by one: in "
+                "evaluation mode nothing may be drawn at random, entries of a batch may not mix, "
+                "no later frame may count, and the state must be what is handed over and given "
+                "back, no attribute of a module"
             )
+        if self.step is not None and not frames.is_floating_point():
+            frame = frames[None, :1]
+            exact = self.forward_frames(frame, actions[:, :1], target=target)
+            floats = self.forward_frames(frame.float(), actions[:, :1], target=target)
+            if not _are_near(floats, exact, DIFFERENT):
+                raise ValueError(
+                    f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got "
+                    "other outputs: convert frames of any type alike (frames.float() / 255)"
+                )
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:
         """Evaluation mode for a while; the modes before come back."""
         with evaluating(nn.Identity() if self.module is None else self.module):
             yield
+
+
+def _are_near(values: Tensor, others: Tensor, share: float) -> bool:
+    """Whether outputs differ by no more than a share of their size; where one is no number, the
+    other is none.
+    """
+    a, b = values.double().nan_to_num(), others.double().nan_to_num()
+    return float((a - b).norm()) <= share * float(b.norm())
 
 
 def as_policy(model: Any, **names: Unpack[Names]) -> Policy:

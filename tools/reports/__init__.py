@@ -1,5 +1,6 @@
 """Build the report of a study: numbers first, then one page that holds everything."""
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -295,14 +296,17 @@ def _learning(
 
 
 def _final_row(agent: str, returns: Sequence[float], levels: Mapping[str, float]) -> dict[str, Any]:
-    """The final returns of one agent on one task, for the table."""
+    """The final returns of one agent on one task, for the table; without a mean if one of them is
+    no number.
+    """
     summary = pooled(returns)
-    mean = float(summary.mean)
+    missing = 0.0 if all(map(math.isfinite, returns)) else math.nan
+    mean = float(summary.mean) + missing
     return {
         "agent": agent,
         "mean": mean,
-        "low": float(summary.low),
-        "high": float(summary.high),
+        "low": float(summary.low) + missing,
+        "high": float(summary.high) + missing,
         "way": way(mean, levels),
         "seeds": "  ".join(f"{value:.3f}" for value in returns),
     }

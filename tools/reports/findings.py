@@ -2,6 +2,7 @@
 its interval excludes zero.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 from arcade_torch.tools.figures.style import TWIN_NAMES
@@ -116,7 +117,7 @@ def way(value: float, levels: Mapping[str, float]) -> float | None:
     """The share of the way from the random policy to the oracle; None where that is not known."""
     low = levels.get("random")
     high = levels.get("state")
-    if low is None or high is None or high == low:
+    if low is None or high is None or high == low or math.isnan(value):
         return None
     return (value - low) / (high - low)
 

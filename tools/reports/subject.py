@@ -1,16 +1,19 @@
 """The part of a report about its subject: one agent beside every other, and what each costs."""
 
-from collections.abc import Sequence
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.tools.comparable import Runs
+from arcade_torch.tools.comparable import Runs, listed
 from arcade_torch.tools.errors import one_line
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import ImportRefusedError, import_again
 from arcade_torch.tools.measures.bootstrap import measured_coverage
-from arcade_torch.tools.measures.gap_bias.pairs import Pair, pair_rows, pairs
+from arcade_torch.tools.measures.gap_bias.measure import TWINS
+from arcade_torch.tools.measures.gap_bias.pairs import Pair, Task, pair_rows, pairs
 from arcade_torch.tools.runs import Run
 from arcade_torch.tools.studies.folder import StudyFolder
 
@@ -26,7 +29,13 @@ def subject_section(
     """Sentences and tables on one agent against each of the others; the differences are written as
     CSV too. The sentences on Gap and Bias compare it with ``rival`` already.
     """
-    table = pairs(runs.scores(metric), subject)
+    scores = runs.scores(metric)
+    table = pairs(scores, subject)
+    tasks = dict.fromkeys(
+        (score.game, score.observability)
+        for score in scores
+        if score.agent == subject and score.observability in TWINS
+    )
     write_csv(folder.analysis / f"differences_{metric}.csv", pair_rows(table, subject))
     others = list(dict.fromkeys(pair.other for pair in table))
     rows: dict[tuple[str, str], dict[str, Any]] = {}
@@ -37,29 +46,67 @@ def subject_section(
         name = f"{pair.game} {TWIN_NAMES[pair.twin]}" if pair.game else MEANS[pair.twin]
         row = {"name": name, "is_mean": not pair.game, "mine": pair.subject_return, "pairs": {}}
         rows.setdefault((pair.game, pair.twin), row)["pairs"][pair.other] = pair
+    # an agent that lacks a task is compared on the others: the mean in front is over all
+    for (game, twin), row in rows.items():
+        if not game:
+            mine = [pair.subject_return for pair in _first_of_tasks(table, twin)]
+            row["mine"] = sum(mine) / len(mine)
     sentences = list[str]()
     for other in others:
         if other != rival:
-            sentences.append(subject_sentence(table, subject, other))
+            sentences.append(subject_sentence(table, subject, other, tasks))
     cost_rows, trouble = costs(runs)
     return {
         "name": subject,
         "others": others,
         "rows": list(rows.values()),
         "sentences": sentences,
+        "shorter": _shorter_means(table, others, tasks),
         "costs": cost_rows,
         "trouble": trouble,
     }
 
 
-def subject_sentence(table: Sequence[Pair], subject: str, other: str) -> str:
-    """What one agent earns against another where something has to be remembered, and where not."""
+def _first_of_tasks(table: Sequence[Pair], twin: str) -> list[Pair]:
+    """One pair of every task of a twin, of both where ``twin`` is empty."""
+    first: dict[tuple[str, str], Pair] = {}
+    for pair in table:
+        if pair.game and twin in ("", pair.twin):
+            first.setdefault((pair.game, pair.twin), pair)
+    return list(first.values())
+
+
+def _shorter_means(
+    table: Sequence[Pair], others: Sequence[str], tasks: Iterable[Task]
+) -> list[str]:
+    """Sentences on the agents whose means are over fewer tasks than the subject has."""
+    sentences = []
+    for other in others:
+        present = {(pair.game, pair.twin) for pair in table if pair.other == other}
+        missing = [
+            f"{game} {TWIN_NAMES[twin]}" for game, twin in tasks if (game, twin) not in present
+        ]
+        if missing:
+            sentences.append(
+                f"{other} has no finished run on {listed(missing)}: its means are of the other "
+                "tasks."
+            )
+    return sentences
+
+
+def subject_sentence(table: Sequence[Pair], subject: str, other: str, known: Iterable[Task]) -> str:
+    """What one agent earns against another where something has to be remembered, and where not;
+    ``known`` are the tasks of the one.
+    """
+    counts = Counter(twin for _, twin in known)
     clauses = []
     for twin, place in (("partial", "On the POMDP"), ("full", "on the MDP")):
         of_twin = [pair for pair in table if (pair.twin, pair.other) == (twin, other)]
         if of_twin:
             *tasks, mean = of_twin
-            clauses.append(f"{place} {_verdict(mean, len(tasks), subject)}")
+            share = f", {len(tasks)} of {counts[twin]} tasks,"
+            share = share if len(tasks) < counts[twin] else ""
+            clauses.append(f"{place}{share} {_verdict(mean, len(tasks), subject)}")
     sentence = "; ".join(clauses)
     return f"{sentence[0].upper()}{sentence[1:]}." if sentence else ""
 
@@ -71,6 +118,8 @@ def _verdict(pair: Pair, tasks: int, subject: str) -> str:
         f"{pair.other_return:.2f}"
     )
     difference = pair.difference
+    if math.isnan(difference.value):
+        return f"{fact}, since the score of a run is no number"
     if not difference.exists:
         return f"{fact}, with a single seed, which says nothing about others"
     if difference.low == difference.high == 0:

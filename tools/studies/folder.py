@@ -27,6 +27,7 @@ from arcade_torch.tools.comparable import FREE
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import imports_of
 from arcade_torch.tools.machine import versions
+from arcade_torch.tools.names import bare_name, preset_size
 from arcade_torch.tools.options import command_line
 from arcade_torch.tools.runs import Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
@@ -181,7 +182,7 @@ class StudyFolder:
 
     def write_results(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
         """Write ``results.csv`` and ``timings.csv`` from the run folders; returns the rows of both,
-        joined.
+        joined. A ``ValueError`` names a folder that holds another run than its name says.
 
         ``finished`` keeps the rows of finished runs from one call to the next: they are not read
         again.
@@ -207,6 +208,7 @@ class StudyFolder:
             row[name] = getattr(spec, name)
         final = run.final
         if final:
+            _check_cell(run, spec)
             row |= _final_columns(final)
             row["status"] = "finished"
             row["error"] = ""
@@ -221,6 +223,22 @@ class StudyFolder:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
         return ""
+
+
+def _check_cell(run: Run, spec: RunSpec) -> None:
+    """Refuse the folder of a run that holds another one than its name says."""
+    described(run)
+    key = run.key
+    held = [bare_name(run.game), run.twin, key.memory, key.algorithm, run.seed]
+    named = [bare_name(spec.game), spec.observability, spec.memory, spec.algorithm, spec.seed]
+    if spec.size:
+        held.append(key.size or preset_size(key.network))
+        named.append(spec.size)
+    if held != named:
+        raise ValueError(
+            f"{run.path} holds a run of {', '.join(map(str, held))}, not of "
+            f"{', '.join(map(str, named))}: give it the name of its own run, or delete it"
+        )
 
 
 def _final_columns(final: Mapping[str, Any]) -> Row:

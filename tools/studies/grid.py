@@ -35,7 +35,7 @@ _AXES: dict[str, Any] = {
     "games": _text(_FOLDERS, _FOLDER),
     "memories": _text(_FOLDERS, _FOLDER),
     "algorithms": _text(_FOLDERS, _FOLDER),
-    "observability": _text("full, partial or both", "full|partial"),
+    "observability": _text("full or partial, or a list of the two", "full|partial"),
     "seeds": Annotated[int, Range("0 or more and below 2**32", lambda seed: 0 <= seed < 2**32)],
     "sizes": _text("layers x width, such as '2x512'", r"[1-9]\d{0,8}x[1-9]\d{0,8}"),
 }
@@ -126,6 +126,12 @@ class Study:
                 )
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)
+        for name in ("layers", "hidden_size"):
+            if self.sizes and name in self.settings.get("network_options", {}):
+                raise ValueError(
+                    f"settings may not hold network_options.{name}: in this study the key sizes "
+                    "decides it; leave out one of the two"
+                )
         if self.total_frames is not None:
             object.__setattr__(
                 self, "total_frames", coerce("total_frames", self.total_frames, _FRAMES)

@@ -55,9 +55,11 @@ def test_an_exchange_changes_nothing_of_the_episodes_themselves() -> None:
     def remember(
         features: Tensor, last_action: Tensor, is_init: Tensor, state: Tensor
     ) -> tuple[Tensor, Tensor]:
-        state += torch.where(is_init[:, :1], -state, 1)  # counts steps, in place
-        action = (state[:, 0] % 3).long()
-        return torch.nn.functional.one_hot(action, 3).float().unsqueeze(1), state
+        outputs = []
+        for begins in is_init.unbind(1):
+            state += torch.where(begins[:, None], -state, 1)  # counts steps, in place
+            outputs.append(torch.nn.functional.one_hot((state[:, 0] % 3).long(), 3).float())
+        return torch.stack(outputs, 1), state
 
     counter = Policy(
         lambda frames: frames.float().flatten(1), remember, lambda size: torch.zeros(size, 1)

@@ -13,11 +13,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.tools.measures.beliefs.recording import check_seen, first_row
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
-from arcade_torch.tools.measures.policy import Progress, policy_of
+from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
 
 Ints = NDArray[np.int64]
@@ -133,7 +135,10 @@ def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator)
     steps = list[Ints]()
     obs = env.reset()
     state = agent.initial_state(size)
+    seen = list[TensorDictBase]()
     while playing.any() and len(steps) < max_steps:
+        if len(seen) < FEW:
+            seen.append(first_row(obs))
         rows = playing.nonzero().flatten().numpy()
         donors = draw_donors(rows, size, rng)
         # before the decision itself: acting may change the state in place
@@ -149,6 +154,7 @@ def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator)
         steps.append(actions)
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+    check_seen(agent, seen)
     return np.stack(steps, axis=-1)
 
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
-from arcade_torch.tools.measures.policy import Progress, policy_of
+from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import held_out
 
 Ints = NDArray[np.int64]
@@ -73,7 +74,10 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
     steps = list[tuple[Floats, Floats, dict[str, NDArray[Any]]]]()
     obs = env.reset()
     state = agent.initial_state(size)
+    seen = list[TensorDictBase]()
     while playing.any() and len(steps) < max_steps:
+        if len(seen) < FEW:
+            seen.append(first_row(obs))
         facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
         features = policy.features(obs["pixels"])
         action, _, state = agent.act(obs, state)
@@ -81,6 +85,7 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
         lengths += playing.numpy()
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+    check_seen(agent, seen)
     states, all_features, all_facts = zip(*steps, strict=True)
     if not all_facts[0]:
         raise ValueError(f"{NO_FACTS}: give its class a method facts, see Game.facts")
@@ -88,6 +93,24 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
     for name in all_facts[0]:
         by_name[name] = np.stack([facts[name] for facts in all_facts], axis=1)
     return Recording(np.stack(states, 1), np.stack(all_features, 1), by_name, lengths)
+
+
+def first_row(obs: TensorDictBase) -> TensorDictBase:
+    """A copy of what a policy reads of the first env of a batch, [1]."""
+    return obs.select("pixels", "last_action", "is_init")[:1].clone()
+
+
+def check_seen(agent: Any, seen: Sequence[TensorDictBase]) -> None:
+    """Refuse an agent that does not say the same again of the first frames of an episode: its state
+    is not all that it remembers.
+    """
+    steps = torch.cat(list(seen))
+    policy_of(agent).check(
+        steps["pixels"],
+        steps["last_action"],
+        steps["is_init"].reshape(-1),
+        agent.initial_state(1),
+    )
 
 
 def flat_state(state: Any, size: int) -> Floats:

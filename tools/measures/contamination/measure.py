@@ -243,7 +243,7 @@ class Probe:
 
     def _disturb(self, number: int, window: Window) -> None:
         """Disturb a trajectory, replay its versions, and compare their decisions."""
-        self.policy.check_floats(window.frames, window.last_action)
+        self.policy.check(window.frames, window.last_action, window.is_init, window.state)
         clean = self.policy.features(window.frames)
         most = self.starts - len(self.points)
         versions = self.disturbance.versions(self.policy, window, clean, most, self.rng)

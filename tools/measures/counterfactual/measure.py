@@ -225,7 +225,7 @@ class Track:
     @classmethod
     def of(cls, policy: Policy, window: Window) -> "Track":
         """Encode a window."""
-        policy.check_floats(window.frames, window.last_action)
+        policy.check(window.frames, window.last_action, window.is_init, window.state)
         return cls(
             features=policy.features(window.frames),
             frame_ids=_frame_ids(window.frames),

@@ -30,6 +30,7 @@ from arcade_torch.tools.measures.policy import (
     outputs,
     resolve,
 )
+from arcade_torch.tools.measures.saliency.cuts import outside_inference, refuse_cuts
 from arcade_torch.tools.measures.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
@@ -90,24 +91,32 @@ def saliency(
         **names: keywords of `as_policy`.
 
     Raises:
-        ValueError: a shape does not fit, n is out of range, or an option has an unknown value.
+        ValueError: a shape does not fit, n is out of range, an option has an unknown value, or the
+            policy says other things when it acts frame by frame, or cuts its gradients.
         TypeError: ``model`` has none of the forms above.
     """
     policy = as_policy(model, **names)
     _check_options(reduce, norm, chunk, resolve(policy, target))
-    steps = _index(n, frames) + 1
-    actions = _last_actions(policy, last_action, frames)
-    starts = _starts(is_init, frames)
-    policy.check_floats(frames, actions)
-    with policy.evaluating(), torch.enable_grad():
-        features = policy.features(frames[:steps], chunk, dtype).clone().requires_grad_()
-        before = policy.initial_state(1) if state is None else state
-        out, _ = policy.remember(
-            features[None], actions[None, :steps], starts[None, :steps], before
-        )
-        values = outputs(policy, target)(out[:, -1])[0]
+    # what is computed in inference mode has no gradient, in silence
+    with torch.inference_mode(False), torch.enable_grad(), policy.evaluating():
+        steps = _index(n, frames) + 1
+        actions = outside_inference(_last_actions(policy, last_action, frames)[:steps])
+        starts = outside_inference(_starts(is_init, frames)[:steps])
+        before = policy.initial_state(1) if state is None else outside_inference(state)
+        frames = outside_inference(frames[:steps])
+        policy.check(frames, actions, starts, before, dtype)
+
+        def decide(features: Tensor) -> Tensor:
+            since = None if before is None else before.clone()
+            out, _ = policy.remember(features[None], actions[None], starts[None], since)
+            return outputs(policy, target)(out[:, -1])[0]
+
+        features = policy.features(frames, chunk, dtype).clone().requires_grad_()
+        values = decide(features)
         jacobian = _jacobian(values, features, reduce)
-        maps, sums = _frame_norms(policy, frames[:steps], jacobian, norm, chunk, dtype)
+        if reduce == "per_action":  # a sum over actions may rightly not change
+            refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
+        maps, sums = _frame_norms(policy, frames, jacobian, norm, chunk, dtype)
     return Saliency(
         maps=maps.float().cpu().numpy(),
         per_frame=sums.double().cpu().numpy(),
@@ -162,15 +171,17 @@ def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
     """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E]."""
     rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
+    return torch.stack([_gradient(values, leaf, row) for row in rows])
+
+
+def _gradient(values: Tensor, leaf: Tensor, row: Tensor) -> Tensor:
+    """The product of ``row`` with the Jacobian of the values by the leaf; zeros where they do not
+    hang together.
+    """
     if not values.requires_grad:
-        return leaf.new_zeros(len(rows), *leaf.shape)
-    gradients = []
-    for row in rows:
-        (gradient,) = torch.autograd.grad(
-            values, leaf, row, retain_graph=True, materialize_grads=True
-        )
-        gradients.append(gradient)
-    return torch.stack(gradients)
+        return torch.zeros_like(leaf)
+    (gradient,) = torch.autograd.grad(values, leaf, row, retain_graph=True, materialize_grads=True)
+    return gradient
 
 
 def _frame_norms(
@@ -187,19 +198,20 @@ def _frame_norms(
         shape.pop(axes[0])
     per_pixel = jacobian.new_zeros(shape, dtype=dtype)
     per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
-    reached = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
-    for index in reached.split(chunk):
+    needed = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
+    for index in needed.split(chunk):
         part = frames[index].to(dtype).requires_grad_()
         features = policy.encode(part)
+        reached = torch.zeros_like(index, dtype=torch.bool)
         for row in jacobian[:, index].to(features):
-            (gradient,) = torch.autograd.grad(
-                features, part, row, retain_graph=True, materialize_grads=True
-            )
+            gradient = _gradient(features, part, row)
+            reached |= gradient.ne(0).flatten(1).any(1)
             pixels = gradient.abs() if norm == "l1" else gradient.square()
             pixels = pixels.sum(axes) if axes else pixels
             total = pixels.flatten(1).sum(1)
             per_frame[index] += total.sqrt() if norm == "l2" else total
             per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
+        refuse_cuts(policy.encode, part, reached)
     return per_pixel, per_frame
 
 
