@@ -95,6 +95,12 @@ def test_in_the_small_preset_navigator_alone_has_limits_that_bootstrap():
     assert preset("small", env="NavigatorEasy", ppo={"entropy_coeff": 0.1}).ppo.entropy_coeff == 0.1
 
 
+def test_in_the_small_preset_breakout_alone_has_a_bonus_that_begins_low():
+    for game in GAMES:
+        coefficient = preset("small", env=f"{game}Easy").ppo.entropy_coeff
+        assert (coefficient == 0.02) == (game == "Breakout")
+
+
 @pytest.mark.parametrize("name", preset_names())
 def test_every_preset_survives_json(name):
     c = preset(name)
