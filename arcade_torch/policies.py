@@ -166,8 +166,14 @@ def random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor
     if not isinstance(spec, Bounded):
         return torch.randn(shape, generator=generator, device=device, dtype=spec.dtype)
     low: torch.Tensor = spec.space.low
-    share = torch.rand(shape, generator=generator, device=device, dtype=spec.dtype)
-    action: torch.Tensor = low + share * (spec.space.high - low)
+    distance = spec.space.high - low
+    is_float = spec.dtype.is_floating_point
+    share = torch.rand(
+        shape, generator=generator, device=device, dtype=spec.dtype if is_float else torch.float64
+    )
+    action: torch.Tensor = (
+        low + share * distance if is_float else low + (share * (distance + 1)).to(spec.dtype)
+    )
     return action
 
 

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch import validation
-from arcade_torch.envs_jax.tracing import ContractError, check_same, traced
+from arcade_torch.envs_jax.settings import is_key
+from arcade_torch.envs_jax.tracing import ContractError, check_same, leaves, traced
 
 # names that params and envs of the suites have for a time limit
 _LIMITS = ("max_steps_in_episode", "max_timesteps", "max_steps")
@@ -102,6 +103,12 @@ class Suite:
         count = jax.ShapeDtypeStruct((), jnp.int32)
         following, after, _ = traced(name, "step", self.step, key, state, action, count)
         check_same(name, "observation", obs, following)
+        for place, leaf in leaves(obs, "observation").items():
+            if is_key(leaf) or leaf.dtype == jnp.bfloat16:
+                raise TypeError(
+                    f"{name}: reset shows {place} as {leaf.dtype}, which torch does not share: "
+                    "give float32, or jax.random.key_data of a key"
+                )
         check_same(name, "state", state, after)
 
     def _number(self, value: Any) -> jax.Array:

@@ -91,6 +91,8 @@ def _check_spec(spec: TensorSpec, num_envs: int) -> None:
             f"action_spec is of {spec.dtype}, expected integers"
             + ("" if is_categorical else " or floats")
         )
+    if isinstance(spec, Unbounded) and spec.dtype in _INTEGERS:
+        raise TypeError("action_spec is of integers without bounds: pass Bounded(low, high, ...)")
     if spec.shape[:1] != (num_envs,):
         raise ValueError(f"action_spec has shape {list(spec.shape)}, expected [{num_envs}, ...]")
     if is_categorical and len(spec.shape) != 1:

@@ -161,7 +161,7 @@ def _check_numbers(game: Game[Any], state: Any, reward: Any, step: int) -> None:
             raise ValueError(f"{game.id}: step {step} gives state entry {name} as nan")
 
 
-def check_ends(game: Game[Any], steps: int) -> None:
+def check_ends(game: Any, steps: int) -> None:
     """Raise ValueError if an episode still runs after so many steps: one more than ``max_steps``,
     for by the reference rules some games end a step late.
     """

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from torchrl.data import Binary, Bounded, Categorical, MultiCategorical
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, Unbounded
 
 from arcade_torch import from_jax
+from arcade_torch.policies import random_actions
 from arcade_torch.suite import Suite
 
 N = 2
@@ -121,6 +122,13 @@ WRONG = {
         "Own: reset is another function when it is called again, .* draw random numbers from the "
         "key",
     ),
+    "bfloat16 to see": (
+        env_with(
+            reset=lambda self, key: (jnp.zeros(2, jnp.bfloat16), 0),
+            step=giving(lambda s: jnp.zeros(2, jnp.bfloat16), goes_on, pays, ends),
+        ),
+        "Own: reset shows observation as bfloat16, which torch does not share",
+    ),
     "nothing to see": (
         env_with(reset=lambda self, key: ({}, 0), step=giving(lambda s: {}, goes_on, pays, ends)),
         "Own: reset gives an observation without any array",
@@ -145,6 +153,7 @@ def test_an_env_that_would_be_stepped_wrongly_is_refused(name: str) -> None:
         ({"obs_key": 7}, "obs_key is 7, expected a string"),
         ({"action_spec": Categorical(3, shape=(N, 2))}, r"several choices at once are Bounded\(0"),
         ({"action_spec": MultiCategorical((3, 4), shape=(N, 2))}, "action_spec is a MultiCateg"),
+        ({"action_spec": Unbounded((N, 2), dtype=torch.int64)}, "is of integers without bounds"),
         ({"action_spec": Binary(4, shape=(N, 4))}, "action_spec is a Binary, expected"),
         ({"action_spec": Categorical(2, shape=(N,), dtype=torch.bool)}, "is of torch.bool, expect"),
     ],
@@ -202,6 +211,9 @@ def test_integers_of_several_choices_arrive_as_integers_and_are_checked() -> Non
 
     env = from_jax(Table(), num_envs=N)
     assert env.action_spec.dtype is torch.int64
+    generator = torch.Generator().manual_seed(0)
+    drawn = [random_actions(env.action_spec, generator) for _ in range(50)]
+    assert torch.stack(drawn).unique().tolist() == [0, 1, 2, 3]
     root = env.reset()
     step = env.step(root.set("action", torch.tensor([[0, 3], [2, 1]])))
     assert step["next", "observation"].tolist() == [[0, 3], [2, 1]]
