@@ -104,7 +104,7 @@ def check_seen(agent: Any, seen: Sequence[TensorDictBase]) -> None:
     """Refuse an agent that does not say the same again of the first frames of an episode: its state
     is not all that it remembers.
     """
-    steps: TensorDictBase = torch.cat(list(seen))  # type: ignore[arg-type,assignment]
+    steps: TensorDictBase = torch.cat(list(seen))
     policy_of(agent).check(
         steps["pixels"],
         steps["last_action"],

@@ -115,13 +115,9 @@ def saliency(
         features = policy.features(frames, chunk, dtype).clone().requires_grad_()
         values, jacobian = _decided(decide, features, reduce)
         maps, sums = _frame_norms(policy, frames, jacobian, norm, chunk, dtype)
-    return Saliency(
-        maps=maps.float().cpu().numpy(),
-        per_frame=sums.double().cpu().numpy(),
-        output=values.detach().float().cpu().numpy(),
-        n=steps - 1,
-        target=resolve(policy, target),
-    )
+    gradients = maps.float().cpu().numpy(), sums.double().cpu().numpy()
+    explained = values.detach().float().cpu().numpy()
+    return Saliency(*gradients, output=explained, n=steps - 1, target=resolve(policy, target))
 
 
 def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
