@@ -256,9 +256,9 @@ def _check_twins(runs: Runs) -> None:
         _check_settings(f"the twins of {agent} on {game}", one, seeds[0])
 
 
-def _check_settings(what: str, one: Run, other: Run) -> None:
+def _check_settings(pair: str, one: Run, other: Run) -> None:
     differences = []
     for name, values in differing_values(one.config, other.config, _CELL | FREE).items():
         differences.append(f"{name}: {values[0]} and {values[1]}")
     if differences:
-        raise ValueError(f"{what} differ in {', '.join(differences)}; give runs with one of them")
+        raise ValueError(f"{pair} differ in {', '.join(differences)}; give runs with one of them")

@@ -161,6 +161,7 @@ def test_a_mean_over_fewer_tasks_is_said_to_be_one(
     page = report(folder.root, skip=parts).read_text()
     assert "gru has no finished run on CartPoleEasy MDP: its means are of the other tasks." in page
     assert "on the MDP, 1 of 2 tasks, mingru reaches a normalised return of 0.76 and gru" in page
+    assert page.count("over the 1 of 2 games that all agents have.") == 6  # gap, POMDP, bias
     # (0.51 + (1 + 0.51) / 2) / 2
     assert re.search(r"mean of the MDPs</td><td>0\.63[23]</td>", page)
 

@@ -28,9 +28,16 @@ def score_sentences(table: GapBias, subject: str) -> list[str]:
 
 
 def score_sentence(table: GapBias, name: str, agent: str) -> str:
-    """One of `SENTENCES` about an agent with memory, and how sure it is."""
+    """One of `SENTENCES` about an agent with memory, how sure it is, and of which tasks if some
+    agent lacks one.
+    """
     memory_free = table.row(table.baselines[agent] or table.baseline)
-    return SENTENCES[name](table, memory_free, table.row(agent))
+    sentence = SENTENCES[name](table, memory_free, table.row(agent))
+    if table.dropped:
+        tasks = len(table.tasks)
+        total = tasks + len(table.dropped)
+        sentence = f"{sentence[:-1]}, over the {tasks} of {total} games that all agents have."
+    return sentence
 
 
 def gap_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:

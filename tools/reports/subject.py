@@ -94,11 +94,13 @@ def _shorter_means(
     return sentences
 
 
-def subject_sentence(table: Sequence[Pair], subject: str, other: str, known: Iterable[Task]) -> str:
+def subject_sentence(
+    table: Sequence[Pair], subject: str, other: str, of_subject: Iterable[Task]
+) -> str:
     """What one agent earns against another where something has to be remembered, and where not;
-    ``known`` are the tasks of the one.
+    ``of_subject`` are the tasks of the one.
     """
-    counts = Counter(twin for _, twin in known)
+    counts = Counter(twin for _, twin in of_subject)
     clauses = []
     for twin, place in (("partial", "On the POMDP"), ("full", "on the MDP")):
         of_twin = [pair for pair in table if (pair.twin, pair.other) == (twin, other)]

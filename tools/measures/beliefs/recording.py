@@ -104,7 +104,7 @@ def check_seen(agent: Any, seen: Sequence[TensorDictBase]) -> None:
     """Refuse an agent that does not say the same again of the first frames of an episode: its state
     is not all that it remembers.
     """
-    steps = torch.cat(list(seen))
+    steps: TensorDictBase = torch.cat(list(seen))
     policy_of(agent).check(
         steps["pixels"],
         steps["last_action"],

@@ -11,6 +11,7 @@ Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation 
 sum over actions instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, Unpack, get_args
 
@@ -97,9 +98,9 @@ def saliency(
     """
     policy = as_policy(model, **names)
     _check_options(reduce, norm, chunk, resolve(policy, target))
+    steps = _index(n, frames) + 1
     # what is computed in inference mode has no gradient, in silence
     with torch.inference_mode(False), torch.enable_grad(), policy.evaluating():
-        steps = _index(n, frames) + 1
         actions = outside_inference(_last_actions(policy, last_action, frames)[:steps])
         starts = outside_inference(_starts(is_init, frames)[:steps])
         before = policy.initial_state(1) if state is None else outside_inference(state)
@@ -112,18 +113,11 @@ def saliency(
             return outputs(policy, target)(out[:, -1])[0]
 
         features = policy.features(frames, chunk, dtype).clone().requires_grad_()
-        values = decide(features)
-        jacobian = _jacobian(values, features, reduce)
-        if reduce == "per_action":  # a sum over actions may rightly not change
-            refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
+        values, jacobian = _decided(decide, features, reduce)
         maps, sums = _frame_norms(policy, frames, jacobian, norm, chunk, dtype)
-    return Saliency(
-        maps=maps.float().cpu().numpy(),
-        per_frame=sums.double().cpu().numpy(),
-        output=values.detach().float().cpu().numpy(),
-        n=steps - 1,
-        target=resolve(policy, target),
-    )
+    gradients = maps.float().cpu().numpy(), sums.double().cpu().numpy()
+    explained = values.detach().float().cpu().numpy()
+    return Saliency(*gradients, output=explained, n=steps - 1, target=resolve(policy, target))
 
 
 def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
@@ -166,6 +160,17 @@ def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
     if is_init is None:
         return torch.zeros(frames.shape[0], dtype=torch.bool, device=frames.device)
     return _one_a_frame("is_init", is_init, frames).bool()
+
+
+def _decided(
+    decide: Callable[[Tensor], Tensor], features: Tensor, reduce: Reduce
+) -> tuple[Tensor, Tensor]:
+    """The outputs [A] of a decision, and their Jacobian [K, T, E] by the features [T, E]."""
+    values = decide(features)
+    jacobian = _jacobian(values, features, reduce)
+    if reduce == "per_action":  # a sum over actions may rightly not change
+        refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
+    return values, jacobian
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
