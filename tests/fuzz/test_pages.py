@@ -156,8 +156,6 @@ def test_a_hostile_word_in_every_place_stays_a_word(tmp_path: Path, evil: str) -
     for run in small_study().runs():
         config = study.run(run).path / "config.json"
         values = json.loads(config.read_text())
-        if run.memory != "mlp":
-            values["config"]["memory"] = evil
         values["config"] |= {evil: evil, "network_options": {evil: evil}, "device": evil}
         values["versions"] = {evil: evil}
         config.write_text(json.dumps(values))
@@ -176,6 +174,16 @@ def test_a_hostile_word_in_every_place_stays_a_word(tmp_path: Path, evil: str) -
     assert page.read_text(encoding="utf-8").count("alert(1)") > 8
     table = (root / "results.csv").read_text()
     assert table.count("\n") == 1 + len(small_study().runs())
+
+
+def test_a_run_of_a_hostile_memory_is_not_the_one_of_its_folder(tmp_path: Path) -> None:
+    study = write_study(tmp_path / "study", small_study())
+    config = study.run(small_study().runs()[0]).path / "config.json"
+    values = json.loads(config.read_text())
+    values["config"]["memory"] = EVIL[0]
+    config.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match="holds a run of MineSweeperEasy, full, <script>alert"):
+        report(study.root, skip=PARTS)
 
 
 @fuzz(60)

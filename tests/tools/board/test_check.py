@@ -300,7 +300,7 @@ def test_a_record_cannot_claim_more_than_it_checked() -> None:
         ({"env": "CountRecallEasy-v0", "amp": True}, "was trained with other amp than"),
         (
             {"observability": "partial", "pqn": {"gamma": 0.5}},
-            "on one twin or seed than on another",
+            "the twins of mingru on MineSweeperEasy-v0 differ in pqn.gamma",
         ),
     ],
 )
