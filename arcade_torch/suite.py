@@ -147,7 +147,7 @@ def _function(env: Any, name: str) -> Callable[..., Any]:
         raise TypeError(
             f"{name_of(env)} has a {name} of its own, but {name}_env is that of what it wraps or "
             f"is derived from, and from_jax calls {name}_env, for gymnax's {name} begins episodes "
-            f"by itself: give {name_of(env)} its own {name}_env"
+            f"by itself: hand over what it wraps, or give {name_of(env)} its own {name}_env"
         )
     function = getattr(env, f"{name}_env", None) or getattr(env, name, None)
     if not callable(function):
