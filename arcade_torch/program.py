@@ -37,6 +37,7 @@ STOP_SIGNALS = tuple(
 )
 REPEAT_S = 0.5
 """A ``KeyboardInterrupt`` that got lost is raised again after this time."""
+NOTHING_BEGUN = "no work was begun"
 
 
 class _Process:
@@ -45,8 +46,7 @@ class _Process:
     begun = False  # the handlers are installed
     phase: Literal["loading", "working", "over"] = "loading"  # of the command
     asked = False  # a signal has asked the command to stop
-    nothing_begun = "no work was begun"
-    hint = nothing_begun  # what an interruption leaves, and how to go on
+    hint = NOTHING_BEGUN  # what an interruption leaves, and how to go on
     code: int | None = None  # what came of it
 
 
@@ -102,7 +102,7 @@ def wait_for_work() -> None:
     """After a command, in a process that carries out another: until then a signal ends it at
     once.
     """
-    _Process.hint = _Process.nothing_begun
+    _Process.hint = NOTHING_BEGUN
     _Process.phase = "loading"
 
 

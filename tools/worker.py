@@ -9,6 +9,7 @@ with its exit code, since it may have left something behind; so does the end of 
 import json
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -36,7 +37,8 @@ def serve(command: Callable[[Sequence[str]], int] = main) -> None:
         order = json.loads(line)
         with open_append(Path(order["log"])) as log:
             _print_to(log.fileno())
-        code = command(order["words"])
+        with warnings.catch_warnings():  # of a run before are given again, into its own log
+            code = command(order["words"])
         if code != EXIT_OK:
             break
         program.wait_for_work()

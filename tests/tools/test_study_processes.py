@@ -76,6 +76,29 @@ def test_a_worker_takes_one_run_after_the_other_and_each_has_its_log(tmp_path: P
     assert not is_there(pid_of(tmp_path, 0))
 
 
+def test_a_warning_stands_in_the_log_of_every_run_that_gives_it(tmp_path: Path) -> None:
+    """Python gives a warning of one place once a process."""
+    warn = "registry = sys.__dict__.setdefault('_of_a_module', {})\n"
+    warn += (
+        "import warnings; warnings.warn_explicit('odd', UserWarning, 'm.py', 1, registry=registry)"
+    )
+    parts = jobs(tmp_path, note_pid(tmp_path, 0, warn), note_pid(tmp_path, 1, warn))
+    assert [result.error for result in python_engine(1).run(parts)] == ["", ""]
+    assert pid_of(tmp_path, 0) == pid_of(tmp_path, 1)
+    assert all("odd" in part.log.read_text() for part in parts)
+
+
+def test_a_worker_ends_when_no_run_waits_while_others_go_on(tmp_path: Path) -> None:
+    parts = jobs(
+        tmp_path, note_pid(tmp_path, 0), note_pid(tmp_path, 1, "import time; time.sleep(60)")
+    )
+    results = python_engine(2).run(parts)
+    first = int(next(results).name.removeprefix("job"))
+    # the process is still to be waited for: it has ended when this returns
+    os.waitid(os.P_PID, int(pid_of(tmp_path, first)), os.WEXITED | os.WNOWAIT)
+    results.close()  # type: ignore[attr-defined]
+
+
 def test_a_run_that_reads_its_input_takes_no_order_away(tmp_path: Path) -> None:
     reads = "import subprocess; assert sys.stdin.read() + input_of_a_program() == ''"
     program = "subprocess.run(['cat'], capture_output=True, check=True, text=True).stdout"

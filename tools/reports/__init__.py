@@ -299,14 +299,17 @@ def _final_row(agent: str, returns: Sequence[float], levels: Mapping[str, float]
     """The final returns of one agent on one task, for the table; without a mean if one of them is
     no number.
     """
-    summary = pooled(returns)
-    missing = 0.0 if all(map(math.isfinite, returns)) else math.nan
-    mean = float(summary.mean) + missing
+    mean = low = high = math.nan
+    if all(map(math.isfinite, returns)):
+        summary = pooled(returns)
+        mean = float(summary.mean)
+        low = float(summary.low)
+        high = float(summary.high)
     return {
         "agent": agent,
         "mean": mean,
-        "low": float(summary.low) + missing,
-        "high": float(summary.high) + missing,
+        "low": low,
+        "high": high,
         "way": way(mean, levels),
         "seeds": "  ".join(f"{value:.3f}" for value in returns),
     }

@@ -227,8 +227,7 @@ class StudyFolder:
 
 def _check_cell(run: Run, spec: RunSpec) -> None:
     """Refuse the folder of a run that holds another one than its name says."""
-    described(run)
-    key = run.key
+    key = described(run).key
     held = [bare_name(run.game), run.twin, key.memory, key.algorithm, run.seed]
     named = [bare_name(spec.game), spec.observability, spec.memory, spec.algorithm, spec.seed]
     if spec.size:

@@ -68,6 +68,8 @@ class Processes:
                 time.sleep(self.poll_s)
                 for worker in workers:
                     result = worker.result()
+                    if result is not None and not waiting:
+                        worker.ask_to_stop()  # it need not keep its memory to the end of the study
                     if result is not None:
                         yield result
         finally:

@@ -107,17 +107,17 @@ def saliency(
         frames = outside_inference(frames[:steps])
         policy.check(frames, actions, starts, before, dtype)
 
-        def decide(features: Tensor) -> Tensor:
-            since = None if before is None else before.clone()
-            out, _ = policy.remember(features[None], actions[None], starts[None], since)
-            return outputs(policy, target)(out[:, -1])[0]
-
+        decide = _decision(policy, actions, starts, before, target)
         features = policy.features(frames, chunk, dtype).clone().requires_grad_()
         values, jacobian = _decided(decide, features, reduce)
         maps, sums = _frame_norms(policy, frames, jacobian, norm, chunk, dtype)
-    gradients = maps.float().cpu().numpy(), sums.double().cpu().numpy()
-    explained = values.detach().float().cpu().numpy()
-    return Saliency(*gradients, output=explained, n=steps - 1, target=resolve(policy, target))
+    return Saliency(
+        maps=maps.float().cpu().numpy(),
+        per_frame=sums.double().cpu().numpy(),
+        output=values.float().cpu().numpy(),
+        n=steps - 1,
+        target=resolve(policy, target),
+    )
 
 
 def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
@@ -162,6 +162,20 @@ def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
     return _one_a_frame("is_init", is_init, frames).bool()
 
 
+def _decision(
+    policy: Policy, actions: Tensor, starts: Tensor, state: Any, target: Target
+) -> Callable[[Tensor], Tensor]:
+    """The outputs [A] of the last step as a function of the features [T, E]."""
+
+    def decide(features: Tensor) -> Tensor:
+        # a policy may change its state in place
+        before = None if state is None else state.clone()
+        out, _ = policy.remember(features[None], actions[None], starts[None], before)
+        return outputs(policy, target)(out[:, -1])[0]
+
+    return decide
+
+
 def _decided(
     decide: Callable[[Tensor], Tensor], features: Tensor, reduce: Reduce
 ) -> tuple[Tensor, Tensor]:
@@ -170,7 +184,7 @@ def _decided(
     jacobian = _jacobian(values, features, reduce)
     if reduce == "per_action":  # a sum over actions may rightly not change
         refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
-    return values, jacobian
+    return values.detach(), jacobian
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
