@@ -27,6 +27,7 @@ from arcade_torch.tools.errors import (
 )
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.imports import import_for_command, imported, take_imports
+from arcade_torch.tools.programs import keep_programs
 from arcade_torch.tools.text import printable, warn
 
 EXIT_OK = 0
@@ -174,9 +175,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def begin() -> None:
-    """Prepare a process that carries out commands: its streams, its signals, its warnings."""
+    """Prepare a process that carries out commands: its streams, its signals, its warnings, and
+    where it keeps what it compiles.
+    """
     program.begin()
     warnings.formatwarning = _format_warning
+    keep_programs()
 
 
 def _run(words: list[str]) -> int:

@@ -78,6 +78,8 @@ class Policy:
     step: Callable[[Any, Any], tuple[Tensor, Any]] | None = None
     splits: bool = True  # False: the features are the frames, encoding them saves nothing
     needs_last_action: bool = False  # whether it must be handed over; zeros are no default then
+    # the types of frames that it was tried on, see `check`
+    _tried: set[torch.dtype] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""
@@ -214,8 +216,11 @@ class Policy:
         floats for other frames than whole numbers of the same values.
 
         ``frames`` [T, ...], ``last_action`` [T] and ``is_init`` [T] are those that it saw from
-        ``state`` on; the first few are tried.
+        ``state`` on; the first few are tried. A policy that few frames were tried on is not tried
+        again, so that a measure of many windows pays for one.
         """
+        if dtype in self._tried:
+            return
         few = slice(0, FEW)
         actions = last_action[None, few]
         starts = is_init[None, few].bool()
@@ -251,6 +256,8 @@ class Policy:
                     f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got "
                     "other outputs: convert frames of any type alike (frames.float() / 255)"
                 )
+        if len(frames) >= FEW:
+            self._tried.add(dtype)
 
     @contextmanager
     def evaluating(self) -> Iterator[None]:

@@ -10,7 +10,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,11 +28,6 @@ LONG_S = 600.0
 """A process that has worked for so many seconds takes no further run: long ones gain nothing."""
 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-# what one worker has compiled, the others read: five seconds less of a core for each
-_KEEP_PROGRAMS = {
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
-    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-}
 
 
 @dataclass
@@ -50,14 +44,8 @@ class Processes:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
         to save.
         """
-        # in a folder that nobody else can write to: what is read from it is run
-        with tempfile.TemporaryDirectory(prefix="arcade-torch-") as programs:
-            yield from self._run(list(jobs), programs)
-
-    def _run(self, waiting: list[Job], programs: str) -> Iterator[JobResult]:
-        """The same, with a folder for compiled programs."""
-        environment = _KEEP_PROGRAMS | {"JAX_COMPILATION_CACHE_DIR": programs} | os.environ
-        environment |= _ONE_THREAD | {PARENT_VARIABLE: str(os.getpid())}
+        waiting = list(jobs)
+        environment = os.environ | _ONE_THREAD | {PARENT_VARIABLE: str(os.getpid())}
         places = self._places(len(waiting))
         workers = [Worker(self.program, environment, cores) for cores in places]
         try:

@@ -178,6 +178,27 @@ def test_a_memory_that_sees_later_frames_is_refused() -> None:
     assert saliency(causal, window(5).frames).shares()[0] > 0
 
 
+def test_a_policy_is_tried_once_and_not_in_every_window() -> None:
+    causal = linear_policy(0.5, dtype=torch.float32)
+    asked = list[int]()
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        asked.append(features.shape[1])
+        return causal.remember(features, *rest)
+
+    policy = Policy(causal.encode, remember, causal.initial_state)
+
+    def calls(steps: int) -> int:
+        asked.clear()
+        seen = window(steps)
+        policy.check(seen.frames, seen.last_action, seen.is_init, seen.state)
+        return len(asked)
+
+    assert calls(2) > 0
+    assert calls(5) > 0, "two frames are too few to go by"
+    assert calls(5) == 0
+
+
 @pytest.mark.parametrize("measure", ["saliency", "recall density"])
 def test_a_gradient_that_is_cut_is_no_zero(measure: str) -> None:
     torch.manual_seed(0)
