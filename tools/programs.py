@@ -11,6 +11,7 @@ import platform
 import stat
 import sys
 import time
+import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -39,6 +40,9 @@ def keep_programs() -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_ours_alone(folder):
             _remove_old(folder)
+            # of a program that cannot be read or written, JAX says a line at every start; it is
+            # compiled, as it would be without the folder
+            warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation")
             for name, value in ({_FOLDER: str(folder)} | _SMALL_ONES_TOO).items():
                 os.environ.setdefault(name, value)
 

@@ -28,8 +28,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_command_reads_what_one_before_it_compiled(cache: Path) -> None:
     code = """
 import sys
-from arcade_torch.tools import cli
-cli.begin()
+from arcade_torch.tools import programs
+programs.keep_programs()
 import jax
 from jax._src import monitoring
 hits = []
@@ -47,7 +47,11 @@ print(float(jax.jit(lambda x: jnp.sin(x).sum() + 1)(jnp.arange(5.0))), sum(hits)
     assert int(results[0][1]) == 0 < int(results[1][1])
     folder = programs_folder()
     assert folder.stat().st_mode & 0o777 == 0o700
-    assert list(folder.iterdir())
+    for program in folder.iterdir():
+        program.write_bytes(program.read_bytes()[:100])
+    damaged = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert damaged.stdout.split() == results[0], damaged.stderr
+    assert not damaged.stderr
 
 
 def test_what_the_user_has_named_stays(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
