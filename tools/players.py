@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import arcade_torch
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.runs.files import read_json, write_json
@@ -88,14 +89,18 @@ def references(
     rules: str = "default",
     options: Mapping[str, Any] | None = None,
     episodes: int = EPISODES,
+    imports: Mapping[str, str] | None = None,
 ) -> dict[str, Baseline]:
     """What the players earn under the rules and options of a study, kept in
-    ``folder/references-GAME-RULES.json``.
+    ``folder/references-GAME-RULES.json`` for this version and these ``imports``, the files of the
+    user and their hashes.
 
     A game without an oracle lacks that player.
     """
     file = folder / f"references-{game}-{rules}.json"
     settings: dict[str, Any] = {"episodes": episodes, "options": dict(options or {})}
+    settings["imports"] = dict(imports or {})
+    settings["version"] = arcade_torch.__version__
     try:
         return _kept_references(file, settings)
     except (FileNotFoundError, ValueError, KeyError, TypeError):

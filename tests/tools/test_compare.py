@@ -189,7 +189,7 @@ FINAL = {"gru": 0.2, "mingru": 0.6, "mlp": 0.5}
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A study whose subject is the weakest of three agents."""
-    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
+    monkeypatch.setattr(reports, "references", lambda *words, imports: LEVELS)
     finals = {(twin, name): value for name, value in FINAL.items() for twin in ("full", "partial")}
     monkeypatch.setattr("tests.tools.fabricated.FINAL", finals)
     write_study(tmp_path / "s", Study.from_dict(SUBJECT))

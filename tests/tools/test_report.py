@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arcade_torch.tools import gap_and_bias, report, reports
+from arcade_torch.tools import gap_and_bias, players, report, reports
 from arcade_torch.tools.figures.style import agent_colours, drawing, svg
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
@@ -30,7 +30,7 @@ LEVELS = {
 
 @pytest.fixture
 def no_oracles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: LEVELS)
+    monkeypatch.setattr(reports, "references", lambda *words, imports: LEVELS)
 
 
 @pytest.fixture
@@ -253,7 +253,7 @@ def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
     same = {
         player: Baseline("X", player, 256, 0.5, 0.0, 20.0, 1.0) for player in ("random", "state")
     }
-    monkeypatch.setattr(reports, "references", lambda game, folder, rules, options: same)
+    monkeypatch.setattr(reports, "references", lambda *words, imports: same)
     write_study(tmp_path / "s", small_study())
     assert "random policy" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
@@ -262,7 +262,9 @@ def test_reference_lines_follow_the_options_of_the_study(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    monkeypatch.setattr(reports, "references", lambda *words: asked.append(words) or LEVELS)
+    monkeypatch.setattr(
+        reports, "references", lambda *words, imports: asked.append(words) or LEVELS
+    )
     folder = write_study(tmp_path / "s", small_study())
     for run in small_study().runs():
         file = folder.run(run).path / "config.json"
@@ -282,6 +284,21 @@ def test_a_mine_costs_what_the_options_say_and_a_damaged_file_is_made_anew(tmp_p
     assert references("MineSweeperEasy", tmp_path, options={"mine_reward": -1}, episodes=64)[
         "random"
     ].mean == (harsh["random"].mean)
+
+
+def test_references_of_a_game_that_was_changed_are_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def measure(game: str, player: str, episodes: int, **_: Any) -> Baseline:
+        asked.append(player)
+        return Baseline(game, player, episodes, 0.0, 0.0, 1.0, 0.0)
+
+    monkeypatch.setattr(players, "measure", measure)
+    for sha256 in ("a" * 64, "a" * 64, "b" * 64):
+        references("SkittlesEasy", tmp_path, imports={"/home/me/mine.py": sha256})
+    assert len(asked) == 2 * len(set(asked))
 
 
 @given(

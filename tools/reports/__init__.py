@@ -253,7 +253,7 @@ def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Play
         config = run.config
         rules = str(config.get("rules", "default"))
         options = dict(config.get("env_options") or {})
-        players[game] = references(game, folder.analysis, rules, options)
+        players[game] = references(game, folder.analysis, rules, options, imports=run.imports)
         if progress is not None:
             progress("random policy and oracles", done, len(games))
     return players
