@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.differences import flatten
-from arcade_torch.agents.runs.files import is_final, read_csv, read_json
+from arcade_torch.agents.runs.files import is_final, read_csv, read_json, wrong_mean
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey
 
@@ -121,11 +121,28 @@ def read_record(file: Path) -> dict[str, Any]:
 
 
 def open_run(path: Path) -> Run | None:
-    """A run from its folder, None if it has not finished; refuses damaged settings by the name of
-    the file.
+    """A run from its folder, None if it has not finished; refuses damaged settings, and a mean that
+    is not that of the returns, by the name of the file.
     """
     run = described(Run(path))
-    return run if run.final is not None else None
+    if run.final is None:
+        check_mean(path)
+        return None
+    return run
+
+
+def check_mean(path: Path) -> None:
+    """Refuse the ``eval.json`` of a run, if there is one, whose mean is not that of its returns."""
+    file = path / "eval.json"
+    try:
+        wrong = wrong_mean(read_json(file))
+    except (OSError, ValueError):
+        return
+    if wrong:
+        raise ValueError(
+            f"{file} was changed: {wrong}; go on with the run (train --resume, or its study "
+            "again), and it is evaluated again"
+        )
 
 
 def described(run: Run) -> Run:

@@ -170,7 +170,8 @@ def test_a_run_without_a_score_is_not_averaged_away(tmp_path: Path, no_oracles: 
     study = small_study(subject="mingru")
     folder = write_study(tmp_path / "s", study)
     file = folder.run(study.runs()[0]).path / "eval.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": float("nan")}))
+    nan = float("nan")
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": nan, "returns": [nan, 0.5]}))
     parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
     page = report(folder.root, skip=parts).read_text()
     assert "is nan" in page  # in the place of gap and bias

@@ -37,7 +37,7 @@ from arcade_torch.tools.reports.findings import (
 )
 from arcade_torch.tools.reports.panels import Finals
 from arcade_torch.tools.reports.subject import subject_section
-from arcade_torch.tools.runs import open_run
+from arcade_torch.tools.runs import check_mean, open_run
 from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
@@ -173,6 +173,8 @@ def _finished_runs(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str
             run = open_run(folder.run(spec).path)
             if run is not None:
                 runs.append(run)
+        elif row["status"] == "unfinished":
+            check_mean(folder.run(spec).path)
     return Runs(tuple(runs))
 
 
