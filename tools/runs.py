@@ -5,10 +5,29 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.differences import flatten
-from arcade_torch.agents.runs.files import is_final, read_csv, read_json, wrong_mean
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields, flatten
+from arcade_torch.agents.runs.files import (
+    is_final,
+    list_checkpoints,
+    read_csv,
+    read_json,
+    wrong_mean,
+)
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey
+
+FREE = {
+    "device",
+    "threads",
+    "checkpoint_every",
+    "eval_every",
+    "eval_episodes",
+    "logger",
+    "compile",
+    "cuda_graphs",
+}
+"""Settings that may differ among runs that are compared."""
 
 
 @dataclass(frozen=True)
@@ -121,14 +140,32 @@ def read_record(file: Path) -> dict[str, Any]:
 
 
 def open_run(path: Path) -> Run | None:
-    """A run from its folder, None if it has not finished; refuses damaged settings, and a mean that
-    is not that of the returns, by the name of the file.
+    """A run from its folder, None if it has not finished; refuses damaged or changed settings, and
+    a mean that is not that of the returns, by the name of the file.
     """
     run = described(Run(path))
     if run.final is None:
         check_mean(path)
         return None
+    _check_unchanged(run)
     return run
+
+
+def _check_unchanged(run: Run) -> None:
+    """Refuse settings that are not those of the run's newest checkpoint, where it keeps one: they
+    were changed since.
+    """
+    for checkpoint in list_checkpoints(run.path / "checkpoints")[:1]:
+        try:
+            trained = TrainConfig.from_dict(read_record(checkpoint / "meta.json")["config"])
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # it is damaged, and says nothing of the settings
+        changed = differing_fields(run.config, trained, FREE)
+        if changed:
+            raise ValueError(
+                f"{run.path / run.settings_file} was changed since the training, see {checkpoint}: "
+                f"{', '.join(changed)}"
+            )
 
 
 def check_mean(path: Path) -> None:

@@ -27,6 +27,8 @@ MOST_CELLS = 2**25
 """Cells of the largest table that is read."""
 MOST_TENSORS = 16 * 2**30
 """Bytes of the largest file of tensors that is read."""
+LATEST = "latest"
+"""File in ``checkpoints/`` with the name of the newest."""
 MEAN_TOLERANCE = 1e-5
 """A mean in float32 may differ from that of its returns in float64 by this share of the largest."""
 _END_BYTES = 2**16
@@ -261,6 +263,19 @@ def checksum(path: Path, most_bytes: int = MOST_TENSORS) -> str:
         while block := stream.read(2**20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames)
+    first.
+    """
+    checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
+    try:
+        latest = read_text(folder / LATEST).strip()
+    except (OSError, ValueError):
+        latest = ""
+    checkpoints.sort(reverse=True)
+    return sorted(checkpoints, key=lambda path: path.name != latest)
 
 
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:

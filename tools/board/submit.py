@@ -9,7 +9,7 @@ from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_values
-from arcade_torch.agents.runs.checkpoint import list_checkpoints
+from arcade_torch.agents.runs.files import list_checkpoints
 from arcade_torch.tools.board.entry import (
     BoardRun,
     Entry,
@@ -20,8 +20,8 @@ from arcade_torch.tools.board.entry import (
 )
 from arcade_torch.tools.board.evaluation import Evaluator, Played, made_with, weights_hash
 from arcade_torch.tools.board.protocol import OBSERVATIONS, PROTOCOL, Protocol
-from arcade_torch.tools.comparable import FREE, Runs, find_runs
-from arcade_torch.tools.runs import Run
+from arcade_torch.tools.comparable import Runs, find_runs
+from arcade_torch.tools.runs import FREE, Run
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how many runs are, and of how many."""

@@ -23,13 +23,12 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import resolve_id
-from arcade_torch.tools.comparable import FREE
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import imports_of
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.names import bare_name, preset_size
 from arcade_torch.tools.options import command_line
-from arcade_torch.tools.runs import Run, described, read_record
+from arcade_torch.tools.runs import FREE, Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 

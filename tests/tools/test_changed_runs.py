@@ -1,4 +1,6 @@
-"""The mean in an ``eval.json`` is that of its returns, or the file is not believed."""
+"""The mean in an ``eval.json`` is that of its returns, and ``config.json`` what was trained, or the
+files are not believed.
+"""
 
 import json
 from pathlib import Path
@@ -11,6 +13,8 @@ from arcade_torch.agents.evaluation import EvalResult
 from arcade_torch.agents.runs.files import is_final, wrong_mean
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools import cli
+from arcade_torch.tools.comparable import find_runs
+from tests.tools.board.boards import write_run as write_board_run
 from tests.tools.fabricated import small_study, write_study
 
 
@@ -57,3 +61,36 @@ def test_the_mean_that_a_training_writes_is_believed() -> None:
             assert wrong_mean(values) == "" and is_final(values)
     assert is_final({"mean": float("nan"), "returns": [0.5, float("nan")]})
     assert not is_final({"mean": 0.5, "returns": [float("nan")]})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"memory": "lru"}, "memory ('lru' != 'mingru')"),
+        ({"observability": "partial"}, "observability ('partial' != 'full')"),
+        ({"network_options": {"layers": 2}}, "network_options.layers (2 != None)"),
+        ({"algorithm": ["pqn"]}, "algorithm (['pqn'] != 'pqn')"),
+        ({"device": "cuda", "threads": 4, "eval_episodes": 7}, None),
+    ],
+)
+def test_settings_that_were_changed_after_the_training_are_refused(
+    settings: dict[str, Any], message: str | None, tmp_path: Path
+) -> None:
+    run = write_board_run(tmp_path)
+    record = json.loads((run / "config.json").read_text())
+    record["config"] |= settings
+    (run / "config.json").write_text(json.dumps(record))
+    if message is None:
+        assert len(find_runs([tmp_path]).runs) == 1
+        return
+    with pytest.raises(ValueError, match=r"config.json was changed since the training") as refusal:
+        find_runs([tmp_path])
+    assert message in str(refusal.value)
+
+
+def test_a_checkpoint_that_cannot_be_read_says_nothing_of_the_settings(tmp_path: Path) -> None:
+    run = write_board_run(tmp_path)
+    for content in ("", "[]", '{"config": 3}', '{"config": {"pqn": 3}}'):
+        for file in run.glob("checkpoints/*/meta.json"):
+            file.write_text(content)
+        assert len(find_runs([tmp_path]).runs) == 1, content
