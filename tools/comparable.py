@@ -154,7 +154,8 @@ def _folders(path: Path, search: RunFolders) -> list[Path]:
     again = search.has_seen(path)
     folders = list(search.below(path))
     if not folders and not again:
-        raise ValueError(f"{path} holds no run: a run folder has a config.json")
+        notes = "".join(f"; {note}" for note in search.notes)
+        raise ValueError(f"{path} holds no run: a run folder has a config.json{notes}")
     orders: dict[Path, dict[str, int]] = {}
 
     def place(folder: Path) -> tuple[Path, int, Path]:

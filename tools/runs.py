@@ -1,5 +1,6 @@
 """A run, to read from: its settings, which agent it is, and what it scored."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -128,7 +129,28 @@ class Run:
         value = (self.final or {}).get(name)
         if value is None:
             raise ValueError(f"{self.path} has no {metric}: choose another metric")
+        if metric == "train_max_ewm":
+            self._check_train_score(float(value))
         return float(value)
+
+    def _check_train_score(self, score: float) -> None:
+        """Refuse a best training score that is not that of ``metrics.csv``, where there is one."""
+        from arcade_torch.agents.metrics import paper_score  # which loads torch
+
+        frames = list[float]()
+        returns = list[float]()
+        for row in self.table("metrics.csv"):
+            if row.get("train_return_last"):
+                frames.append(float(row["frames"]))
+                returns.append(float(row["train_return_last"]))
+        if not frames:
+            return
+        actual = paper_score(frames, returns)
+        if not math.isclose(score, actual, rel_tol=1e-5, abs_tol=1e-6):
+            raise ValueError(
+                f"{self.path / 'eval.json'} was changed, or metrics.csv: its train_max_ewm is "
+                f"{score:g}, that of the curve {actual:g}"
+            )
 
 
 def read_record(file: Path) -> dict[str, Any]:

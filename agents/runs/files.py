@@ -302,7 +302,13 @@ def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     numbers = [*returns, *lengths, *(value for value in others if value is not None)]
     # what can be squared; NaN is one
     sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)
-    return sound and all(type(n) is int for n in lengths) and not wrong_mean(values)
+    if not sound or not all(type(n) is int for n in lengths):
+        return False
+    if any((values.get(name) or 0) < 0 for name in ("frames", "seconds")):
+        return False
+    if {"returns", "lengths"} <= set(values) and not 0 < len(returns) == len(lengths):
+        return False
+    return not wrong_mean(values)
 
 
 def wrong_mean(values: Any) -> str:

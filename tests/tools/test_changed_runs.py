@@ -14,6 +14,8 @@ from arcade_torch.agents.runs.files import is_final, wrong_mean
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools import cli
 from arcade_torch.tools.comparable import find_runs
+from arcade_torch.tools.runs import Run
+from arcade_torch.tools.sharing import share as sharing
 from tests.tools.board.boards import write_run as write_board_run
 from tests.tools.fabricated import small_study, write_study
 
@@ -94,3 +96,28 @@ def test_a_checkpoint_that_cannot_be_read_says_nothing_of_the_settings(tmp_path:
         for file in run.glob("checkpoints/*/meta.json"):
             file.write_text(content)
         assert len(find_runs([tmp_path]).runs) == 1, content
+
+
+def test_a_training_score_that_is_not_that_of_the_curve_is_refused(tmp_path: Path) -> None:
+    folder = write_study(tmp_path / "s", small_study())
+    path = folder.run(small_study().runs()[0]).path
+    (path / "metrics.csv").write_text("frames,train_return_last\n64,0.25\n128,0.25\n")
+    final = json.loads((path / "eval.json").read_text())
+    (path / "eval.json").write_text(json.dumps(final | {"train_max_ewm": 0.25}))
+    assert Run(path).value("train_max_ewm") == 0.25
+    (path / "eval.json").write_text(json.dumps(final | {"train_max_ewm": 0.9}))
+    with pytest.raises(ValueError, match=r"its train_max_ewm is 0\.9, that of the curve 0\.25"):
+        Run(path).value("train_max_ewm")
+    assert Run(path).value("eval_final") == final["mean"]
+
+
+def test_a_run_whose_command_and_versions_were_changed_can_be_shared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write_board_run(tmp_path)
+    record = json.loads((run / "config.json").read_text()) | {"command": {"a": 1}, "versions": [1]}
+    (run / "config.json").write_text(json.dumps(record))
+    one = EvalResult(np.zeros(1, np.float32), np.ones(1, np.int64))
+    monkeypatch.setattr(sharing, "_evaluated", lambda *arguments: one)
+    results = sharing.share(run, tmp_path / "shared", "", 1, False, False)
+    assert results["training"] == {"versions": {}, "command": ""}

@@ -204,7 +204,6 @@ def write_page(study: Path, out: Path | None = None, **options: Any) -> None:
     from arcade_torch.tools.progress import Bars
     from arcade_torch.tools.reports import report
 
-    if out is not None:
-        check_writable(out)
+    check_writable(study / "report.html" if out is None else out)
     with Bars() as bars:
         say(f"report: {report(study, out, progress=bars.update, **options).resolve()}")
