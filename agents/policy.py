@@ -2,6 +2,7 @@
 memory's primer.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -222,21 +223,39 @@ def build_network(config: TrainConfig) -> Network:
     """The freshly initialised network of a config, on its device; the same seed gives the same
     weights, and no global draw moves.
     """
+    # on the CPU, whatever torch's default device is: there the seed says what is drawn
+    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+        torch.default_generator.manual_seed(config.seed)
+        network = _new_network(config)
+    for module in network.modules():
+        if isinstance(module, Encoder):
+            module.amp = config.amp
+    return network.to(config.device)  # type: ignore[no-any-return]
+
+
+def check_network(config: TrainConfig) -> None:
+    """Refuse options that :func:`build_network` would refuse; no weight is allocated or drawn.
+
+    Raises:
+        ValueError, TypeError: an option of the network or of the memory is unknown, or its value
+            is not allowed.
+    """
+    # a memory of somebody's own may need real numbers: its run finds out
+    with suppress(RuntimeError), torch.device("meta"):
+        _new_network(config)
+
+
+def _new_network(config: TrainConfig) -> Network:
+    """A network on torch's default device."""
     make: Any = make_actor_critic if config.algorithm == "ppo" else make_network
     options = {
         "predicts": getattr(config.learner, "prediction_coeff", 0.0) > 0,
         **config.network_options,
     }
-    # on the CPU, whatever torch's default device is: there the seed says what is drawn
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
-        torch.default_generator.manual_seed(config.seed)
-        network: Network = make(
-            config.network, memory=config.memory, obs_size=config.obs_size, **options
-        )
-    for module in network.modules():
-        if isinstance(module, Encoder):
-            module.amp = config.amp
-    return network.to(config.device)  # type: ignore[no-any-return]
+    network: Network = make(
+        config.network, memory=config.memory, obs_size=config.obs_size, **options
+    )
+    return network
 
 
 def compile_network(network: nn.Module, backend: str = "inductor") -> None:

@@ -22,8 +22,8 @@ from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
 from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.metrics import paper_score
 from arcade_torch.agents.policy import Agent
-from arcade_torch.agents.runs.checkpoint import list_checkpoints, load_latest, save_checkpoint
-from arcade_torch.agents.runs.files import CsvLog, read_csv, write_json
+from arcade_torch.agents.runs.checkpoint import load_latest, save_checkpoint
+from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.agents.trainer import Trainer

@@ -73,7 +73,9 @@ class Recurrence:
         self._empty = _empty_nodes(example)
         self.state_keys = list(self._paths)
         self.next_state_keys = [("next", *key) for key in self.state_keys]
-        begins_with_zeros = not any(x.any() or x.requires_grad for x in tensors.values())
+        begins_with_zeros = not any(
+            x.is_meta or x.any() or x.requires_grad for x in tensors.values()
+        )
         if store == "step" and not begins_with_zeros:
             raise ValueError(
                 "store='step' needs a memory that begins with zeros and learns no start: take "

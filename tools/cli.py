@@ -254,10 +254,23 @@ def _print_page(words: Sequence[str]) -> None:
 def _parse(words: Sequence[str], imports: Sequence[str]) -> Any:
     """The command that a command line asks for, with its options."""
     name, options = split_command(words)
+    _check_current_folder()
     import_for_command(imports)
     command = command_class(name).parse(options, f"arcade-torch {name}")
     command.argv = tuple(options)
     return command
+
+
+def _check_current_folder() -> None:
+    """Refuse to work in a folder that was removed: libraries end the process there, with messages
+    about something else.
+    """
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise ValueError(
+            "the current folder is not there any more: change to another, such as with cd ~"
+        ) from None
 
 
 def _tell_stopped(begun: Sequence[Any]) -> int:

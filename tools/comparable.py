@@ -14,19 +14,8 @@ from arcade_torch.agents.differences import differing_values
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.names import AgentKey, agent_names, bare_name, game_names, plain_number
 from arcade_torch.tools.run_folders import RunFolders
-from arcade_torch.tools.runs import Run, Score, open_run
+from arcade_torch.tools.runs import FREE, Run, Score, open_run
 
-FREE = {
-    "device",
-    "threads",
-    "checkpoint_every",
-    "eval_every",
-    "eval_episodes",
-    "logger",
-    "compile",
-    "cuda_graphs",
-}
-"""Settings that may differ among runs that are compared."""
 _CELL = {
     "env",
     "observability",
@@ -165,7 +154,8 @@ def _folders(path: Path, search: RunFolders) -> list[Path]:
     again = search.has_seen(path)
     folders = list(search.below(path))
     if not folders and not again:
-        raise ValueError(f"{path} holds no run: a run folder has a config.json")
+        notes = "".join(f"; {note}" for note in search.notes)
+        raise ValueError(f"{path} holds no run: a run folder has a config.json{notes}")
     orders: dict[Path, dict[str, int]] = {}
 
     def place(folder: Path) -> tuple[Path, int, Path]:

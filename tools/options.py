@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from io import StringIO
+from itertools import pairwise
 from typing import Any, ClassVar
 
 from arcade_torch.tools.imports import FLAG, imported
@@ -52,7 +53,8 @@ def parse(
     except SystemExit as stop:
         if not stop.code:  # the help was printed
             raise
-    raise ValueError(f"{_in_one_line(message.getvalue())} (see {prog} --help)")
+    wrong = _in_one_line(message.getvalue())
+    raise ValueError(f"{wrong}{_dashed_value(wrong, words)} (see {prog} --help)")
 
 
 class Command:
@@ -89,6 +91,22 @@ def _whole_numbers() -> Any:
         )
 
     return registry
+
+
+def _dashed_value(wrong: str, words: Sequence[str]) -> str:
+    """How to write a value that begins with a dash, if tyro missed one for that; else nothing.
+
+    Example:
+        >>> _dashed_value("Missing value for argument '--out'", ["--out", "-x.gif"])
+        '; a value that begins with - is written --out=-x.gif'
+    """
+    missed = re.search(r"'(--[\w.-]+)'", wrong)
+    if missed is None or "issing" not in wrong:
+        return ""
+    for option, value in pairwise(words):
+        if option == missed[1] and re.match(r"-[^-]", value):
+            return f"; a value that begins with - is written {option}={value}"
+    return ""
 
 
 def _in_one_line(message: str) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -110,7 +111,10 @@ def references(
     for player in players_of(game, **of_game):
         baselines[player] = measure(game, player, episodes, block=EPISODES, **of_game)
     rows = [baseline._asdict() for baseline in baselines.values()]
-    write_json(file, {"how": settings, "players": rows})
+    try:
+        write_json(file, {"how": settings, "players": rows})
+    except OSError as error:  # the folder of somebody else: the numbers are of use all the same
+        warnings.warn(f"what the players earn could not be kept: {error}", stacklevel=2)
     return baselines
 
 

@@ -1,14 +1,34 @@
 """A run, to read from: its settings, which agent it is, and what it scored."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from arcade_torch.agents.differences import flatten
-from arcade_torch.agents.runs.files import is_final, read_csv, read_json
+from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.differences import differing_fields, flatten
+from arcade_torch.agents.runs.files import (
+    is_final,
+    list_checkpoints,
+    read_csv,
+    read_json,
+    wrong_mean,
+)
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey
+
+FREE = {
+    "device",
+    "threads",
+    "checkpoint_every",
+    "eval_every",
+    "eval_episodes",
+    "logger",
+    "compile",
+    "cuda_graphs",
+}
+"""Settings that may differ among runs that are compared."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +129,28 @@ class Run:
         value = (self.final or {}).get(name)
         if value is None:
             raise ValueError(f"{self.path} has no {metric}: choose another metric")
+        if metric == "train_max_ewm":
+            self._check_train_score(float(value))
         return float(value)
+
+    def _check_train_score(self, score: float) -> None:
+        """Refuse a best training score that is not that of ``metrics.csv``, where there is one."""
+        from arcade_torch.agents.metrics import paper_score  # which loads torch
+
+        frames = list[float]()
+        returns = list[float]()
+        for row in self.table("metrics.csv"):
+            if row.get("train_return_last"):
+                frames.append(float(row["frames"]))
+                returns.append(float(row["train_return_last"]))
+        if not frames:
+            return
+        actual = paper_score(frames, returns)
+        if not math.isclose(score, actual, rel_tol=1e-5, abs_tol=1e-6):
+            raise ValueError(
+                f"{self.path / 'eval.json'} was changed, or metrics.csv: its train_max_ewm is "
+                f"{score:g}, that of the curve {actual:g}"
+            )
 
 
 def read_record(file: Path) -> dict[str, Any]:
@@ -121,11 +162,46 @@ def read_record(file: Path) -> dict[str, Any]:
 
 
 def open_run(path: Path) -> Run | None:
-    """A run from its folder, None if it has not finished; refuses damaged settings by the name of
-    the file.
+    """A run from its folder, None if it has not finished; refuses damaged or changed settings, and
+    a mean that is not that of the returns, by the name of the file.
     """
     run = described(Run(path))
-    return run if run.final is not None else None
+    if run.final is None:
+        check_mean(path)
+        return None
+    _check_unchanged(run)
+    return run
+
+
+def _check_unchanged(run: Run) -> None:
+    """Refuse settings that are not those of the run's newest checkpoint, where it keeps one: they
+    were changed since.
+    """
+    for checkpoint in list_checkpoints(run.path / "checkpoints")[:1]:
+        try:
+            trained = TrainConfig.from_dict(read_record(checkpoint / "meta.json")["config"])
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # it is damaged, and says nothing of the settings
+        changed = differing_fields(run.config, trained, FREE)
+        if changed:
+            raise ValueError(
+                f"{run.path / run.settings_file} was changed since the training, see {checkpoint}: "
+                f"{', '.join(changed)}"
+            )
+
+
+def check_mean(path: Path) -> None:
+    """Refuse the ``eval.json`` of a run, if there is one, whose mean is not that of its returns."""
+    file = path / "eval.json"
+    try:
+        wrong = wrong_mean(read_json(file))
+    except (OSError, ValueError):
+        return
+    if wrong:
+        raise ValueError(
+            f"{file} was changed: {wrong}; go on with the run (train --resume, or its study "
+            "again), and it is evaluated again"
+        )
 
 
 def described(run: Run) -> Run:

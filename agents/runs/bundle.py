@@ -23,12 +23,16 @@ from arcade_torch.agents.runs.checkpoint import (
     FORMAT,
     MOST_WEIGHTS,
     Checkpoint,
-    list_checkpoints,
     load_checkpoint,
     load_latest,
     refuse_format,
 )
-from arcade_torch.agents.runs.files import CheckpointError, read_bytes, write_atomic
+from arcade_torch.agents.runs.files import (
+    CheckpointError,
+    list_checkpoints,
+    read_bytes,
+    write_atomic,
+)
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"

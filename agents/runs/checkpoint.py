@@ -35,15 +35,16 @@ from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import (
+    LATEST,
     MOST_JSON,
     MOST_TENSORS,
     CheckpointError,
     checksum,
     is_ours,
+    list_checkpoints,
     open_regular,
     read_bytes,
     read_json,
-    read_text,
     write_atomic,
     write_json,
 )
@@ -61,7 +62,6 @@ _PLAIN = re.compile(
 _WEIGHTS = "weights.safetensors"
 _TRAINER = "trainer.pt"
 _META = "meta.json"
-_LATEST = "latest"
 
 _MOST_BYTES = {_WEIGHTS: MOST_WEIGHTS, _TRAINER: MOST_TENSORS}
 
@@ -109,7 +109,7 @@ def save_checkpoint(
     except BaseException:  # a full disk, for one: what is half written makes room
         shutil.rmtree(draft, ignore_errors=True)
         raise
-    write_atomic(folder / _LATEST, final.name + "\n")
+    write_atomic(folder / LATEST, final.name + "\n")
     for old in list_checkpoints(folder)[KEEP:]:
         shutil.rmtree(old, ignore_errors=True)
     remove_draft_checkpoints(folder)
@@ -148,19 +148,6 @@ def remove_draft_checkpoints(folder: Path) -> None:
     for path in folder.iterdir() if folder.is_dir() else ():
         if is_ours(path, "checkpoint draft"):
             shutil.rmtree(path, ignore_errors=True)
-
-
-def list_checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames)
-    first.
-    """
-    checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
-    try:
-        latest = read_text(folder / _LATEST).strip()
-    except (OSError, ValueError):
-        latest = ""
-    checkpoints.sort(reverse=True)
-    return sorted(checkpoints, key=lambda path: path.name != latest)
 
 
 def load_checkpoint(

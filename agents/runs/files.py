@@ -8,6 +8,7 @@ import errno
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import secrets
@@ -26,6 +27,10 @@ MOST_CELLS = 2**25
 """Cells of the largest table that is read."""
 MOST_TENSORS = 16 * 2**30
 """Bytes of the largest file of tensors that is read."""
+LATEST = "latest"
+"""File in ``checkpoints/`` with the name of the newest."""
+MEAN_TOLERANCE = 1e-5
+"""A mean in float32 may differ from that of its returns in float64 by this share of the largest."""
 _END_BYTES = 2**16
 _OUR_NAMES = {
     "draft": re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL),
@@ -151,11 +156,13 @@ def write_atomic(path: Path, data: str | bytes) -> Path:
 
     Raises:
         OSError: it cannot be written; ``filename`` is ``path``, and the old content is still there.
+            A pipe or a device, also behind a link, is no file to replace.
     """
+    _refuse_special(path)
     # Others may write the same file on another machine; names may be as long as the system allows.
     draft = path.with_name(f".{path.name[:40]}.{os.getpid()}-{secrets.token_hex(4)}.draft")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path)
         draft.write_bytes(data.encode(errors="backslashreplace") if isinstance(data, str) else data)
         os.replace(draft, path)
     except OSError as error:  # a full disk, for one
@@ -166,6 +173,65 @@ def write_atomic(path: Path, data: str | bytes) -> Path:
         draft.unlink(missing_ok=True)
         raise
     return path
+
+
+def check_writable(path: Path) -> Path:
+    """Refuse a file that :func:`write_atomic` could not write, before the work for it begins.
+
+    Raises:
+        OSError: it is a folder, a pipe or a device, what should be its folder is a file, or nobody
+            may write there; ``filename`` is ``path``.
+    """
+    _refuse_special(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "it is a folder: choose a file", str(path))
+    check_writable_folder(path.parent, path)
+    return path
+
+
+def check_writable_folder(folder: Path, path: Path | None = None) -> Path:
+    """The same of a folder that is there, or is made; ``path`` is what the error names."""
+    name = str(folder if path is None else path)
+    place = _nearest_place(folder)
+    if not place.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, f"{place} is a file, not a folder", name)
+    if not os.access(place, os.W_OK | os.X_OK):
+        number = errno.EROFS if _is_read_only(place) else errno.EACCES
+        raise OSError(number, os.strerror(number), name)
+    return folder
+
+
+def _nearest_place(folder: Path) -> Path:
+    """The folder, or the nearest one above it that is there; or a file in its place."""
+    place = folder
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    return place
+
+
+def _is_read_only(place: Path) -> bool:
+    return bool(os.statvfs(place).f_flag & os.ST_RDONLY)
+
+
+def _refuse_special(path: Path) -> None:
+    """Refuse to replace a pipe, a socket or a device, or a link to one."""
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:  # such as a name that is too long
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise FileExistsError(errno.EEXIST, "it is a pipe or a device, not a file", str(path))
+
+
+def _make_folder(path: Path) -> None:
+    """Make the folder of a file."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        check_writable_folder(path.parent, path)
+        raise
 
 
 def remove_drafts(folder: Path) -> None:
@@ -199,6 +265,19 @@ def checksum(path: Path, most_bytes: int = MOST_TENSORS) -> str:
     return digest.hexdigest()
 
 
+def list_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints in a ``checkpoints/`` folder, the newest (by ``latest``, then by frames)
+    first.
+    """
+    checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
+    try:
+        latest = read_text(folder / LATEST).strip()
+    except (OSError, ValueError):
+        latest = ""
+    checkpoints.sort(reverse=True)
+    return sorted(checkpoints, key=lambda path: path.name != latest)
+
+
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
     holds.
@@ -223,7 +302,32 @@ def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     numbers = [*returns, *lengths, *(value for value in others if value is not None)]
     # what can be squared; NaN is one
     sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)
-    return sound and all(type(n) is int for n in lengths)
+    if not sound or not all(type(n) is int for n in lengths):
+        return False
+    if any((values.get(name) or 0) < 0 for name in ("frames", "seconds")):
+        return False
+    if {"returns", "lengths"} <= set(values) and not 0 < len(returns) == len(lengths):
+        return False
+    return not wrong_mean(values)
+
+
+def wrong_mean(values: Any) -> str:
+    """In what the mean of an ``eval.json`` is not that of its returns; empty if it is, or what
+    stands there are no numbers.
+    """
+    if not isinstance(values, dict) or "mean" not in values or not values.get("returns"):
+        return ""
+    try:
+        mean = float(values["mean"])
+        returns = list(map(float, values["returns"]))
+        actual = math.fsum(returns) / len(returns)
+        size = max(1.0, *map(abs, returns))
+    except (TypeError, ValueError, OverflowError):
+        return ""
+    is_equal = abs(mean - actual) <= MEAN_TOLERANCE * size  # no number is equal to NaN
+    if is_equal or (math.isnan(mean) and math.isnan(actual)):
+        return ""
+    return f"its mean is {mean:g}, but that of its {len(returns)} returns is {actual:g}"
 
 
 class CsvLog:

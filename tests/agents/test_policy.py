@@ -20,8 +20,9 @@ from arcade_torch.agents import (
     make_policy,
     preset,
 )
+from arcade_torch.agents.policy import check_network
 from arcade_torch.agents.runs.checkpoint import save_checkpoint
-from arcade_torch.models import make_network
+from arcade_torch.models import make_network, memory_names
 from arcade_torch.tools.measures.windows import resolve_agent
 from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
 
@@ -218,3 +219,23 @@ def test_an_option_that_is_true_or_false_takes_no_text(algorithm, name):
 def test_a_network_without_any_size_is_refused_in_one_line(name):
     with pytest.raises(ValueError, match=rf"^{name} must be at least 1 and at most \d+, got -4$"):
         build_network(preset("smoke", memory="gru", network_options={name: -4}))
+
+
+def refusal_of(function, config):
+    """What a function says of a config that it refuses."""
+    with pytest.raises((ValueError, TypeError)) as refusal:
+        function(config)
+    return str(refusal.value)
+
+
+@pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
+def test_a_network_is_checked_as_it_is_built_but_without_weights_or_draws(algorithm):
+    drawn = torch.random.get_rng_state()
+    for memory in (*memory_names(), "feedforward"):
+        check_network(preset("paper", memory=memory, algorithm=algorithm))
+        options = {"memory_options": {"zork": 1}}
+        wrong = preset("smoke", memory=memory, algorithm=algorithm, network_options=options)
+        assert refusal_of(check_network, wrong) == refusal_of(build_network, wrong)
+    huge = {"hidden_size": 2**15, "layers": 4}
+    check_network(preset("smoke", memory="gru", algorithm=algorithm, network_options=huge))
+    assert torch.equal(torch.random.get_rng_state(), drawn)

@@ -118,6 +118,10 @@ def test_every_command_explains_itself_with_an_example(
         (["train", "--preset", "smoke", "--seed", ""], "'' is no whole number"),
         (["train", "--preset", "smoke", "--seed=-1"], "seed"),
         (["train", "--preset", "smoke", "--seed", "1" + "0" * 30], "seed"),
+        (
+            ["record", "SignpostEasy", "--out", "-x.gif"],
+            "a value that begins with - is written --out=-x.gif",
+        ),
         (["demo", "--seeds", "0"], "give the number of seeds (1 to 10000)"),
     ],
 )
@@ -131,6 +135,15 @@ def test_bad_input_is_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     assert message in one_error(capsys, words)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_current_folder_that_was_removed_is_told_in_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "the current folder is not there any more" in one_error(capsys, ["list", "envs"])
 
 
 def test_an_unknown_game_is_named_with_the_nearest(

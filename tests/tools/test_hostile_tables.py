@@ -29,6 +29,10 @@ from tests.tools.fabricated import small_study, write_study
         {"mean": {}},
         {"lengths": [0.5]},
         {"frames": "x"},
+        {"frames": -1},
+        {"seconds": -0.5},
+        {"lengths": [3, 4]},
+        {"returns": [], "lengths": []},
     ],
 )
 def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(

@@ -2,14 +2,20 @@
 (on a pty).
 """
 
+import fcntl
 import os
 import pty
 import re
 import select
+import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -371,16 +377,12 @@ def test_the_screen_fits_the_terminal() -> None:
 
 
 def talk(
-    words: list[str], keys: list[bytes], size: tuple[int, int] = (24, 80)
+    words: list[str], keys: list[Any], size: tuple[int, int] = (24, 80)
 ) -> tuple[int, str, bytes]:
-    """Run the command on a pseudo terminal; each key is sent when the picture has been drawn
-    anew.
+    """Run the command on a pseudo terminal; each key is sent, or function called, when the picture
+    has been drawn anew.
     """
     master, slave = pty.openpty()
-    import fcntl
-    import struct
-    import termios
-
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", *size, 0, 0))
     before = termios.tcgetattr(slave)
     env = {
@@ -398,7 +400,11 @@ def talk(
         drawn = out.count(b"\x1b[J")
         if drawn > pictures and keys:
             pictures = drawn
-            os.write(master, keys.pop(0))
+            key = keys.pop(0)
+            if callable(key):
+                key(process, slave)
+            else:
+                os.write(master, key)
     process.kill()
     process.wait()
     while select.select([master], [], [], 0)[0]:
@@ -444,6 +450,32 @@ def test_a_terminal_plays_and_is_left_as_it_was(tmp_path: Path) -> None:
         "ann",
         "abandoned",
     )
+
+
+@pytest.mark.slow
+def test_ctrl_z_leaves_the_terminal_as_it_was_until_the_game_goes_on() -> None:
+    def stop(process: subprocess.Popen[bytes], slave: int) -> None:
+        playing = termios.tcgetattr(slave)
+        process.send_signal(signal.SIGTSTP)
+        os.waitpid(process.pid, os.WUNTRACED)
+        assert termios.tcgetattr(slave)[3] & termios.ICANON and not playing[3] & termios.ICANON
+        process.send_signal(signal.SIGCONT)
+
+    words = ["play", GAME, "--obs-size", "128", "--terminal"]
+    code, out, unread = talk(words, [b" ", stop, b"\x1b"])
+    assert (code, unread) == (0, b""), out
+    assert out.count("\x1b[?1049h") == out.count("\x1b[?1049l") == 2
+    assert out.split("\x1b[?1049h")[2].startswith("\x1b[?25l\x1b[2J\x1b[H")  # it is drawn anew
+
+
+def test_a_terminal_without_the_blocks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    for encoding, reason in (("utf-8", None), ("ascii", "text is written in ascii, without the")):
+        terminal = SimpleNamespace(isatty=lambda: True, encoding=encoding)
+        monkeypatch.setattr(sys, "stdin", terminal)
+        monkeypatch.setattr(sys, "stdout", terminal)
+        said = screens.why_no_terminal()
+        assert said is reason or reason in said
 
 
 def test_a_terminal_of_twenty_columns_shows_a_picture() -> None:

@@ -3,6 +3,7 @@ nothing.
 """
 
 import json
+import os
 import re
 import shutil
 from html.parser import HTMLParser
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arcade_torch.tools import gap_and_bias, players, report, reports
+from arcade_torch.tools import cli, gap_and_bias, players, report, reports
 from arcade_torch.tools.figures.style import agent_colours, drawing, svg
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
@@ -170,7 +171,8 @@ def test_a_run_without_a_score_is_not_averaged_away(tmp_path: Path, no_oracles: 
     study = small_study(subject="mingru")
     folder = write_study(tmp_path / "s", study)
     file = folder.run(study.runs()[0]).path / "eval.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": float("nan")}))
+    nan = float("nan")
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": nan, "returns": [nan, 0.5]}))
     parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
     page = report(folder.root, skip=parts).read_text()
     assert "is nan" in page  # in the place of gap and bias
@@ -350,3 +352,21 @@ def test_a_panel_with_nothing_in_it_is_left_out(tmp_path: Path, no_oracles: None
     write_study(tmp_path / "s", small_study(memories=["mlp"]))
     page = report(tmp_path / "s", skip=("saliency",)).read_text()
     assert "Observability Gap" in page and ">Memory Bias<" not in page
+
+
+def test_the_study_of_somebody_else_has_its_page_elsewhere_and_is_left_as_it_is(
+    tmp_path: Path, no_oracles: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_study(tmp_path / "s", small_study(subject="mingru"))
+    before = {path: path.stat().st_mtime_ns for path in folder.root.rglob("*")}
+    access = os.access
+    monkeypatch.setattr(
+        os,
+        "access",
+        lambda path, mode: not Path(path).is_relative_to(folder.root) and access(path, mode),
+    )
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    page = report(folder.root, tmp_path / "page.html", skip=parts)
+    assert "mingru" in page.read_text()
+    assert {path: path.stat().st_mtime_ns for path in folder.root.rglob("*")} == before
+    assert cli.main(["report", str(folder.root)]) == 2  # its own page cannot be written

@@ -53,6 +53,23 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
             {"sizes": ["1x8"], "settings": {"network_options": {"layers": 2}}},
             "settings may not hold network_options.layers: in this study the key sizes decides it",
         ),
+        (
+            {"settings": {"network_options": {"zork": 1}}},
+            "unknown network option zork; allowed are encoder, hidden_size",
+        ),
+        (
+            {"settings": {"network_options": {"hidden_size": -1}}},
+            "hidden_size must be at least 1 and at most 32768, got -1",
+        ),
+        ({"sizes": ["1x99999"]}, "hidden_size must be at least 1 and at most 32768, got 99999"),
+        (
+            {"settings": {"network_options": {"memory_options": {"zork": 1}}}},
+            "memory 'mingru' has other options: got an unexpected keyword argument 'zork'",
+        ),
+        ({"settings": {"network": "zork"}}, "unknown network 'zork': known are paper, small"),
+        ({"settings": {"env_options": {"zork": 1}}}, "has no option 'zork'"),
+        ({"settings": {"obs_size": 48}}, "obs_size is 48, allowed: 128, 256"),
+        ({"settings": {"rules": "zork"}}, "rules must be 'default' or 'reference'; got 'zork'"),
         ({"observability": "both"}, "must be full or partial, or a list of the two"),
         ({"memories": ["mlp", "mlp"]}, "memories names something twice"),
         ({"seeds": [0, 1, 1.0]}, "seeds names something twice"),
@@ -63,7 +80,7 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
 def test_what_the_report_would_refuse_is_refused_before_anything_runs(
     changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match=message) as refusal:
+    with pytest.raises((ValueError, TypeError), match=message) as refusal:
         study(small_study(**changes), tmp_path / "s", Fabricator(small_study()))
     assert not (tmp_path / "s").exists() and "\n" not in str(refusal.value)
 

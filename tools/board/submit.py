@@ -9,7 +9,7 @@ from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_values
-from arcade_torch.agents.runs.checkpoint import list_checkpoints
+from arcade_torch.agents.runs.files import list_checkpoints
 from arcade_torch.tools.board.entry import (
     BoardRun,
     Entry,
@@ -19,9 +19,9 @@ from arcade_torch.tools.board.entry import (
     settings_of,
 )
 from arcade_torch.tools.board.evaluation import Evaluator, Played, made_with, weights_hash
-from arcade_torch.tools.board.protocol import PROTOCOL, Protocol
-from arcade_torch.tools.comparable import FREE, Runs, find_runs
-from arcade_torch.tools.runs import Run
+from arcade_torch.tools.board.protocol import OBSERVATIONS, PROTOCOL, Protocol
+from arcade_torch.tools.comparable import Runs, find_runs
+from arcade_torch.tools.runs import FREE, Run
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how many runs are, and of how many."""
@@ -70,6 +70,7 @@ def submit(
     configs = [TrainConfig.from_dict(run.config) for run in runs]
     _check_group(runs, configs)
     shared, rest = settings_of(configs)
+    _check_draft(words, runs, configs, shared, rest, protocol)
     rows = list[BoardRun]()
     played = list[Played]()
     evaluator = Evaluator(protocol)
@@ -92,7 +93,14 @@ def _evaluated(
     checkpoint = last_checkpoint(run)
     weights = weights_hash(checkpoint)
     result = evaluator.play(checkpoint, config.observability)
-    row = BoardRun(
+    return _row(run, config, settings, weights, result), result
+
+
+def _row(
+    run: Run, config: TrainConfig, settings: Mapping[str, Any], weights: str, result: Played
+) -> BoardRun:
+    """What an entry says of a run."""
+    return BoardRun(
         game=config.env,
         twin=config.observability,  # type: ignore[arg-type]  # no mixed one passed
         seed=config.seed,
@@ -103,7 +111,26 @@ def _evaluated(
         seconds=float((run.final or {}).get("seconds", 0.0)),
         settings=settings,
     )
-    return row, result
+
+
+def _check_draft(
+    words: Words,
+    runs: Sequence[Run],
+    configs: Sequence[TrainConfig],
+    shared: Mapping[str, Any],
+    rest: Sequence[Mapping[str, Any]],
+    protocol: Protocol,
+) -> None:
+    """Refuse what needs no evaluation to be refused: words, a missing cell or checkpoint, as an
+    entry in which every score is 0.
+    """
+    nothing = "0" * 64
+    result = Played(0.0, 0.0, 0.0, nothing, 0, 0, OBSERVATIONS)
+    rows = list[BoardRun]()
+    for run, config, settings in zip(runs, configs, rest, strict=True):
+        last_checkpoint(run)
+        rows.append(_row(run, config, settings, nothing, result))
+    check_protocol(_entry(words, configs[0], shared, rows, [result], protocol), protocol)
 
 
 def _entry(

@@ -6,7 +6,7 @@ from typing import Any
 
 import tyro
 
-from arcade_torch.agents.runs.files import write_atomic, write_json
+from arcade_torch.agents.runs.files import check_writable_folder, write_atomic, write_json
 from arcade_torch.tools.cards.study import FRAMES, GAMES, SEEDS
 from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.options import Command, at_least, command_line
@@ -48,6 +48,7 @@ class Card(Command):
 
         at_least(self, frames=1, seeds=1, workers=0)
         names = self.selection()
+        check_writable_folder(self.out)
         for name in names:
             make_memory(name, 1, 1)  # refuses a name that is none, before anything is measured
         failed = 0

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import tyro
 
+from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.tools.options import Command, at_least
 from arcade_torch.tools.text import say
 
@@ -43,6 +44,7 @@ class Submit(Command):
         file = self.out / file_name(self.name)
         if file.exists() and not self.replace:
             raise FileExistsError(f"{file} exists: give another --name, or --replace")
+        check_writable(file)
         words = Words(self.name, self.url, self.commit, self.note, self._checkpoints())
         entry = submit(self.runs, words, self.memory, self.seeds, progress=say_progress)
         write_entry(file, entry)
@@ -97,6 +99,8 @@ class Check(Command):
             )
         if self.retrain and self.pull:
             raise ValueError("give --pull or --retrain, not both: --pull fetches checkpoints")
+        if self.record:
+            check_writable(record_file(self.file))
         weights: Origin = "kept"
         if self.pull or self.retrain:
             weights = "pulled" if self.pull else "retrained"

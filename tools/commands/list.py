@@ -7,6 +7,7 @@ from typing import Literal
 
 import tyro
 
+from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.envs_jax import make, registered_ids, resolve_id
 from arcade_torch.envs_jax.game import MEMORY_KINDS
 from arcade_torch.tools import players
@@ -64,8 +65,11 @@ class List(Command):
         ids = [resolve_id(name) for name in self.games] or registered_ids()
         rows = []
         total = len(ids) * len(players.PLAYERS)
+        out = check_writable(self.out or BASELINES)
+        if self.page is not None:
+            check_writable(self.page)
         with Bars() as bars:
-            for row in players.measure_all(ids, self.episodes, self.seconds, self.out or BASELINES):
+            for row in players.measure_all(ids, self.episodes, self.seconds, out):
                 rows.append(row)
                 bars.update("players", len(rows), total, f"{row.id} {row.player} {row.mean:.3f}")
         table = players.markdown(rows)
@@ -81,13 +85,14 @@ class List(Command):
         if self.steps and len(ids) != 1:
             raise ValueError(f"--steps draws a strip of one game: name one, got {len(ids)}")
         ids = ids or [id for id in registered_ids() if f"{self.level}-v" in id]
+        out = check_writable(self.out or Path("games.png"))
         with Bars(first_line_s=0.0) as bars:
 
             def show(id: str, done: int) -> None:
                 bars.update("sheet", done, len(ids), id)
 
             picture = strip(ids[0], self.steps) if self.steps else sheet(ids, progress=show)
-        say(write_png(self.out or Path("games.png"), picture).resolve())
+        say(write_png(out, picture).resolve())
 
     def _envs(self) -> None:
         games = [make(env_id) for env_id in registered_ids()]

@@ -7,7 +7,7 @@ from pathlib import Path
 import tyro
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.runs.files import read_bytes, write_atomic
+from arcade_torch.agents.runs.files import check_writable_folder, read_bytes, write_atomic
 from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import import_again
 from arcade_torch.tools.options import Command, at_least
@@ -52,6 +52,7 @@ class Push(Command):
         require(into_folder or hub.is_repo(self.repo), "the repository", self.repo, allowed)
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(self.repo).expanduser() if into_folder else Path(scratch) / "agent"
+            check_writable_folder(folder)
             name = "" if into_folder else self.repo
             results = share(run, folder, name, self.episodes, self.half, self.film)
             place = str(folder)
@@ -87,7 +88,13 @@ class Pull(Command):
         from arcade_torch.agents import hub
         from arcade_torch.agents.policy import agent_of
         from arcade_torch.agents.pretrained import read_shared
-        from arcade_torch.agents.runs.bundle import CONFIG, MOST_BYTES, WEIGHTS, check_hash
+        from arcade_torch.agents.runs.bundle import (
+            CONFIG,
+            MOST_BYTES,
+            WEIGHTS,
+            check_hash,
+            is_bundle,
+        )
         from arcade_torch.agents.runs.files import checksum
         from arcade_torch.tools.sharing.share import EVALUATION, FILMS, README, RESULTS
 
@@ -103,9 +110,15 @@ class Pull(Command):
             require(hub.is_repo(self.repo), "the repository", self.repo, allowed)
             source = hub.download(self.repo, sizes, extras, self.revision)
         agent = agent_of(read_shared(source, self.sha256), "cpu")
+        if source.is_dir() and not is_bundle(source):
+            raise ValueError(
+                f"{source} is no agent that was shared, it has no {WEIGHTS}: a run folder can be "
+                "used as it is, or pushed into a folder first"
+            )
         out = self.out or Path("agents") / source_name(self.repo)
         if out.exists():
             raise FileExistsError(f"{out} exists: choose another folder with --out")
+        check_writable_folder(out)
         for name in (CONFIG, WEIGHTS, *extras):
             if (source / name).is_file():
                 write_atomic(out / name, read_bytes(source / name, sizes[name]))

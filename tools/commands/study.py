@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import Command, command_line
 from arcade_torch.tools.studies.engines import Engine, RayOptions
@@ -203,5 +204,6 @@ def write_page(study: Path, out: Path | None = None, **options: Any) -> None:
     from arcade_torch.tools.progress import Bars
     from arcade_torch.tools.reports import report
 
+    check_writable(study / "report.html" if out is None else out)
     with Bars() as bars:
         say(f"report: {report(study, out, progress=bars.update, **options).resolve()}")

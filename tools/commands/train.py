@@ -10,7 +10,7 @@ import tyro
 
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
-from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.agents.runs.files import check_writable, read_json, write_json
 from arcade_torch.tools.imports import import_again, imports_of, load_agent
 from arcade_torch.tools.memory_files import check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
@@ -160,6 +160,8 @@ class Evaluate(Command):
 
         if self.json is not None and self.json.exists():
             raise FileExistsError(f"{self.json} exists: choose another file")
+        if self.json is not None:
+            check_writable(self.json)
         agent = load_agent(self.run_folder)
         result = evaluate(agent, self.observability, self.episodes)
         config = agent.config

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import NamedTuple
 
 from arcade_torch.agents.checked import require
+from arcade_torch.agents.runs.files import check_writable, check_writable_folder
 from arcade_torch.tools.figures import (
     NUMBERS,
     PICTURES,
@@ -20,6 +21,9 @@ from arcade_torch.tools.measures.counterfactual import CounterfactualOptions
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
 from arcade_torch.tools.measures.recall_density import DensityOptions
 from arcade_torch.tools.measures.saliency import SaliencyOptions
+
+OF_FILES = (*PICTURES, *NUMBERS, ".jpg", ".jpeg", ".gif", ".webp", ".tif", ".tiff", ".eps", ".ps")
+"""Endings that no folder has, in capitals either: somebody means a file."""
 
 
 class Entry(NamedTuple):
@@ -140,6 +144,7 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
         raise ValueError("name at least one run folder")
     if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):
         raise ValueError(f"this figure has several files: give a folder, not --out {options.out}")
+    _check_out(options)
     module, _, maker = entry.maker.rpartition(".")
     make = getattr(import_module(f"arcade_torch.tools.{module}"), maker)
     with drawing(options.style):
@@ -147,3 +152,15 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
         for picture in result.pictures:
             result.files += save(options, picture)
     return result
+
+
+def _check_out(options: Options) -> None:
+    """Refuse files that cannot be written, before the work for them begins."""
+    base, endings = options.path("figure")
+    if len(endings) == 1:
+        check_writable(base.with_name(base.name + endings[0]))
+        return
+    is_folder = base.parent.suffix.lower() not in OF_FILES
+    allowed = f"a folder, or a file that ends in {', '.join((*PICTURES, *NUMBERS))}"
+    require(is_folder, "--out", str(base.parent), allowed)
+    check_writable_folder(base.parent)

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 import arcade_torch
-from arcade_torch.agents.runs.checkpoint import list_checkpoints
+from arcade_torch.agents.runs.files import list_checkpoints
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.imports import load_agent

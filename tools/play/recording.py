@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.agents.runs.files import check_writable, write_atomic
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax import ACTION_NAMES, make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
@@ -101,8 +101,7 @@ def recorded_frames(
 def writer_for(path: Path) -> Callable[[Path, Iterable[Frame], float], Path]:
     """The writer that a file's name asks for."""
     require(path.suffix in FASTEST_FPS, "the film", str(path), "a file that ends in .gif or .mp4")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: choose a file")
+    check_writable(path)
     need("PIL" if path.suffix == ".gif" else "imageio_ffmpeg")
     return write_gif if path.suffix == ".gif" else write_mp4
 

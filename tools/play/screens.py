@@ -6,11 +6,13 @@ import os
 import re
 import select
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import groupby
+from types import FrameType
 
 import numpy as np
 
@@ -61,6 +63,7 @@ _REST_WITHIN_S = 0.05  # the rest of an arrow key's sequence arrives within this
 _ENTER = "\x1b[?1049h\x1b[?25l\x1b[2J"
 _LEAVE = "\x1b[0m\x1b[?25h\x1b[?1049l"
 _COLOURS = "\x1b[38;2;{};{};{};48;2;{};{};{}m"
+_HALF_BLOCK = "\u2580"
 _TEXT_ROWS = 2
 
 
@@ -159,10 +162,14 @@ def play_in_terminal(session: Session, watched: Watched | None = None) -> None:
         raise ValueError(f"playing needs a window or a terminal, and this is neither: {reason}")
     # before the terminal is changed: an interruption of imports ends the process at once
     need("PIL.Image")
-    with _raw_terminal() as source:
+
+    def draw() -> None:
+        size = shutil.get_terminal_size()
+        _write(screen(session, size.columns, size.lines))
+
+    with _raw_terminal(draw) as source:
         while not session.closed:
-            size = shutil.get_terminal_size()
-            print(screen(session, size.columns, size.lines), end="", flush=True)
+            draw()
             if watched is not None and not select.select([source], [], [], watched.wait_s)[0]:
                 watched.press(session)
                 continue
@@ -185,26 +192,55 @@ def why_no_terminal() -> str | None:
         return f"{' and '.join(redirected)} {verb} redirected"
     if os.environ.get("TERM", "") in ("dumb", "unknown"):
         return f"TERM is {os.environ['TERM']}, a terminal that shows no pictures"
+    try:
+        _HALF_BLOCK.encode(sys.stdout.encoding)
+    except UnicodeEncodeError:
+        return f"text is written in {sys.stdout.encoding}, without the blocks of UTF-8 to draw with"
     return None
 
 
 @contextmanager
-def _raw_terminal() -> Iterator[int]:
+def _raw_terminal(draw: Callable[[], None]) -> Iterator[int]:
     """Keys one by one and unseen, on a screen of our own; everything as before afterwards, whatever
-    happens.
+    happens, and while Ctrl-Z stops this process; then the screen is drawn anew.
     """
     import termios
     import tty
 
     source = sys.stdin.fileno()
     before = termios.tcgetattr(source)
-    try:
+    sys.stdout.flush()
+
+    def enter() -> None:
         tty.setcbreak(source)
-        print(_ENTER, end="")
+        _write(_ENTER)
+
+    def leave() -> None:
+        termios.tcsetattr(source, termios.TCSADRAIN, before)
+        _write(_LEAVE)
+
+    def pause(number: int, frame: FrameType | None) -> None:
+        leave()
+        os.kill(os.getpid(), signal.SIGSTOP)
+        enter()
+        draw()
+
+    handler = signal.getsignal(signal.SIGTSTP)
+    try:
+        if handler is signal.SIG_DFL:
+            signal.signal(signal.SIGTSTP, pause)
+        enter()
         yield source
     finally:
-        termios.tcsetattr(source, termios.TCSADRAIN, before)
-        print(_LEAVE, end="", flush=True)
+        signal.signal(signal.SIGTSTP, handler)
+        leave()
+
+
+def _write(text: str) -> None:
+    """Write to the terminal past Python's buffers, which a handler of signals may not enter."""
+    data = text.encode(sys.stdout.encoding, "backslashreplace")
+    while data:
+        data = data[os.write(sys.stdout.fileno(), data) :]
 
 
 def decode_keys(data: bytes) -> list[str]:
@@ -242,6 +278,6 @@ def half_blocks(frame: Frame, height: int, width: int) -> list[str]:
         line = ""
         for (top, bottom), cells in groupby(zip(upper, lower, strict=True)):
             count = len(list(cells))
-            line += _COLOURS.format(*top, *bottom) + "\u2580" * count
+            line += _COLOURS.format(*top, *bottom) + _HALF_BLOCK * count
         lines.append(line + "\x1b[0m")
     return lines

@@ -15,7 +15,6 @@ from arcade_torch.tools.errors import need
 from arcade_torch.tools.exploring import stopped_exploring
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
-from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import import_again
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.bootstrap import pooled
@@ -37,7 +36,7 @@ from arcade_torch.tools.reports.findings import (
 )
 from arcade_torch.tools.reports.panels import Finals
 from arcade_torch.tools.reports.subject import subject_section
-from arcade_torch.tools.runs import open_run
+from arcade_torch.tools.runs import check_mean, open_run
 from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
@@ -92,7 +91,7 @@ def report(
     environment = page_environment()
     folder = StudyFolder(Path(root))
     study = folder.load()
-    rows = folder.write_results(study)
+    rows = folder.write_results(study) if folder.is_writable else folder.rows(study)
     runs = _finished_runs(folder, study, rows)
     if not runs.runs:
         raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
@@ -173,6 +172,8 @@ def _finished_runs(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str
             run = open_run(folder.run(spec).path)
             if run is not None:
                 runs.append(run)
+        elif row["status"] == "unfinished":
+            check_mean(folder.run(spec).path)
     return Runs(tuple(runs))
 
 
@@ -326,7 +327,7 @@ def _scores(
     for name in sorted(METRICS, key=lambda name: name != metric):
         try:
             tables[name] = gap_and_bias(runs.scores(name), metric=name, baseline=study.baseline)
-            write_csv(folder.analysis / f"gap_bias_{name}.csv", tables[name].table())
+            folder.keep_table(f"gap_bias_{name}.csv", tables[name].table())
         except ValueError as error:
             trouble = trouble or str(error)
     table = tables.get(metric)

@@ -9,7 +9,6 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.tools.comparable import Runs, listed
 from arcade_torch.tools.errors import one_line
 from arcade_torch.tools.figures.style import TWIN_NAMES
-from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import ImportRefusedError, import_again
 from arcade_torch.tools.measures.bootstrap import measured_coverage
 from arcade_torch.tools.measures.gap_bias.measure import TWINS
@@ -36,7 +35,7 @@ def subject_section(
         for score in scores
         if score.agent == subject and score.observability in TWINS
     )
-    write_csv(folder.analysis / f"differences_{metric}.csv", pair_rows(table, subject))
+    folder.keep_table(f"differences_{metric}.csv", pair_rows(table, subject))
     others = list(dict.fromkeys(pair.other for pair in table))
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     has_one_game = len({pair.game for pair in table if pair.game}) == 1

@@ -60,7 +60,9 @@ def share(
     _check_free(folder)
     checkpoint = find_checkpoint(run)
     record = _record_of(run)
-    training = {"versions": record.get("versions", {}), "command": _command(record)}
+    packages = record.get("versions")
+    made_by = packages if isinstance(packages, dict) else {}
+    training = {"versions": made_by, "command": _command(record)}
     needs = [Path(name).name for name in remembered_imports(record, run / CONFIG)]
     write_bundle(folder, checkpoint, training | {"needs": needs}, half)
     stored = load_bundle(folder)
@@ -99,6 +101,8 @@ def _command(record: dict[str, Any]) -> str:
     words = record.get("command", [])
     if isinstance(words, str):
         return words
+    if not isinstance(words, list):  # somebody changed the file
+        return ""
     kept = ["arcade-torch"]
     skips = False
     for word in map(str, words[1:]):

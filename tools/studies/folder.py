@@ -14,7 +14,8 @@
 """
 
 import contextlib
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +24,12 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.envs_jax import resolve_id
-from arcade_torch.tools.comparable import FREE
 from arcade_torch.tools.files import write_csv
 from arcade_torch.tools.imports import imports_of
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.names import bare_name, preset_size
 from arcade_torch.tools.options import command_line
-from arcade_torch.tools.runs import Run, described, read_record
+from arcade_torch.tools.runs import FREE, Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
@@ -69,6 +69,16 @@ class StudyFolder:
     def analysis(self) -> Path:
         """Folder for numbers and figures made from the runs."""
         return self.root / "analysis"
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether files may be written here; the study of somebody else may be read alone."""
+        return os.access(self.root, os.W_OK)
+
+    def keep_table(self, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write a table into `analysis`, where files may be written."""
+        if self.is_writable:
+            write_csv(self.analysis / name, rows)
 
     def note_failure(self, spec: RunSpec, error: str) -> None:
         """Keep why a run failed, or forget it where ``error`` is empty."""
@@ -187,6 +197,14 @@ class StudyFolder:
         ``finished`` keeps the rows of finished runs from one call to the next: they are not read
         again.
         """
+        rows = self.rows(study, finished)
+        write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
+        timed = [row for row in rows if row["seconds"] is not None]
+        write_csv(self.root / "timings.csv", timed, TIMING_COLUMNS)
+        return rows
+
+    def rows(self, study: Study, finished: dict[RunSpec, Row] | None = None) -> list[Row]:
+        """The rows that `write_results` writes, of a folder that is left as it is."""
         finished = {} if finished is None else finished
         rows = list[Row]()
         for run in study.runs():
@@ -194,9 +212,6 @@ class StudyFolder:
             if row["status"] == "finished":
                 finished[run] = row
             rows.append(row)
-        write_csv(self.root / "results.csv", rows, RESULT_COLUMNS)
-        timed = [row for row in rows if row["seconds"] is not None]
-        write_csv(self.root / "timings.csv", timed, TIMING_COLUMNS)
         return rows
 
     def _row(self, spec: RunSpec) -> Row:

@@ -9,7 +9,7 @@ import shutil
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -167,7 +167,33 @@ def planned(plan: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     part, parts = map(int, match.groups()) if match else (0, 0)
     if not 1 <= part <= parts:
         raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
-    return plan.configs(plan.runs()[part - 1 :: parts])
+    configs = plan.configs(plan.runs()[part - 1 :: parts])
+    _check_options(configs.values())
+    return configs
+
+
+def _check_options(configs: Iterable[TrainConfig]) -> None:
+    """Refuse options of games, networks and memories that each run would refuse when it begins."""
+    from arcade_torch.agents.policy import check_network
+    from arcade_torch.envs_jax import make
+
+    games = set[str]()
+    networks = set[str]()
+    for config in configs:
+        of_game: dict[str, Any] = {
+            "obs_size": config.obs_size,
+            "rules": config.rules,
+            **config.env_options,
+        }
+        game = repr((config.env, of_game))
+        if game not in games:
+            make(config.env, **of_game)
+            games.add(game)
+        parts = (config.network, config.network_options, config.memory, config.algorithm)
+        network = repr((parts, config.obs_size))
+        if network not in networks:
+            check_network(config)
+            networks.add(network)
 
 
 def _check_names(plan: Study) -> None:

@@ -3,6 +3,7 @@
 import copy
 import json
 import random
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,17 @@ from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
 from arcade_torch.tools.board.entry import EntryRefusedError
-from arcade_torch.tools.board.evaluation import Evaluator, Played
+from arcade_torch.tools.board.evaluation import Evaluator
 from arcade_torch.tools.board.submit import submit
 from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
 
 Plain = dict[str, Any]
-NOTHING = Played(0.0, 0.0, 0.0, "0" * 64, 1, 1, ("pixels",))
+
+
+def no_episodes(*arguments: Any) -> Any:
+    raise AssertionError("an agent was evaluated")
+
+
 """What an agent that is not played scored."""
 
 
@@ -304,7 +310,7 @@ def test_a_record_cannot_claim_more_than_it_checked() -> None:
         ),
     ],
 )
-def test_runs_that_are_no_entry_are_refused(
+def test_runs_that_are_no_entry_are_refused_before_they_are_evaluated(
     changes: Plain, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other_twin = changes.get("observability") == "partial"
@@ -313,6 +319,27 @@ def test_runs_that_are_no_entry_are_refused(
     else:
         write_pair(tmp_path)
     write_run(tmp_path, **({"observability": "full"} | changes))
-    monkeypatch.setattr(submits.Evaluator, "play", lambda *arguments: NOTHING)
+    monkeypatch.setattr(submits.Evaluator, "play", no_episodes)
     with pytest.raises(ValueError, match=message):
+        submit([tmp_path], WORDS, protocol=SHORT)
+
+
+@pytest.mark.parametrize("words", [{"name": "../x"}, {"commit": "main"}, {"url": "http://x"}])
+def test_words_that_no_entry_has_are_refused_before_runs_are_evaluated(
+    words: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    monkeypatch.setattr(submits.Evaluator, "play", no_episodes)
+    with pytest.raises(ValueError, match=f"{next(iter(words))} must be"):
+        submit([tmp_path], replace(WORDS, **words), protocol=SHORT)
+
+
+def test_runs_without_the_checkpoint_of_their_end_are_refused_before_any_is_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    last = max(tmp_path.glob("*/checkpoints/frames-*"))
+    shutil.rmtree(last)
+    monkeypatch.setattr(submits.Evaluator, "play", no_episodes)
+    with pytest.raises(EntryRefusedError, match="has no checkpoint frames-"):
         submit([tmp_path], WORDS, protocol=SHORT)
