@@ -15,10 +15,10 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueModule
 
+from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.forward import evaluating, last_outputs
-from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.bundle import find_checkpoint
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
