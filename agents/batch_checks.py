@@ -95,7 +95,7 @@ def check_order(batch: TensorDictBase, cut: Tensor) -> None:
 
     Args:
         batch: [N] with entries [N, L, ...].
-        cut: bool [N, L], steps behind which an episode or its record ends.
+        cut: bool [N, L], steps behind which an episode or its record ends, and padding.
     """
     if "final_index" in batch:
         return

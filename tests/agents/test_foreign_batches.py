@@ -11,6 +11,7 @@ from tensordict import TensorDict, lazy_stack
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors.utils import split_trajectories
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.modules import PopArtValueNorm
 
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, make_actor
@@ -301,6 +302,29 @@ def test_padding_is_no_part_of_loss_or_gradient(make, key):
         found.append((value(loss, form), gradients))
     for other in found[1:]:
         torch.testing.assert_close(other, found[0], atol=1e-5, rtol=1e-5)
+
+
+@LOSSES
+@pytest.mark.parametrize("is_flat", [True, False])
+def test_slices_that_a_sampler_pads_count_as_those_that_it_does_not(make, is_flat):
+    losses = []
+    for pads in (True, False):
+        sampler = SliceSampler(
+            slice_len=4, traj_key=("collector", "traj_ids"), strict_length=False, pad_output=pads
+        )
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(36), sampler=sampler, batch_size=24
+        )
+        batch = ppo_batch(steps=9, ends=0.3)
+        zeros = {key: torch.zeros_like(batch[key]) for key in batch.keys(True, True)}
+        batch.update({key: zero for key, zero in zeros.items() if key[0] == "memory"})
+        loss = make()
+        buffer.extend((loss.value_estimator(batch) if make is ppo_loss else batch).reshape(-1))
+        torch.manual_seed(0)
+        drawn = buffer.sample()
+        assert ("collector", "mask") in drawn or not pads
+        losses.append(value(loss, drawn if is_flat or not pads else drawn.reshape(-1, 4)))
+    torch.testing.assert_close(*losses, atol=1e-6, rtol=1e-5)
 
 
 def test_a_norm_of_advantages_learns_from_no_padding():
