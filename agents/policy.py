@@ -22,6 +22,7 @@ from arcade_torch.agents.forward import evaluating, last_outputs
 from arcade_torch.agents.runs.bundle import find_checkpoint
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
+from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.models.actor_critic import (
     ActorCriticNetwork,
     current_names,
@@ -228,7 +229,7 @@ def build_network(config: TrainConfig) -> Network:
         **config.network_options,
     }
     # on the CPU, whatever torch's default device is: there the seed says what is drawn
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+    with plain_torch(), torch.random.fork_rng(devices=[]), torch.device("cpu"):
         torch.default_generator.manual_seed(config.seed)
         network: Network = make(
             config.network, memory=config.memory, obs_size=config.obs_size, **options
