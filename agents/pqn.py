@@ -180,7 +180,8 @@ class PQNLoss(LossModule):
         prepared = "position" in tensordict
         data = tensordict if prepared else self.prepare(tensordict)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
-        require(steps > 0, "bootstrap", self.bootstrap, "'next' where sequences are of one step")
+        if steps == 0:
+            raise ValueError("bootstrap must be 'next' where sequences are of one step; got 'last'")
         with self._with_parameters():
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         chosen = _chosen_values(q, data["position"][:, :steps], data["action"][:, :steps])
