@@ -70,8 +70,8 @@ class Trainer:
             if device.type == "cuda"
             else torch.default_generator
         )
-        own = torch.Generator(self.random.device).manual_seed(config.seed)
-        self.random_state = own.get_state()
+        generator = torch.Generator(self.random.device).manual_seed(config.seed)
+        self.random_state = generator.get_state()
         with self._own_settings():
             self._make(device, replay_folder)
 
@@ -233,9 +233,9 @@ class Trainer:
             self.learner.load_state_dict(state)
             self.acting.load_state_dict(checkpoint.weights)
             self.network.load_state_dict(state.get("network") or checkpoint.weights)
-            own = torch.Generator(self.random.device)
-            own.set_state(state["explore"].cpu())  # refuses what is no state
-            self.random_state = own.get_state()
+            generator = torch.Generator(self.random.device)
+            generator.set_state(state["explore"].cpu())  # refuses what is no state
+            self.random_state = generator.get_state()
             self.shuffle.set_state(state["shuffle"])
             self.collector.load_state_dict(state["collector"], strict=False)
             self.stats.load_state_dict(state["stats"])
