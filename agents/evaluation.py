@@ -11,6 +11,7 @@ import arcade_torch
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
+from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.envs_jax.checks import check_ends
 
 MOST_EPISODES = 2**16
@@ -97,6 +98,7 @@ def make_eval_env(
     return make_env(config, episodes, held_out_seed(0), observability)
 
 
+@plain_torch()
 @torch.no_grad()
 def evaluate(
     agent: Any,

@@ -15,11 +15,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
+from arcade_torch.agents.batch_checks import (
+    Key,
+    check_order,
+    check_stored_states,
+    entry,
+    flat,
+    is_stock,
+    step_mask,
+)
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.rollout_buffer import final_key
-
-Key = str | tuple[str, ...]
 
 
 class NetworkInputs:
@@ -34,17 +41,12 @@ class NetworkInputs:
         self.observation_keys = [key for key in keys if key not in self.state_keys]
         self.final_keys = {key: final_key(key) for key in keys}
         self.stores = set()
+        self.start_keys: set[Key] = {"is_init"}
         for module in network.modules():
             if isinstance(module, MemoryModule | MemoryNetwork):
                 self.stores.add(module.store)
+                self.start_keys.add(module.recurrence.is_init_key)
         self.reads_first_state_only = self.stores == {"sequence"}
-
-
-def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
-    """Whether a batch has TorchRL's layout [..., L], not that of sequences [N] with entries [N, L,
-    ...].
-    """
-    return batch.ndim != 1 or _get(batch, is_init).ndim == 2
 
 
 def insert_final_observations(
@@ -67,14 +69,15 @@ def insert_final_observations(
         time_limit: ``"bootstrap"``: a truncated step needs its true next observation;
             ``"terminal"``: it does not.
         burn_in: first steps that only bring the recurrent state up to date; they are kept apart.
-        **names: other names of ``action``, ``is_init``, ``reward``, ``terminated``, ``truncated``.
+        **names: other names of ``action``, ``is_init``, ``reward``, ``done``, ``terminated``,
+            ``truncated``.
 
     Returns:
         TensorDict [N] with ``extended`` [N, L + K] (what the network reads), ``position`` int64 [N,
         L] (where each step's observation stands; its true successor stands right behind it),
         ``burn_in`` [N, burn_in], ``initial_state`` [N], ``reward``, ``terminated``, ``cut`` (the
-        episode or its record ends here), and ``action``, ``stored_target`` (DQN's, if the batch has
-        it) [N, L, ...]; L without burn-in.
+        episode or its record ends here), and ``action``, ``stored_target`` (DQN's) and ``mask`` (of
+        padded rows), if the batch has them, [N, L, ...]; L without burn-in.
 
     Raises:
         KeyError: an entry is missing; names it.
@@ -82,16 +85,20 @@ def insert_final_observations(
             follow each other.
     """
     batch = _as_sequences(_rename(batch, names), inputs, burn_in)
-    terminated, cut = _ends(batch, time_limit)
-    _check_order(batch, cut)
+    mask = step_mask(batch, flat(batch, "is_init").shape)
+    terminated, cut = _ends(batch, mask, time_limit)
+    check_order(batch, cut if mask is None else cut | ~mask)
 
     # The true next observation is needed where the record stops but the task goes on.
     final_steps, used = _final_places(batch, needed=cut & ~terminated)
     order, position = _order_in_time(cut.shape[1], final_steps, used, burn_in)
 
     outcomes = {"terminated": terminated, "cut": cut}
-    outcomes["reward"] = _flat(batch, ("next", "reward"))
-    outcomes["action"] = _get(batch, "action")
+    outcomes["reward"] = _in_full(flat(batch, ("next", "reward")))
+    outcomes["action"] = entry(batch, "action")
+    if mask is not None:
+        outcomes["mask"] = mask
+        outcomes["reward"] = outcomes["reward"].where(mask, 0)  # NaN times a trace of 0 is NaN
     if "stored_target" in batch:
         outcomes["stored_target"] = batch["stored_target"]
 
@@ -110,29 +117,33 @@ def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
             "the batch must be one without MultiStep: use lmbda; got 'steps_to_next_obs'"
         )
     batch = batch.copy()
+    truncated = unravel_key(("next", names.get("truncated", "truncated")))
+    done = unravel_key(("next", names.pop("done", "done")))
     # an env of TorchRL need not have it; done is there, and beside terminated it says the same
-    if ("next", "truncated") not in batch and ("next", "done") in batch:
-        batch["next", "truncated"] = batch["next", "done"]
+    if truncated not in batch and done in batch:
+        batch[truncated] = batch[done]
     for name, given in names.items():
         if name in ("reward", "terminated", "truncated"):
-            batch["next", name] = _get(batch, unravel_key(("next", given)))
+            batch["next", name] = entry(batch, unravel_key(("next", given)))
         else:
-            batch[name] = _get(batch, given)
+            batch[name] = entry(batch, given)
     return batch
 
 
 def _as_sequences(batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> TensorDictBase:
     """The batch with one sequence a row, entries [N, L, ...], and start flags [N, L, 1]."""
     if is_stock(batch):
-        _check_stored_states(batch, inputs)
+        check_stored_states(batch, inputs)
         if burn_in and batch.ndim == 1 and bool(batch["is_init"][1:].any()):
             raise ValueError(
                 "burn_in must be 0 for a flat batch of several slices: reshape it to [slices, "
                 f"length]; got {burn_in}"
             )
         batch = batch.reshape(-1, batch.shape[-1])
-    is_init = _flat(batch, "is_init")
-    batch["is_init"] = is_init.unsqueeze(-1)
+    is_init = flat(batch, "is_init").bool()
+    for key in inputs.start_keys:
+        if key in batch:
+            batch[key] = flat(batch, key).bool().unsqueeze(-1)
     if burn_in >= is_init.shape[1]:
         raise ValueError(
             f"burn_in must be less than the {is_init.shape[1]} steps of the batch; got {burn_in}"
@@ -140,46 +151,32 @@ def _as_sequences(batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) ->
     return batch
 
 
-def _ends(batch: TensorDictBase, time_limit: str) -> tuple[Tensor, Tensor]:
+def _ends(batch: TensorDictBase, mask: Tensor | None, time_limit: str) -> tuple[Tensor, Tensor]:
     """Behind which steps the task ends, and behind which an episode or its record ends; bool [N,
     L].
     """
-    terminated = _flat(batch, ("next", "terminated"))
-    done = terminated | _flat(batch, ("next", "truncated"))
-    is_init = _flat(batch, "is_init")
+    terminated = flat(batch, ("next", "terminated")).bool()
+    done = terminated | flat(batch, ("next", "truncated")).bool()
+    is_init = flat(batch, "is_init")
 
     # The record ends where the next step opens an episode, and with the last step of a row.
     last = torch.ones_like(is_init[:, :1])
     cut = done | torch.cat((is_init[:, 1:], last), dim=1)
 
     # TorchRL pads trajectories: zeros follow, up to the length of the longest.
-    for key in ("mask", ("collector", "mask")):
-        mask = _flat(batch, key) if key in batch else None
-        if mask is not None and mask.shape == cut.shape:
-            cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]
+    if mask is not None:
+        cut[:, :-1] |= mask[:, :-1] & ~mask[:, 1:]
 
     if time_limit == "terminal":
         terminated = done
     return terminated, cut
 
 
-def _check_order(batch: TensorDictBase, cut: Tensor) -> None:
-    """Refuse a stock batch of shuffled steps."""
-    if "final_index" in batch:
-        return
-    follows = {}
-    if "step_count" in batch and ("next", "step_count") in batch:
-        after = _flat(batch, ("next", "step_count"))
-        follows["step_count"] = after[:, :-1] == _flat(batch, "step_count")[:, 1:]
-    trajectory = ("collector", "traj_ids")
-    if trajectory in batch:  # steps of two envs may be counted as if they were of one
-        numbers = _flat(batch, trajectory)
-        follows["('collector', 'traj_ids')"] = numbers[:, :-1] == numbers[:, 1:]
-    for name, same in follows.items():
-        if not bool((cut[:, :-1] | same).all()):
-            raise ValueError(
-                f"{name} must be that of whole sequences, never shuffled; got a jump within a row"
-            )
+def _in_full(reward: Tensor) -> Tensor:
+    """Rewards in single precision at least: discounts in half would be off by a thousandth."""
+    if reward.is_floating_point() and reward.itemsize < torch.float32.itemsize:
+        return reward.float()
+    return reward
 
 
 def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,7 +244,9 @@ def _add_observations(
     extended = TensorDict(batch_size=order.shape)
     before = TensorDict(batch_size=[len(order), burn_in])
     for key in keys:
-        observation = _get(batch, key)
+        observation = entry(batch, key)
+        if key in inputs.state_keys:
+            observation = observation.detach()  # what was stored is no way back to older steps
         final = _next(batch, key, final_steps, inputs)
         both = torch.cat((observation[:, burn_in:], final), dim=1)
         extended[key] = _rows(both, order)
@@ -270,7 +269,7 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
                 "it run while collecting, TensorDictSequential(critic, actor); got "
                 f"{', '.join(map(str, first.keys()))}"
             )
-        out["initial_state"] = first.select(*inputs.state_keys)
+        out["initial_state"] = first.select(*inputs.state_keys).detach()
         if burn_in and not inputs.reads_first_state_only:
             _begin_with(out["burn_in"], first, inputs)
         return
@@ -279,7 +278,7 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
     if not missing:
         state = TensorDict(batch_size=out.batch_size)
         for key in inputs.state_keys:
-            state[key] = batch[key][:, 0]
+            state[key] = batch[key][:, 0].detach()
         out["initial_state"] = state
     elif not bool(batch["is_init"][:, 0].all()):
         raise ValueError(
@@ -291,7 +290,7 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
     """An entry of the observations [N, K] behind some steps; nothing begins there, so no state is
     read.
     """
-    if key == "is_init":
+    if key in inputs.start_keys:
         return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
     final = batch.get(inputs.final_keys[key], None)
     if final is not None:
@@ -353,33 +352,27 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
         *keys: further entries to keep.
 
     Returns:
-        TensorDict [N, L]; the recurrent state counts at index 0 and where an episode begins.
+        TensorDict [N, L] with start flags [N, L, 1]; the recurrent state counts at index 0 and
+        where an episode begins.
     """
     if is_stock(batch):
-        _check_stored_states(batch, inputs)
-        return batch
-    out = TensorDict(batch_size=_flat(batch, "is_init").shape)
+        check_stored_states(batch, inputs)
+        return _with_flags(batch, inputs)
+    out = TensorDict(batch_size=flat(batch, "is_init").shape)
     for key in (*inputs.observation_keys, *keys):
-        out[key] = _get(batch, key)
+        out[key] = entry(batch, key)
     if inputs.state_keys:
         _begin_with(out, batch["initial_state"], inputs)
     return out
 
 
-def _check_stored_states(batch: TensorDictBase, inputs: NetworkInputs) -> None:
-    """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored
-    there get lost.
-    """
-    if not inputs.reads_first_state_only or "step_count" not in batch:
-        return
-    is_init = batch["is_init"].reshape(batch.shape)
-    within_episode = batch["step_count"].reshape(batch.shape) > 0
-    for key in inputs.state_keys:
-        if key in batch and bool(batch[key][is_init & within_episode].any()):
-            raise ValueError(
-                "store must be 'step' (of the network) for slices that begin within episodes; got "
-                "'sequence'"
-            )
+def _with_flags(batch: TensorDictBase, inputs: NetworkInputs) -> TensorDictBase:
+    """The stock batch with start flags [*, L, 1], as memories read them."""
+    for key in inputs.start_keys:
+        flags = batch.get(key, None)
+        if flags is not None and (flags.shape == batch.shape or flags.dtype != torch.bool):
+            batch = batch.copy().set(key, flags.bool().reshape(*batch.shape, 1))
+    return batch
 
 
 def _with_state(
@@ -389,10 +382,12 @@ def _with_state(
     at a start.
     """
     step = step.copy()
-    if state is not None and not inputs.reads_first_state_only and "is_init" in step:
+    starts = [key for key in inputs.start_keys if key in step]
+    if state is not None and not inputs.reads_first_state_only and starts:
         stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
-        state = stored.where(step["is_init"].squeeze(-1), state)
-        step["is_init"] = torch.zeros_like(step["is_init"])  # which would drop what was loaded
+        state = stored.where(step[starts[0]].squeeze(-1), state)
+        for key in starts:
+            step[key] = torch.zeros_like(step[key])  # which would drop what was loaded
     return step if state is None else step.update(state)
 
 
@@ -415,16 +410,3 @@ def _rows(value: Tensor, index: Tensor) -> Tensor:
     flat_index = (index + first_of_row).flatten()
     chosen = value.flatten(0, 1).index_select(0, flat_index)
     return chosen.view(*index.shape, *value.shape[2:])
-
-
-def _get(batch: TensorDictBase, key: Key) -> Tensor:
-    value = batch.get(key, None)
-    if value is None:
-        raise KeyError(f"the batch has no entry {key!r}")
-    return value  # type: ignore[no-any-return]
-
-
-def _flat(batch: TensorDictBase, key: Key) -> Tensor:
-    """An entry [N, L] or [N, L, 1] as [N, L]."""
-    value = _get(batch, key)
-    return value.squeeze(-1) if value.ndim == 3 else value

@@ -16,13 +16,14 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, QValueModule
 
+from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.forward import evaluating, last_outputs
-from arcade_torch.agents.ppo import make_actor
 from arcade_torch.agents.runs.bundle import find_checkpoint
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
+from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.models.actor_critic import (
     ActorCriticNetwork,
     current_names,
@@ -224,7 +225,7 @@ def build_network(config: TrainConfig) -> Network:
     weights, and no global draw moves.
     """
     # on the CPU, whatever torch's default device is: there the seed says what is drawn
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+    with plain_torch(), torch.random.fork_rng(devices=[]), torch.device("cpu"):
         torch.default_generator.manual_seed(config.seed)
         network = _new_network(config)
     for module in network.modules():

@@ -1,11 +1,12 @@
 """PPO with a memory in actor and critic, or in neither."""
 
+import copy
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
@@ -13,15 +14,23 @@ from tensordict.nn import (
     dispatch,
 )
 from torch import Tensor
-from torch.distributions import Categorical
-from torchrl.envs.utils import ExplorationType
-from torchrl.modules import PopArtValueNorm, ProbabilisticActor
+from torch.distributions import Distribution
+from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
+from arcade_torch.agents.acting import make_actor
+from arcade_torch.agents.batch_checks import (
+    Key,
+    entry,
+    one_a_step,
+    step_mask,
+    stored_numbers,
+    with_mask,
+)
 from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.layout import Key, NetworkInputs, as_steps
+from arcade_torch.agents.layout import NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import SequenceGAE
 
@@ -76,10 +85,18 @@ def ppo_objective(
     }
 
 
-def normalize(advantage: Tensor) -> Tensor:
-    """Deviations from the mean, divided by the population deviation; finite where all are equal."""
-    centred = advantage - advantage.mean()
-    return centred / (centred.square().mean().sqrt() + 1e-8)
+def normalize(advantage: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Deviations from the mean, divided by the population deviation; finite where all are equal.
+
+    Where a ``mask`` of the same shape is false nothing counts, and the result is 0.
+    """
+    if mask is None:
+        centred = advantage - advantage.mean()
+        return centred / (centred.square().mean().sqrt() + 1e-8)
+    count = mask.sum().clamp_min(1)
+    mean = advantage.where(mask, 0).sum() / count
+    centred = (advantage - mean).where(mask, 0)
+    return centred / ((centred.square().sum() / count).sqrt() + 1e-8)
 
 
 class PPOLoss(LossModule):
@@ -131,6 +148,8 @@ class PPOLoss(LossModule):
         reward: Key = "reward"
         done: Key = "done"
         terminated: Key = "terminated"
+        truncated: Key = "truncated"
+        is_init: Key = "is_init"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -165,7 +184,7 @@ class PPOLoss(LossModule):
         self.critic_network = None
         if critic_network is None:
             require(
-                self.tensor_keys.value in actor_network.out_keys,
+                _may_write_value(actor_network, self.tensor_keys.value),
                 "critic_network",
                 critic_network,
                 "given, unless the actor network writes state_value",
@@ -205,7 +224,7 @@ class PPOLoss(LossModule):
         roots = [*self.inputs.observation_keys, *self.inputs.state_keys]
         more = [keys.action, keys.sample_log_prob]
         outcome = [("next", name) for name in (keys.reward, keys.done, keys.terminated)]
-        nexts = [("next", key) for key in self.inputs.observation_keys if key != "is_init"]
+        nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
         self.in_keys = list(dict.fromkeys([*roots, *more, *outcome, *nexts]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
@@ -233,15 +252,10 @@ class PPOLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         """Let the estimator know the names of the entries."""
-        names = (
-            "advantage",
-            "value_target",
-            "value",
-            "reward",
-            "done",
-            "terminated",
-            "sample_log_prob",
-        )
+        names = ["advantage", "value_target", "value", "reward", "done", "terminated"]
+        names.append("sample_log_prob")
+        if isinstance(self._value_estimator, SequenceGAE):
+            names += ["action", "truncated", "is_init"]
         if self._value_estimator is not None:
             self._value_estimator.set_keys(
                 **{name: getattr(self.tensor_keys, name) for name in names}
@@ -260,31 +274,33 @@ class PPOLoss(LossModule):
         Returns:
             The out keys.
         """
+        tensordict = self._prepared(tensordict)
         keys = self.tensor_keys
-        if tensordict.get(keys.advantage, None) is None:
-            tensordict = self.value_estimator(tensordict.copy())
-            if self.advantage_norm is not None and self.training:
-                self.advantage_norm.update(tensordict[keys.value_target])
-        read = (keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
-        steps = as_steps(tensordict, self.inputs, *read).copy()
-        old_value = steps[keys.value] if self.clip_value else None
+        stored = (keys.sample_log_prob, keys.advantage, keys.value_target, keys.value)
+        steps = as_steps(tensordict, self.inputs, keys.action, *stored).copy()
+        mask = step_mask(tensordict, steps.shape)
+        given = stored_numbers(steps, stored if self.clip_value else stored[:-1], mask)
+        for key in self.inputs.state_keys:
+            if key in steps:
+                steps[key] = steps[key].detach()
 
         with self._parameters_in(self.actor_network, "actor_network_params"):
             policy = self.actor_network.get_dist(steps)
         if self.critic_network is not None:
             with self._parameters_in(self.critic_network, "critic_network_params"):
                 self.critic_network(steps)
-        value = steps[keys.value]
+        value = one_a_step(keys.value, steps[keys.value], steps)
+        log_prob = policy.log_prob(_fitting(steps[keys.action], policy))
         terms = ppo_objective(
-            log_prob=policy.log_prob(steps[keys.action]).unsqueeze(-1),
-            old_log_prob=steps[keys.sample_log_prob].unsqueeze(-1),
-            advantage=self._scaled(steps[keys.advantage]),
+            log_prob=one_a_step("log_prob of the policy", log_prob, steps),
+            old_log_prob=given[keys.sample_log_prob],
+            advantage=self._scaled(given[keys.advantage], mask),
             value=value,
-            old_value=old_value,
-            value_target=steps[keys.value_target],
+            old_value=given.get(keys.value),
+            value_target=given[keys.value_target],
             clip_epsilon=self.clip_epsilon,
         )
-        entropy = policy.entropy().unsqueeze(-1)
+        entropy = one_a_step("entropy of the policy", policy.entropy(), steps)
 
         losses = {
             "loss_objective": terms["policy_loss"],
@@ -299,12 +315,29 @@ class PPOLoss(LossModule):
             "clip_fraction": terms["clipped"],
             "value_clip_fraction": terms["value_clipped"],
         }
+        counted = with_mask(tensordict, mask)
         out = TensorDict(batch_size=[])
         for name, each_step in losses.items():
-            out[name] = self._reduce_loss(each_step, tensordict)
+            out[name] = self._reduce_loss(each_step, counted)
         for name, each_step in diagnostics.items():
-            out[name] = self._reduce_loss(each_step, tensordict, reduction="mean")
+            out[name] = self._reduce_loss(each_step, counted, reduction="mean")
         return out
+
+    def _prepared(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The batch with start flags under our name and with advantages; a copy where it has
+        none.
+        """
+        keys = self.tensor_keys
+        if keys.is_init != "is_init":
+            tensordict = tensordict.copy().set("is_init", entry(tensordict, keys.is_init))
+        if tensordict.get(keys.advantage, None) is not None:
+            return tensordict
+        tensordict = self.value_estimator(tensordict.copy())
+        if self.advantage_norm is not None and self.training:
+            target = tensordict[keys.value_target]
+            mask = step_mask(tensordict, target.shape[:-1])
+            self.advantage_norm.update(target if mask is None else target[mask])
+        return tensordict
 
     def _parameters_in(self, network: Any, name: str) -> AbstractContextManager[Any]:
         """While open, the network has the loss's parameters."""
@@ -316,47 +349,45 @@ class PPOLoss(LossModule):
         )
         return opened
 
-    def _scaled(self, advantage: Tensor) -> Tensor:
+    def _scaled(self, advantage: Tensor, mask: Tensor | None) -> Tensor:
         if self.advantage_norm is not None:
             return advantage / self.advantage_norm.scale()  # type: ignore[no-any-return]
-        return normalize(advantage) if self.normalize_advantage else advantage
+        if not self.normalize_advantage:
+            return advantage
+        return normalize(advantage, None if mask is None else mask.unsqueeze(-1))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "PPOLoss":
+        """A copy whose networks hold its own parameters, as those of this loss do.
+
+        TensorDicts copy themselves by ``clone``, which takes no part in this: the estimator of a
+        copy would read a critic that nobody trains.
+        """
+        for params in self.children():
+            if isinstance(params, TensorDictParams):
+                leaves = params._param_td.apply(lambda leaf: copy.deepcopy(leaf, memo))
+                memo[id(params)] = TensorDictParams(leaves, no_convert=True)
+        copied = type(self).__new__(type(self))
+        memo[id(self)] = copied
+        copied.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        return copied
 
 
-class Choice(Categorical):
-    """A categorical distribution that samples something even where logits are NaN.
+def _fitting(action: Tensor, policy: Distribution) -> Tensor:
+    """Categorical actions [*, 1] as [*], or each would be compared with all."""
+    has_one_more = not policy.event_shape and action.shape == (*policy.batch_shape, 1)
+    return action.squeeze(-1) if has_one_more else action
 
-    ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name
-    the update.
+
+def _may_write_value(actor: ProbabilisticTensorDictSequential, name: Key) -> bool:
+    """Whether an actor network writes the value, or something that ``set_keys`` may call so: an
+    entry that the distribution does not read, and that is no state.
     """
-
-    deterministic_sample = Categorical.mode  # the name that TorchRL asks for
-
-    def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Draw by the largest of ``logits + Gumbel noise``, int64 [*sample_shape, *batch]."""
-        logits = self.logits.expand(*sample_shape, *self.logits.shape)
-        return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
-
-
-def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> ProbabilisticActor:
-    """A policy that samples from the softmax of ``logits``.
-
-    Args:
-        network: any TensorDict module that writes ``logits`` [*, A].
-        deterministic: take the most likely action unless told otherwise (``set_exploration_type``).
-
-    Returns:
-        TorchRL's ``ProbabilisticActor``; writes ``action`` int64 [*] and ``action_log_prob``.
-    """
-    return ProbabilisticActor(
-        network,
-        in_keys=["logits"],
-        distribution_class=Choice,
-        distribution_kwargs={"validate_args": False},
-        return_log_prob=True,
-        default_interaction_type=ExplorationType.DETERMINISTIC
-        if deterministic
-        else ExplorationType.RANDOM,
-    )
+    head = actor[-1]
+    used = {*head.in_keys, *head.out_keys}
+    for key in actor.det_part.out_keys:
+        if key == name or (key not in used and unravel_key(key)[0] != "next"):
+            return True
+    return False
 
 
 class PPO(Learner):

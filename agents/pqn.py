@@ -16,15 +16,10 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
+from arcade_torch.agents.batch_checks import Key, is_stock, with_mask
 from arcade_torch.agents.checked import CountOrZero, coerce, require
 from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
-from arcade_torch.agents.layout import (
-    Key,
-    NetworkInputs,
-    insert_final_observations,
-    is_stock,
-    unroll,
-)
+from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import QLambdaEstimator
 
@@ -162,7 +157,7 @@ class PQNLoss(LossModule):
         """
         keys = {
             x: getattr(self.tensor_keys, x)
-            for x in ("action", "is_init", "reward", "terminated", "truncated")
+            for x in ("action", "is_init", "reward", "done", "terminated", "truncated")
         }
         return insert_final_observations(batch, self.inputs, self.time_limit, self.burn_in, **keys)
 
@@ -185,6 +180,8 @@ class PQNLoss(LossModule):
         prepared = "position" in tensordict
         data = tensordict if prepared else self.prepare(tensordict)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
+        if steps == 0:
+            raise ValueError("bootstrap must be 'next' where sequences are of one step; got 'last'")
         with self._with_parameters():
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
         chosen = _chosen_values(q, data["position"][:, :steps], data["action"][:, :steps])
@@ -196,8 +193,13 @@ class PQNLoss(LossModule):
             chosen = chosen.reshape(rows.shape)
             target = target.reshape(rows.shape)
         error = chosen - target
+        mask = data.get("mask", None)
+        if mask is not None:
+            rows = with_mask(rows, mask[:, :steps].reshape(error.shape))
         weight = self._maybe_get_priority_weight(rows)
         if weight is not None:
+            if weight.shape == (*error.shape, 1):
+                weight = weight.squeeze(-1)
             weight = expand_as_right(weight, error)
         loss = self._reduce_loss(0.5 * error.square(), rows, weights=weight)
 
@@ -267,7 +269,8 @@ def _chosen_values(q: Tensor, position: Tensor, action: Tensor) -> Tensor:
     num_actions = q.shape[-1]
     if action.ndim == 3 and action.shape[-1] == num_actions:
         action = action.int().argmax(-1)
-    return q.flatten(1).gather(1, position * num_actions + action.reshape(position.shape))
+    action = action.reshape(position.shape).long()
+    return q.flatten(1).gather(1, position * num_actions + action)
 
 
 class PQN(Learner):

@@ -6,13 +6,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
+from arcade_torch.agents.batch_checks import MASKS, Key
 from arcade_torch.agents.layout import NetworkInputs, as_steps
 
 __all__ = ["check_replay"]
-
-Key = str | tuple[str, ...]
-MASKS: tuple[Key, ...] = ("mask", ("collector", "mask"))
-"""Where TorchRL says which steps are no padding."""
 
 
 def check_replay(

@@ -11,9 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives.value import TDLambdaEstimator
 
-from arcade_torch.agents.checked import coerce
+from arcade_torch.agents.batch_checks import is_stock
+from arcade_torch.agents.checked import Fraction, coerce, require
 from arcade_torch.agents.config import TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, is_stock, unroll
+from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
 
 
 def q_lambda_return(
@@ -166,6 +167,18 @@ def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
     return base
 
 
+def discount(name: str, value: float | Tensor) -> float:
+    """A discount or a decay of traces as a float; refuse one outside [0, 1], or one a step
+    (ValueError).
+    """
+    if isinstance(value, Tensor):
+        allowed = "one number for all steps"
+        require(value.numel() == 1, name, f"a tensor of shape {list(value.shape)}", allowed)
+        value = float(value)
+    number: float = coerce(name, value, Fraction)
+    return number
+
+
 class QLambdaEstimator(TDLambdaEstimator):
     """:func:`q_lambda_return` as a value estimator of TorchRL, which a CUDA graph can hold: all its
     shapes are static.
@@ -184,8 +197,10 @@ class QLambdaEstimator(TDLambdaEstimator):
     def __init__(
         self, *, gamma: float = 0.99, lmbda: float = 0.95, value_network: Any = None, **kwargs: Any
     ) -> None:
+        gamma = discount("gamma", gamma)
+        lmbda = discount("lmbda", lmbda)
         super().__init__(gamma=gamma, lmbda=lmbda, value_network=value_network, **kwargs)
-        self._floats = float(gamma), float(lmbda)
+        self._floats = (gamma, lmbda)
 
     def value_estimate(
         self,
@@ -216,6 +231,10 @@ class QLambdaEstimator(TDLambdaEstimator):
         return returns.unsqueeze(-1)
 
 
+READ = ("action", "is_init", "reward", "done", "terminated", "truncated")
+WRITTEN = ("advantage", "value_target")
+
+
 class SequenceGAE(nn.Module):
     """Advantages by one pass of the critic over each sequence, final observations read where they
     belong.
@@ -244,17 +263,15 @@ class SequenceGAE(nn.Module):
         self.__dict__["critic"] = critic  # its parameters belong to the loss
         self.inputs = NetworkInputs(critic)
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
-        self.gamma = gamma
-        self.lmbda = lmbda
+        self.gamma = discount("gamma", gamma)
+        self.lmbda = discount("lmbda", lmbda)
         self.chunks = chunks
-        self.names: dict[str, Any] = {
-            key: key for key in ("reward", "terminated", "advantage", "value_target")
-        }
+        self.names: dict[str, Any] = {key: key for key in (*READ, *WRITTEN)}
         self.names["value"] = "state_value"
 
     def set_keys(self, **names: Any) -> None:
-        """Other names of ``reward``, ``terminated``, ``advantage``, ``value_target``, ``value``;
-        the rest is unused.
+        """Other names of ``action``, ``is_init``, ``reward``, ``done``, ``terminated``,
+        ``truncated``, ``advantage``, ``value_target``, ``value``; the rest is unused.
         """
         self.names |= {name: key for name, key in names.items() if name in self.names}
 
@@ -270,13 +287,8 @@ class SequenceGAE(nn.Module):
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
-        data = insert_final_observations(
-            batch,
-            self.inputs,
-            self.time_limit,
-            reward=self.names["reward"],
-            terminated=self.names["terminated"],
-        )
+        names = {name: self.names[name] for name in READ}
+        data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
         opened: Any = nullcontext()
         if params is not None:
             opened = params.to_module(self.critic, preserve_module_state=False)
@@ -284,9 +296,17 @@ class SequenceGAE(nn.Module):
         with opened:
             for rows in data.chunk(self.chunks):
                 values.append(unroll(self.critic, self.inputs, rows, self.names["value"]))
-        values_in_time = torch.cat(values).squeeze(-1)
-
         position = data["position"]
+        values_in_time = torch.cat(values)
+        extended = data["extended"].shape
+        require(
+            values_in_time.shape in (extended, (*extended, 1)),
+            f"the entry {self.names['value']!r} of the critic",
+            f"shape {list(values_in_time.shape[2:])}",
+            "one number a step, [*, 1]",
+        )
+        values_in_time = values_in_time.reshape(extended)
+
         value = values_in_time.gather(1, position)
         last = values_in_time.shape[1] - 1
         next_value = values_in_time.gather(1, (position + 1).clamp_max(last))
@@ -300,7 +320,7 @@ class SequenceGAE(nn.Module):
             self.lmbda,
         )
         entries = {"advantage": advantage, "value_target": advantage + value, "value": value}
-        shape = batch.shape if is_stock(batch) else advantage.shape
+        shape = batch.shape if is_stock(batch, names["is_init"]) else advantage.shape
         for key, entry in entries.items():
             batch[self.names[key]] = entry.reshape(shape).unsqueeze(-1)
         return batch

@@ -3,7 +3,8 @@ memory, and for none.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS
 from arcade_torch.agents.runs.states import check_state
+from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.devices import pick_devices
 from arcade_torch.envs_jax.checks import check_ends
 from arcade_torch.envs_jax.registry import is_built_in
@@ -46,8 +48,10 @@ COMPILE_BACKEND = "inductor"
 class Trainer:
     """One run in memory: environments, policy, learner, and what makes it resumable.
 
-    Random actions are drawn from torch's global generator, as TorchRL's modules do: seed it, or use
-    :func:`train`.
+    The seed of the config decides what is drawn, whoever else seeds torch or draws from it between
+    two updates; TorchRL's modules draw from torch's global generator, which gets the numbers of the
+    run for the length of an update. Other settings of torch are those of a fresh process
+    (:func:`plain_torch`).
 
     Args:
         config: of the run.
@@ -60,8 +64,21 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
         self.config = config
-        numbers = config.learner
         device, _ = pick_devices(config.device)  # refused here if it is not there
+        self.random = (
+            torch.cuda.default_generators[device.index]
+            if device.type == "cuda"
+            else torch.default_generator
+        )
+        generator = torch.Generator(self.random.device).manual_seed(config.seed)
+        self.random_state = generator.get_state()
+        with self._own_settings():
+            self._make(device, replay_folder)
+
+    def _make(self, device: torch.device, replay_folder: Path | None) -> None:
+        """Make networks, learner, environments and collector."""
+        config = self.config
+        numbers = config.learner
         self.network = build_network(config)  # learns
         # is saved, too
         self.acting = build_network(config) if numbers.average_share else self.network
@@ -69,11 +86,6 @@ class Trainer:
             compile_network(network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
-        self.random = (
-            torch.cuda.default_generators[device.index]
-            if device.type == "cuda"
-            else torch.default_generator
-        )
         training = Training(
             self.total_frames, self.shuffle, device, replay_folder, config.cuda_graphs
         )
@@ -109,10 +121,26 @@ class Trainer:
         """Whether all updates were made."""
         return self.updates >= self.config.num_updates
 
+    @contextmanager
+    def _own_settings(self) -> Iterator[None]:
+        """While open, torch draws and computes as this run does; others find theirs again."""
+        before = self.random.get_state()
+        self.random.set_state(self.random_state)
+        try:
+            with plain_torch():
+                yield
+        finally:
+            self.random_state = self.random.get_state()
+            self.random.set_state(before)
+
     def warm_up(self) -> None:
         """Random play before training: fills the overlap and calibrates the input scaling; not
         counted as frames.
         """
+        with self._own_settings():
+            self._warm_up()
+
+    def _warm_up(self) -> None:
         numbers = self.config.learner
         # the first window fills the overlap too
         steps = max(0, numbers.warmup_steps - numbers.steps_before)
@@ -132,6 +160,10 @@ class Trainer:
             NonFiniteError: a quantity is NaN or infinite; names the update and the quantity.
             ValueError: an episode of a game of one's own does not end in time.
         """
+        with self._own_settings():
+            return self._update()
+
+    def _update(self) -> dict[str, Any]:
         began = time.perf_counter()
         numbers = self.config.learner
         epsilon = epsilon_at(numbers, self.frames, self.total_frames)
@@ -181,7 +213,7 @@ class Trainer:
         return {
             **self.learner.state_dict(),
             "network": None if self.network is self.acting else self.network.state_dict(),
-            "explore": self.random.get_state(),
+            "explore": self.random_state,
             "shuffle": self.shuffle.get_state(),
             "collector": collector,
             "stats": self.stats.state_dict(),
@@ -190,6 +222,7 @@ class Trainer:
             "seconds": self.seconds,
         }
 
+    @plain_torch()
     def load(self, checkpoint: Checkpoint) -> None:
         """Go back to where a checkpoint was made; a ``CheckpointError`` if its state is not one of
         this trainer.
@@ -200,7 +233,9 @@ class Trainer:
             self.learner.load_state_dict(state)
             self.acting.load_state_dict(checkpoint.weights)
             self.network.load_state_dict(state.get("network") or checkpoint.weights)
-            self.random.set_state(state["explore"].cpu())
+            generator = torch.Generator(self.random.device)
+            generator.set_state(state["explore"].cpu())  # refuses what is no state
+            self.random_state = generator.get_state()
             self.shuffle.set_state(state["shuffle"])
             self.collector.load_state_dict(state["collector"], strict=False)
             self.stats.load_state_dict(state["stats"])
@@ -240,7 +275,7 @@ class Trainer:
         return {
             **learner,
             **counters,
-            "explore": self.random.get_state(),
+            "explore": self.random_state,
             "shuffle": self.shuffle.get_state(),
             "collector": collector,
             "stats": self.stats.state_dict(),

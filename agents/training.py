@@ -26,6 +26,7 @@ from arcade_torch.agents.runs.checkpoint import load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
+from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax import resolve_id
 
@@ -66,7 +67,8 @@ def train(
         resume: go on with the run in the folder (from the start if it has no checkpoint yet); a
             finished run returns its result at once, an absent one is started.
         progress: called after every update with the row of ``metrics.csv``, ``total_frames``, and
-            ``eval_return``, the mean of the last greedy evaluation (None before the first).
+            ``eval_return``, the mean of the last greedy evaluation (None before the first). Random
+            numbers that it draws change nothing.
         on_evaluation: called with the agent after every greedy evaluation; it may play, and must
             change nothing.
         imports: files and modules that game and memory came from, each with ``name`` and
@@ -185,9 +187,8 @@ class _Run:
                     self._save()
                 self._report("running", fps=row["fps"], train_return=row["train_return_ewm"])
                 if self.progress is not None:
-                    self.progress(
-                        row | {"total_frames": trainer.total_frames, "eval_return": self.last_eval}
-                    )
+                    more = {"total_frames": trainer.total_frames, "eval_return": self.last_eval}
+                    self.progress(row | more)
         self._save()
         if trainer.done:
             return self._finish()
@@ -270,11 +271,11 @@ def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
 
 @contextmanager
 def own_settings(config: TrainConfig) -> Iterator[None]:
-    """Seed torch's global generators and set its threads for the duration of a run."""
+    """Seed torch's global generators and set its threads and settings for the duration of a run."""
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(config.threads or threads)
-        with own_random_numbers(torch.device(config.device), config.seed):
+        with plain_torch(), own_random_numbers(torch.device(config.device), config.seed):
             yield
     finally:
         torch.set_num_threads(threads)

@@ -33,7 +33,8 @@ def check_memory(
             step gives the same output at every step, as in attention.
         input_size: D; None reads ``module.input_size``.
         dtype: of parameters and inputs during the check. float64 finds the most; take float32,
-            bfloat16 or float16 for kernels that know nothing else.
+            bfloat16 or float16 for kernels that know nothing else. A module without a weight
+            or a buffer of floats is checked in float32.
         tolerance: largest difference allowed between two ways to compute the same, as a share of
             the largest entry where that is above 1; None for 1e-7 in float64, 1e-4 in float32, 0.01
             in float16 and 0.1 in bfloat16.
@@ -58,7 +59,7 @@ def check_memory(
     discrepancies = {}
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        for name, law in laws_of(module, dtype, gradients).items():
+        for name, law in laws_of(module, subject.dtype, gradients).items():
             discrepancies[name] = law(subject, name)
     return discrepancies
 
@@ -101,7 +102,7 @@ def law_results(
     results = []
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        for name, law in laws_of(module, torch.float64, True).items():
+        for name, law in laws_of(module, subject.dtype, True).items():
             try:
                 results.append(LawResult(name, True, law(subject, name), ""))
             except MemoryLawError as error:

@@ -102,6 +102,9 @@ def subject_of(
     if dtype not in TOLERANCES:
         allowed = ", ".join(map(str, TOLERANCES))
         raise ValueError(f"dtype is {dtype}, allowed: {allowed}")
+    weights = [*module.parameters(), *module.buffers()]
+    if not any(weight.is_floating_point() or weight.is_complex() for weight in weights):
+        dtype = torch.float32  # there is nothing to convert, so its states are what they are
     if tolerance is None:
         tolerance = TOLERANCES[dtype]
     checked = copy.deepcopy(module).eval()

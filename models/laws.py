@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 
 from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
@@ -121,11 +122,14 @@ def _layout(state: TensorDict) -> dict[tuple[str, ...], tuple[list[int], torch.d
 
 @torch.no_grad()
 def _calls_repeat(s: Subject, law: str) -> float:
+    symptom = "two calls of initial_state differ"
+    cause = "random numbers in it: an episode begins with zeros, a constant or an nn.Parameter"
+    worst = s.compare(law, symptom, cause, *pairs_of(s.initial(3), s.initial(3)))
     copied = s.copied()
     x, state, flags = copied.inputs(3, 5, 0.3)
     y, after = copied.module(x, state, flags)
     again, after_again = copied.module(x, state, flags)
-    worst = s.compare(
+    repeated = s.compare(
         law,
         "the same call twice differs",
         "random numbers, such as F.dropout without training=self.training, or a state that the "
@@ -136,6 +140,7 @@ def _calls_repeat(s: Subject, law: str) -> float:
     trained, after_trained = s.copied().module.train()(x, state, flags)
     return max(
         worst,
+        repeated,
         s.compare(
             law,
             "training mode and evaluation mode differ",
@@ -150,6 +155,10 @@ def _calls_repeat(s: Subject, law: str) -> float:
 
 @torch.no_grad()
 def _weights_are_registered(s: Subject, law: str) -> float:
+    for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
+        if is_lazy(weight):
+            symptom = f"{name} has no shape before the first call"
+            raise MemoryLawError(law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
     registered = {id(weight) for weight in s.module.parameters()}
     for part in s.module.modules():
         for name, value in vars(part).items():

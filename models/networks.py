@@ -302,7 +302,12 @@ class MemoryNetwork(TensorDictModuleBase):
         """
         if self.num_actions:
             features = self._append(features, last_action, is_init)
-        y, state = self.block(features, state, is_init)
+        device = features.device.type
+        if torch.is_autocast_enabled(device):  # a recurrence adds up what bfloat16 rounds away
+            with torch.autocast(device, enabled=False):
+                y, state = self.block(features.float(), state, is_init)
+        else:
+            y, state = self.block(features, state, is_init)
         return self.head(y), state
 
     def read_sequences(

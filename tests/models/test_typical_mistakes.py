@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from arcade_torch.models import MemoryLawError, MemoryModule, check_memory, make_network
+from arcade_torch.models.checks import law_results
 
 WIDTH = 4
 
@@ -189,6 +190,20 @@ class NotANumber(Cell):
         return y / torch.zeros_like(y)
 
 
+class RandomStart(Cell):
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return self.state_of(torch.randn(batch_size, WIDTH, dtype=self.linear.weight.dtype))
+
+
+class LazyLayer(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.late = nn.LazyLinear(WIDTH)
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.late(y)
+
+
 def refusal(model: type[Cell]) -> MemoryLawError:
     """What check_memory says of a model."""
     torch.manual_seed(0)
@@ -233,6 +248,8 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
         (LayersFirst, "shapes are fixed", "such as [layers, B, H]"),
         (WithoutGradient, "nothing leaks over a start", "torch.no_grad"),
         (NotANumber, "shapes are fixed", "NaN or infinite"),
+        (RandomStart, "equal calls give equal results", "initial_state differ"),
+        (LazyLayer, "weights are registered", "late.weight has no shape"),
     ],
 )
 def test_said_something_else_before(model: type[Cell], law: str, said: str) -> None:
@@ -273,6 +290,28 @@ class Ordered(Cell):
 
     def written(self, y: Tensor) -> Tensor:
         return self.order[0](y)
+
+
+class NoWeights(nn.Module):
+    """Right: a running sum, whose state can take its dtype from no weight."""
+
+    input_size = hidden_size = WIDTH
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> Any:
+        h = state["h"]
+        outputs = []
+        for t in range(x.shape[1]):
+            h = torch.where(is_init[:, t, None], 0.0, h) / 2 + x[:, t]
+            outputs.append(h)
+        return torch.stack(outputs, 1), TensorDict({"h": h}, [len(x)])
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return TensorDict({"h": torch.zeros(batch_size, WIDTH)}, [batch_size])
+
+
+def test_a_memory_without_weights_is_checked_in_the_dtype_of_its_state() -> None:
+    assert max(check_memory(NoWeights()).values()) < 1e-5
+    assert all(result.passed for result in law_results(NoWeights()))
 
 
 @pytest.mark.parametrize("model", [ComplexWeight, Ordered])

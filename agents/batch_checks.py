@@ -1,0 +1,130 @@
+"""Which layout a batch has, which of its steps count, and what no loss can read."""
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from arcade_torch.agents.checked import require
+
+if TYPE_CHECKING:
+    from arcade_torch.agents.layout import NetworkInputs
+
+Key = str | tuple[str, ...]
+MASKS: tuple[Key, ...] = ("mask", ("collector", "mask"))
+"""Where TorchRL says which steps are no padding."""
+
+
+def entry(batch: TensorDictBase, key: Key) -> Tensor:
+    """An entry of a batch; a KeyError that names it if it is not there."""
+    value = batch.get(key, None)
+    if value is None:
+        raise KeyError(f"the batch has no entry {key!r}")
+    return value  # type: ignore[no-any-return]
+
+
+def flat(batch: TensorDictBase, key: Key) -> Tensor:
+    """An entry [N, L] or [N, L, 1] as [N, L]."""
+    value = entry(batch, key)
+    return value.squeeze(-1) if value.ndim == 3 else value
+
+
+def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
+    """Whether a batch has TorchRL's layout [..., L], not that of sequences [N] with entries [N, L,
+    ...]; refuse one without a step, or whose time is not its last dimension (ValueError).
+    """
+    flags = entry(batch, is_init)
+    is_empty = flags.numel() == 0 or batch.numel() == 0
+    if batch.ndim == 0 or is_empty:
+        raise ValueError(
+            f"a batch must be [..., L] with L >= 1 steps; got batch_size {list(batch.shape)}"
+        )
+    names = batch.names if batch.ndim > 1 else ["time"]
+    if "time" in names and names[-1] != "time":
+        raise ValueError(
+            f"time must be the last dimension of a batch, [..., L]: transpose it; got {names}"
+        )
+    return batch.ndim != 1 or flags.ndim == 2
+
+
+def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
+    """Which steps are no padding, bool of this shape [..., L]; None if the batch does not say."""
+    masks = []
+    for key in MASKS:
+        mask = batch.get(key, None)
+        if isinstance(mask, Tensor) and mask.shape in (shape, (*shape, 1)):
+            masks.append(mask.reshape(shape).bool())
+    if not masks:
+        return None
+    return masks[0] & masks[-1]
+
+
+def with_mask(batch: TensorDictBase, mask: Tensor | None) -> TensorDictBase:
+    """The batch with its mask, bool [*, L], where TorchRL's losses look for one."""
+    if mask is None:
+        return batch
+    batch = batch.copy()
+    batch["collector", "mask"] = mask.unsqueeze(-1)
+    return batch
+
+
+def one_a_step(name: Key, value: Tensor, steps: TensorDictBase) -> Tensor:
+    """A number a step, [*, L] or [*, L, 1], as [*, L, 1]; refuse any other shape (ValueError),
+    which would be spread over the batch.
+    """
+    shape = (*steps.shape, 1)
+    fits = value.shape in (steps.shape, shape)
+    require(fits, f"the shape of {name!r}", list(value.shape), f"{list(shape)}, one number a step")
+    return value.reshape(shape)
+
+
+def stored_numbers(
+    steps: TensorDictBase, keys: tuple[Key, ...], mask: Tensor | None
+) -> dict[Key, Tensor]:
+    """What was stored of every step, [*, L, 1], without gradient; 0 where there is padding."""
+    numbers = {}
+    for key in keys:
+        number = one_a_step(key, steps[key].detach(), steps)
+        numbers[key] = number if mask is None else number.where(mask.unsqueeze(-1), 0)
+    return numbers
+
+
+def check_order(batch: TensorDictBase, cut: Tensor) -> None:
+    """Refuse a stock batch of shuffled steps (ValueError).
+
+    Args:
+        batch: [N] with entries [N, L, ...].
+        cut: bool [N, L], steps behind which an episode or its record ends, and padding.
+    """
+    if "final_index" in batch:
+        return
+    follows = {}
+    if "step_count" in batch and ("next", "step_count") in batch:
+        after = flat(batch, ("next", "step_count"))
+        follows["step_count"] = after[:, :-1] == flat(batch, "step_count")[:, 1:]
+    trajectory = ("collector", "traj_ids")
+    if trajectory in batch:  # steps of two envs may be counted as if they were of one
+        numbers = flat(batch, trajectory)
+        follows["('collector', 'traj_ids')"] = numbers[:, :-1] == numbers[:, 1:]
+    for name, same in follows.items():
+        if not bool((cut[:, :-1] | same).all()):
+            raise ValueError(
+                f"{name} must be that of whole sequences, never shuffled; got a jump within a row"
+            )
+
+
+def check_stored_states(batch: TensorDictBase, inputs: "NetworkInputs") -> None:
+    """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored
+    there get lost (ValueError).
+    """
+    if not inputs.reads_first_state_only or "step_count" not in batch:
+        return
+    is_init = batch["is_init"].reshape(batch.shape).bool()
+    within_episode = batch["step_count"].reshape(batch.shape) > 0
+    for key in inputs.state_keys:
+        if key in batch and bool(batch[key][is_init & within_episode].any()):
+            raise ValueError(
+                "store must be 'step' (of the network) for slices that begin within episodes; got "
+                "'sequence'"
+            )
