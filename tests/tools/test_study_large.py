@@ -13,6 +13,7 @@ from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.studies import folder as study_folder
+from arcade_torch.tools.studies import runner
 from arcade_torch.tools.studies.engines import Job, JobResult
 from arcade_torch.tools.studies.runner import SHARE, Pace, show_progress, study
 from tests.tools.fabricated import small_study, write_study
@@ -79,7 +80,10 @@ def test_the_table_is_whole_when_a_study_is_interrupted(tmp_path: Path) -> None:
     assert states == ["finished"] * 7 + ["waiting"] * 13
 
 
-def test_the_table_is_written_while_a_study_goes_on(tmp_path: Path) -> None:
+def test_the_table_is_written_while_a_study_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "SHARE", 1e9)  # it rests no longer than a write takes
     what = small_study(seeds=1)
 
     class Slow(Fabricator):
@@ -88,7 +92,7 @@ def test_the_table_is_written_while_a_study_goes_on(tmp_path: Path) -> None:
                 yield result
                 rows = read_csv(tmp_path / "s" / "results.csv")
                 assert sum(row["status"] == "finished" for row in rows) == place + 1
-                time.sleep(0.5)
+                time.sleep(0.01)
 
     study(what, tmp_path / "s", Slow(what), stream=io.StringIO())
 
