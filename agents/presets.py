@@ -51,7 +51,6 @@ _SEARCH = ("Navigator",)
 _SMALL_SEARCH = {
     "time_limit": "bootstrap",
     "entropy_coeff": 0.05,
-    "advantage_decay": 0.0,
     "prediction_coeff": 0.0,
 }
 # Every hit of the ball is needed, and whoever still draws actions at random misses some.
@@ -118,9 +117,9 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       learns to expect the next frame's features. PPO's gamma is .98 in games that pay an action at
       once (AutoEncode, BattleShip, CountRecall, MineSweeper), .995 in those that pay every step
       survived (the CartPoles, Skittles), .99 in the others. In Navigator limits bootstrap, the
-      bonus begins at half, each minibatch's own deviation divides advantages, and no frame is
-      expected: with the numbers of the others both seeds that were tried walked down the clock
-      (results/small.md). In Breakout the bonus begins at .02, a fifth of that of the others.
+      bonus begins at half, and no frame is expected: with the numbers of the others both seeds that
+      were tried walked down the clock (results/small.md). In Breakout the bonus begins at .02, a
+      fifth of that of the others.
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
