@@ -73,9 +73,7 @@ class Recurrence:
         self._empty = _empty_nodes(example)
         self.state_keys = list(self._paths)
         self.next_state_keys = [("next", *key) for key in self.state_keys]
-        begins_with_zeros = not any(
-            x.is_meta or x.any() or x.requires_grad for x in tensors.values()
-        )
+        begins_with_zeros = not any(_begins_with_more(x) for x in tensors.values())
         if store == "step" and not begins_with_zeros:
             raise ValueError(
                 "store='step' needs a memory that begins with zeros and learns no start: take "
@@ -289,6 +287,13 @@ def _tensors(state: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
     for key, value in state.items(True, True):
         tensors[(key,) if isinstance(key, str) else tuple(key)] = value
     return tensors
+
+
+def _begins_with_more(start: Tensor) -> bool:
+    """Whether a tensor of the first state is learned or has an entry that is not 0; one without
+    data (on the meta device) has none.
+    """
+    return start.requires_grad or (not start.is_meta and bool(start.any()))
 
 
 def _empty_nodes(state: TensorDictBase) -> list[tuple[str, ...]]:

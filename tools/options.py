@@ -101,7 +101,7 @@ def _dashed_value(wrong: str, words: Sequence[str]) -> str:
         '; a value that begins with - is written --out=-x.gif'
     """
     missed = re.search(r"'(--[\w.-]+)'", wrong)
-    if missed is None or "issing" not in wrong:
+    if missed is None or "missing" not in wrong.lower():
         return ""
     for option, value in pairwise(words):
         if option == missed[1] and re.match(r"-[^-]", value):

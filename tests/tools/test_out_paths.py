@@ -4,7 +4,6 @@ replaced by files.
 
 import os
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,30 +44,34 @@ WORK = (
 
 
 @pytest.fixture
-def no_work(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def no_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The current folder has a study, and no command may begin with its work."""
+    monkeypatch.chdir(tmp_path)
+    write_study(tmp_path / "study", small_study())
+
     def work(*args: Any, **options: Any) -> Any:
         raise AssertionError("work has begun")
 
     for name in WORK:
         monkeypatch.setattr(name, work)
-    yield
+
+
+def refusal(words: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line with which a command refuses its options."""
+    assert cli.main(words.split()) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
 
 
 @pytest.mark.usefixtures("no_work")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_file_where_a_folder_should_be_is_refused_before_the_work(
-    command: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_study(tmp_path / "study", small_study())
     Path("file").write_text("kept")
     words, _ = COMMANDS[command]
-    assert cli.main(words.format("file/out").split()) == 2
-    said = capsys.readouterr().err
-    assert "file is a file, not a folder" in said and said.count("\n") == 1
+    assert "file is a file, not a folder" in refusal(words.format("file/out"), capsys)
     assert Path("file").read_text() == "kept"
 
 
@@ -76,20 +79,12 @@ def test_a_file_where_a_folder_should_be_is_refused_before_the_work(
 @pytest.mark.parametrize(
     "command", ["record", "evaluate", "report", "figure", "analyze", "sheet", "baselines"]
 )
-def test_a_pipe_is_not_replaced(
-    command: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_study(tmp_path / "study", small_study())
+def test_a_pipe_is_not_replaced(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     words, suffix = COMMANDS[command]
-    pipe = tmp_path / f"pipe{suffix}"
+    pipe = Path(f"pipe{suffix}")
     os.mkfifo(pipe)
-    assert cli.main(words.format("pipe").split()) == 2
-    said = capsys.readouterr().err
-    assert ("pipe or a device" in said or "exists" in said) and said.count("\n") == 1
+    said = refusal(words.format("pipe"), capsys)
+    assert "pipe or a device" in said or "exists" in said
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
