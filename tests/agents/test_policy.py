@@ -236,7 +236,6 @@ def test_without_data_a_memory_stores_what_it_stores_with_data(memory):
         assert make_network("small", memory=memory, store="step").store == "step"
 
 
-
 @pytest.mark.parametrize("algorithm", ["pqn", "ppo"])
 def test_a_network_is_checked_as_it_is_built_but_without_weights_or_draws(algorithm):
     drawn = torch.random.get_rng_state()
