@@ -47,11 +47,12 @@ class BMRU(Memory):
     threshold that rounding decides may set the latch in one computation and not in another, as on
     another device.
 
-    Written from the abstracts of the two papers below, which name the means (two stable states, no
-    transients, a parallel scan), and from the equations above; the papers' text and code were not
-    at hand. The surrogate, its slope, the initial weights (torch's default of a linear layer),
-    states of size 1, and y = h are ours. So it may differ from the authors' code. A size that is
-    learned for each channel was no better in tests of memory: a linear layer behind h scales it.
+    Written from the equations above and the abstracts of the two papers below, which name the means
+    (two stable states with hysteresis, no transients, a parallel scan); the papers' text and code
+    were not at hand. The surrogate, its slope, the initial weights (torch's default of a linear
+    layer), states of size 1, and y = h are ours. So it may differ from the authors' code. A size
+    that is learned for each channel was no better in tests of memory: a linear layer behind h
+    scales it.
 
     Args:
         input_size: D.
@@ -61,8 +62,8 @@ class BMRU(Memory):
     Raises:
         ValueError: sizes or slope out of range.
 
-    Source: De Geeter, Lambrechts, Ernst and Drion (2026), arXiv 2601.09495; in hardware arXiv
-        2605.12206.
+    Source: De Geeter, Lambrechts, Ernst and Drion (2026), arXiv 2601.09495; on its gradients
+        Brandoit, Fyon, Ernst and Drion (2026), arXiv 2605.11855.
     """
 
     scan = staticmethod(linear_scan)
