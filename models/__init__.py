@@ -7,7 +7,7 @@ before which everything is forgotten.
 
 * :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru
   gru mlp linear_transformer attention gdn ttt lstm frame_stack s5 mamba slstm mlstm gtrxl ffm shm
-  rtu deltaproduct rwkv7``).
+  rtu deltaproduct rwkv7 bmru``).
 * :func:`check_memory`: check that a module, ours or yours, is a correct memory model;
   :class:`MemoryLawError` says what is wrong with it, :func:`law_results` checks on behind it.
 * :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of

@@ -30,7 +30,9 @@ def check_memory(
     Args:
         module: a memory model, see :class:`MemoryContract`; ``replay`` is checked too where there
             is one. One with ``averages_values = True`` has one law more: the same input at every
-            step gives the same output at every step, as in attention.
+            step gives the same output at every step, as in attention. One that has a part with
+            ``surrogate_gradients = True``, a step function with the derivative of another, is asked
+            for the gradients of a call a step in every type: finite differences know no such step.
         input_size: D; None reads ``module.input_size``.
         dtype: of parameters and inputs during the check. float64 finds the most; take float32,
             bfloat16 or float16 for kernels that know nothing else. A module without a weight

@@ -108,6 +108,9 @@ class Memory(nn.Module):
     averages_values = False
     """Whether every output is a function of the input and of a weighted mean over the episode's
     steps, as in softmax and linear attention; ``check_memory`` then has one more law."""
+    surrogate_gradients = False
+    """Whether some function in it is a step whose backward pass has another's derivative, as in
+    ``bmru``; ``check_memory`` then compares no gradient with finite differences."""
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()

@@ -8,6 +8,7 @@ from typing import Any
 from torch import nn
 
 from arcade_torch.models.attention import Attention
+from arcade_torch.models.bmru import BMRU
 from arcade_torch.models.deltaproduct import DeltaProduct
 from arcade_torch.models.ffm import FFM
 from arcade_torch.models.frame_stack import FrameStack
@@ -53,6 +54,7 @@ _FACTORIES: dict[str, MemoryFactory] = {
     "slstm": SLSTM,
     "mlstm": MLSTM,
     "gtrxl": GTrXL,
+    "bmru": BMRU,
 }
 
 ALIASES = {"fart": "linear_transformer"}

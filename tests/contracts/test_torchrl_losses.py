@@ -63,6 +63,7 @@ MEMORIES = (
     "slstm",
     "mlstm",
     "gtrxl",
+    "bmru",
 )
 
 

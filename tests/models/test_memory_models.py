@@ -50,6 +50,8 @@ MODELS = [
     ("mlstm", {"key_size": 3}),
     ("gtrxl", {}),
     ("gtrxl", {"window": 3}),
+    ("bmru", {}),
+    ("bmru", {"slope": 1.0}),
 ]
 NAMES = memory_names()
 LENGTHS = [1, 2, 3, 7, 128, 132, 1000]
@@ -90,6 +92,7 @@ def test_every_model_satisfies_the_protocols(name):
         ("slstm", 2_099_200),
         ("mlstm", 60_510),
         ("gtrxl", 4_461_056),
+        ("bmru", 525_312),
     ],
 )
 def test_parameter_counts_at_width_512_are_the_published_ones(name, count):

@@ -37,6 +37,7 @@ def test_every_model_is_listed_with_its_parameters_state_and_arithmetic(
         ("slstm", 32, 128, 8 * 8 * 8),
         ("mlstm", 13, 52, 8 * (9 + 2 + 3 + 3) + 2 * 3 * 4),
         ("gtrxl", 128 * 16 + 1, 128 * 8 * 8 + 8, 17 * 8 * 8 + 2 * 128 * 8),
+        ("bmru", 8, 32, 2 * 8 * 8),
         ("linear_transformer", 12, 48, 3 * 8 * 3 + 3 * 4 + 3 * 4 + 3 * 8),
         ("attention", 128 * 16 + 1, 128 * 8 * 8 + 8, 3 * 8 * 8 + 2 * 128 * 8),
     ],

@@ -45,6 +45,7 @@ AGENT_COLOURS = {
     "slstm": "#b6de27",
     "mlstm": "#055686",
     "gtrxl": "#2c1814",
+    "bmru": "#d20fb4",
     "human": "#000000",
 }
 """Colours that people with the usual colour deficiencies can tell apart (after Okabe and Ito)."""

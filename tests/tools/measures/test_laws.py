@@ -148,6 +148,8 @@ def test_law_06_one_batched_pass_equals_a_loop_over_actions_and_finite_differenc
     looped = torch.stack(gradients(net, o)).square().sum((0, 4))
     found = saliency(net, o, dtype=F64)
     np.testing.assert_allclose(found.per_frame, looped.sum((1, 2)), rtol=1e-9, atol=1e-20)
+    if name == "bmru":
+        return  # a step function: its gradients are those of another function
 
     def value(shift: float) -> Tensor:
         moved = o.clone()
