@@ -100,6 +100,7 @@ def measure_ahead(
     # neighbours play the same game: a process goes on with the one that it has loaded
     numbers = sorted(range(count), key=lambda number: (number % SHARES, number))
     log = folder.root / "logs" / "report.log"
+    log.unlink(missing_ok=True)
     orders = list[Command]()
     for number in numbers:
         shard = f"{number + 1}/{count}"
