@@ -101,7 +101,7 @@ def report(
     runs, about = _runs(folder, study, rows, subject)
     finals = _finals(runs)
     cells, note = panels.select_cells(runs, finals, study.baseline, about)
-    if workers != 1 and _is_on_cpu(runs):
+    if _is_on_cpu(runs):
         pieces = _pieces(folder, runs, cells, skip)
         measure_ahead(pieces, folder, _words(skip, subject), workers, progress)
     context: dict[str, Any] = {
@@ -111,12 +111,10 @@ def report(
         "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
+        **_PROTOCOLS,
     }
-    context |= _PROTOCOLS
     with drawing("light"), torch_threads(1):  # the last bits of a measure depend on how many
-        players: Players = {}
-        if "references" not in skip:
-            players = _players(folder, runs, progress)
+        players = _players(folder, runs, skip, progress)
         context |= _parts(runs, finals, cells, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
     context["subject"] = None
@@ -296,9 +294,13 @@ def _finals(runs: Runs) -> Finals:
     return agents_by_task(returns)
 
 
-def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Players:
+def _players(
+    folder: StudyFolder, runs: Runs, skip: Sequence[Part], progress: Progress | None
+) -> Players:
     """What the players earn under the rules and options that the study was trained with."""
-    players = {}
+    players = dict[str, Mapping[str, Baseline]]()
+    if "references" in skip:
+        return players
     first_runs = _first_runs(runs)
     for done, (game, run) in enumerate(first_runs.items(), start=1):
         players[game] = _players_of(folder, run)
