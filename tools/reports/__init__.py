@@ -117,10 +117,7 @@ def report(
         players = _players(folder, runs, skip, progress)
         context |= _parts(runs, finals, cells, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
-    context["subject"] = None
-    if about:
-        rival = _rival(context["table"], about)
-        context["subject"] = subject_section(folder, runs, about, metric, rival)
+    context["subject"] = _subject_part(folder, runs, about, metric, context["table"])
     context |= how_to_repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
@@ -184,9 +181,16 @@ def _check_options(metric: str, skip: Sequence[str]) -> None:
         )
 
 
-def _rival(table: GapBias | None, about: str) -> str:
-    """The agent that the headline holds the subject against; empty without a table."""
-    return "" if table is None else str(table.baselines[about])
+def _subject_part(
+    folder: StudyFolder, runs: Runs, about: str, metric: str, table: GapBias | None
+) -> dict[str, Any] | None:
+    """The subject beside every other agent, and the one that the headline holds it against; None
+    without a subject.
+    """
+    if not about:
+        return None
+    rival = "" if table is None else str(table.baselines[about])
+    return subject_section(folder, runs, about, metric, rival)
 
 
 def _subject(study: Study, runs: Runs, subject: str) -> str:
