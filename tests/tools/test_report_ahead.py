@@ -125,7 +125,8 @@ def contents(folder: Path) -> dict[str, Any]:
         with np.load(file, allow_pickle=False) as arrays:
             for name, array in arrays.items():
                 kept[f"{file.parent.parent.name} {file.name} {name}"] = array.tobytes()
-    page = (folder / "report.html").read_text().replace(folder.name, "")
+    page = (folder / "report.html").read_text()
+    page = page.replace("study-a", "").replace("study-b", "")  # in commands
     kept["page"] = [line for line in page.splitlines() if "written" not in line.lower()]
     return kept
 
