@@ -102,6 +102,17 @@ def test_replaying_a_window_gives_the_values_that_were_acted_on(env: Any, agent:
     )  # training sees whole grey levels, saliency all
 
 
+def test_the_first_env_of_a_batch_plays_the_episode_that_it_plays_alone(
+    env: Any, agent: Agent
+) -> None:
+    (alone,), lengths = play(agent, env, seed=3, keep=12, max_steps=12)
+    two = arcade_torch.make(GAME, num_envs=2, observability="partial")
+    (first,), lengths_of_first = play(agent, two, seed=3, keep=12, max_steps=12, most=1)
+    for name in ("frames", "last_action", "is_init", "action", "reward"):
+        assert torch.equal(getattr(first, name), getattr(alone, name)), name
+    assert lengths_of_first.tolist() == lengths.tolist() and first.ended == alone.ended
+
+
 def test_a_batch_of_several_is_refused() -> None:
     with pytest.raises(
         ValueError, match=r"the batch size of env must be \[\] or \[1\], for one episode; got \[2\]"

@@ -8,11 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import Command, command_line
-from arcade_torch.tools.studies.engines import Engine, RayOptions
+from arcade_torch.tools.studies.engines import Engine, Inline, RayOptions
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
+from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
 from arcade_torch.tools.text import say
 
@@ -26,6 +28,14 @@ class Resumable(Command):
         """What an interruption left, and the command that goes on."""
         line = command_line([self.word, *self.argv])
         return f"finished runs are kept, the others go on from their checkpoints with: {line}"
+
+    def report_workers(self, engine: Engine) -> int:
+        """Processes that measure for the report: as many as trained, if those were of this
+        machine.
+        """
+        if isinstance(engine, Processes):
+            return engine.workers
+        return 1 if isinstance(engine, Inline) else 0
 
     def carry_out(
         self,
@@ -58,7 +68,7 @@ class Resumable(Command):
             say(f"failed: {name}: {reason}")
         if report and result.finished and (not shard or result.finished == len(result.rows)):
             try:
-                write_page(result.root, skip=skip)
+                write_page(result.root, skip=skip, workers=self.report_workers(engine))
             except Exception:
                 again = command_line(["report", str(result.root)])
                 print(
@@ -181,10 +191,29 @@ class Report(Command):
     """The agent that the page is about and compares with every other; that of the study by
     default.
     """
+    workers: int = 0  # Processes that measure at once; 0 for one a core.
+    shard: str = ""
+    """3/10 takes the third tenth of the measures that the page needs and writes no page, for the
+    array jobs of a scheduler.
+    """
 
     def run(self) -> int:
-        """Write the page."""
-        write_page(self.study, self.out, metric=self.metric, skip=self.skip, subject=self.subject)
+        """Write the page, or measure a share of what it shows."""
+        least = "at least 1, or 0 for one a core"
+        require(self.workers >= 0, "workers", self.workers, least)
+        if self.shard:
+            from arcade_torch.tools.reports import report_shard
+
+            report_shard(self.study, self.shard, skip=self.skip, subject=self.subject)
+            return 0
+        write_page(
+            self.study,
+            self.out,
+            metric=self.metric,
+            skip=self.skip,
+            subject=self.subject,
+            workers=self.workers,
+        )
         return 0
 
 

@@ -20,21 +20,24 @@ class EpisodeBatch:
         keys: where it has frames, the last action and start flags, and reads actions. If it has no
             last action, that is the action before, zeros at first; if it has no start flags, they
             follow from ``done``.
+        most: only so many envs of the batch are played, from the first on; what is compiled for a
+            batch then serves fewer, and an env of ours plays the same episode in any batch.
 
     Attributes:
-        size: N.
+        size: N, or ``most``.
 
     Raises:
         ValueError: it has more than one batch dimension.
     """
 
-    def __init__(self, env: Any, keys: Keys) -> None:
+    def __init__(self, env: Any, keys: Keys, most: int | None = None) -> None:
         shape = list(env.batch_size)
         require(len(shape) < 2, "the batch size of env", shape, "[] or [N]")
         self.env = env
         self.keys = keys
         self.is_batch = bool(shape)
-        self.size = int(shape[0]) if shape else 1
+        self._envs = int(shape[0]) if shape else 1
+        self.size = min(self._envs, most or self._envs)
         spec = _action_spec(env, keys.action)
         self._one_hot = spec if _is_one_hot(spec) else None
         self._count = getattr(spec, "n", None)  # of actions
@@ -68,18 +71,21 @@ class EpisodeBatch:
             )
         encoded = self._encode(action)
         given = encoded if self.is_batch else encoded[0]
+        if self.size < self._envs:
+            given = torch.cat([given, given.new_zeros(self._envs - self.size, *given.shape[1:])])
         if self._action_shape is not None:
             given = given.reshape(self._action_shape)
         self._root.set(self.keys.action, given)
         step, self._root = self.env.step_and_maybe_reset(self._root)
-        reward = self._batch(step.get(("next", "reward")))
-        done = self._batch(step.get(("next", "done"))).reshape(-1, 1)
+        reward = self._batch(step.get(("next", "reward")))[: self.size]
+        done = self._batch(step.get(("next", "done")))[: self.size].reshape(-1, 1)
         return self._observe(encoded, done), reward.reshape(-1, 1), done.reshape(-1)
 
     def _observe(self, last_action: Tensor, is_init: Tensor) -> TensorDictBase:
         """What the env gives, with defaults for what it lacks, under the names of the measures."""
         keys = self.keys
         obs = self._root.copy() if self.is_batch else self._root.unsqueeze(0)
+        obs = obs[: self.size] if self.size < self._envs else obs
         pixels = obs.get(keys.pixels, None)
         if pixels is None:
             raise ValueError(

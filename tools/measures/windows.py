@@ -97,15 +97,16 @@ def greedy_window(
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
     seed = held_out(seed) if env is None else seed
-    player, env = resolve_agent(agent, env, observability, num_envs=1, **names)
     require(
-        tuple(env.batch_size) in ((), (1,)),
+        env is None or tuple(env.batch_size) in ((), (1,)),
         "the batch size of env",
-        list(env.batch_size),
+        [] if env is None else list(env.batch_size),
         "[] or [1], for one episode",
     )
+    # as many envs of its own as other measures play: what is compiled for those serves here too
+    player, env = resolve_agent(agent, env, observability, **names)
     require(max_steps >= 1, "max_steps", max_steps, "at least 1")
-    (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps)
+    (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps, most=1)
     return window
 
 
@@ -168,14 +169,15 @@ def play(
     keep: int,
     max_steps: int | None = None,
     first: Sequence[int] | None = None,
+    most: int | None = None,
 ) -> tuple[list[Window], NDArray[np.int64]]:
     """Play the first episode of every env of a batch greedily.
 
     From frame ``first`` on (0 by default; one for every env) ``keep`` frames of each episode are
-    kept; episodes are cut after ``max_steps``, never by default. Returns a window of each episode,
-    and all lengths int64 [N].
+    kept; episodes are cut after ``max_steps``, never by default. With ``most`` only so many envs
+    are played. Returns a window of each episode, and all lengths int64 [N].
     """
-    episodes = EpisodeBatch(env, _keys(agent))
+    episodes = EpisodeBatch(env, _keys(agent), most)
     size = episodes.size
     starts = torch.as_tensor([0] * size if first is None else first)
     lengths = torch.zeros(size, dtype=torch.int64)

@@ -3,12 +3,11 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.comparable import Runs, check_comparable, import_notes
 from arcade_torch.tools.errors import need
@@ -16,6 +15,7 @@ from arcade_torch.tools.exploring import stopped_exploring
 from arcade_torch.tools.figures import Part, Progress
 from arcade_torch.tools.figures.style import TWIN_NAMES, agent_colours, agents_by_task, drawing
 from arcade_torch.tools.imports import import_again
+from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.bootstrap import pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
@@ -24,10 +24,11 @@ from arcade_torch.tools.measures.gap_bias import figure as gap_bias
 from arcade_torch.tools.measures.gap_bias.measure import GapBias, gap_and_bias, normalise
 from arcade_torch.tools.measures.recall_density import figure as recall_density
 from arcade_torch.tools.measures.saliency import figure as saliency
+from arcade_torch.tools.measures.section import Cells
 from arcade_torch.tools.names import find_agent
-from arcade_torch.tools.options import command_line
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
+from arcade_torch.tools.reports.ahead import Piece, measure_ahead, measure_shard, pieces_of_runs
 from arcade_torch.tools.reports.findings import (
     coverage_sentence,
     learning_sentence,
@@ -35,11 +36,13 @@ from arcade_torch.tools.reports.findings import (
     way,
 )
 from arcade_torch.tools.reports.panels import Finals
+from arcade_torch.tools.reports.repeating import how_to_repeat
 from arcade_torch.tools.reports.subject import subject_section
-from arcade_torch.tools.runs import check_mean, open_run
+from arcade_torch.tools.runs import Run, check_mean, open_run
 from arcade_torch.tools.scores import METRICS
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
+from arcade_torch.tools.studies.shards import part_of
 
 MANY_PANELS = 8  # from here on pictures of learning are small
 
@@ -64,6 +67,7 @@ def report(
     metric: str = "eval_final",
     skip: Sequence[Part] = (),
     subject: str = "",
+    workers: int = 1,
     progress: Progress | None = None,
 ) -> Path:
     """Write the page of a study, one HTML file that loads nothing, and return its path.
@@ -80,6 +84,8 @@ def report(
             state contamination, returns of random policy and oracles.
         subject: the agent, or its memory, that the page is about; by default that of the study, if
             it has one.
+        workers: processes that measure at once, 0 for one a core; with 1 this one measures all. The
+            page is the same.
         progress: called with (what, done, total).
 
     Raises:
@@ -92,32 +98,77 @@ def report(
     folder = StudyFolder(Path(root))
     study = folder.load()
     rows = folder.write_results(study) if folder.is_writable else folder.rows(study)
-    runs = _finished_runs(folder, study, rows)
-    if not runs.runs:
-        raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
-    check_comparable(runs)
-    about = _subject(study, runs, subject)
+    runs, about = _runs(folder, study, rows, subject)
+    finals = _finals(runs)
+    cells, note = panels.select_cells(runs, finals, study.baseline, about)
+    if _is_on_cpu(runs):
+        pieces = _pieces(folder, runs, cells, skip)
+        measure_ahead(pieces, folder, _words(skip, subject), workers, progress)
     context: dict[str, Any] = {
         "study": study,
+        "note": note,
         "changes": import_notes(runs.runs),
         "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
         "rows": rows,
+        **_PROTOCOLS,
     }
-    context |= _PROTOCOLS
-    with drawing("light"):
-        players: Players = {}
-        if "references" not in skip:
-            players = _players(folder, runs, progress)
-        context |= _parts(study, runs, about, players, skip, progress)
+    with drawing("light"), torch_threads(1):  # the last bits of a measure depend on how many
+        players = _players(folder, runs, skip, progress)
+        context |= _parts(runs, finals, cells, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
-    context["subject"] = None
-    if about:
-        rival = _rival(context["table"], about)
-        context["subject"] = subject_section(folder, runs, about, metric, rival)
-    context |= _repeat(folder, study, rows)
+    context["subject"] = _subject_part(folder, runs, about, metric, context["table"])
+    context |= how_to_repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
     return write_atomic(Path(out) if out is not None else folder.root / "report.html", page)
+
+
+def report_shard(
+    root: str | Path, shard: str, *, skip: Sequence[Part] = (), subject: str = ""
+) -> None:
+    """Measure one share of what `report` measures, ``3/10`` for the third tenth, and keep it for
+    the report; write no page. Everything else is as for `report`.
+    """
+    _check_options("eval_final", skip)
+    part_of(shard)
+    folder = StudyFolder(Path(root))
+    study = folder.load()
+    runs, about = _runs(folder, study, folder.rows(study), subject)
+    cells, _ = panels.select_cells(runs, _finals(runs), study.baseline, about)
+    with torch_threads(1):
+        measure_shard(_pieces(folder, runs, cells, skip), shard)
+
+
+def _runs(
+    folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]], subject: str
+) -> tuple[Runs, str]:
+    """The runs that have finished, and the agent that the page is about, see `_subject`."""
+    runs = _finished_runs(folder, study, rows)
+    if not runs.runs:
+        raise ValueError(f"no run of {folder.root} has finished yet: nothing to report")
+    check_comparable(runs)
+    return runs, _subject(study, runs, subject)
+
+
+def _is_on_cpu(runs: Runs) -> bool:
+    """Whether no agent is loaded onto a card, whose memory several processes would share."""
+    return all(str(run.config.get("device", "cpu")) == "cpu" for run in runs.runs)
+
+
+def _pieces(folder: StudyFolder, runs: Runs, cells: Cells, skip: Sequence[Part]) -> list[Piece]:
+    """All that a report measures."""
+    pieces = list[Piece]()
+    if "references" not in skip:
+        for game, run in _first_runs(runs).items():
+            play = partial(_players_of, folder, run)
+            pieces.append(Piece(game, play, folder.analysis, f"references-{game}-*.json"))
+    return pieces + pieces_of_runs(cells, skip)
+
+
+def _words(skip: Sequence[Part], subject: str) -> list[str]:
+    """The options of the command line that decide what is measured."""
+    words = ["--skip", *skip] if skip else []
+    return [*words, "--subject", subject] if subject else words
 
 
 def _check_options(metric: str, skip: Sequence[str]) -> None:
@@ -130,9 +181,16 @@ def _check_options(metric: str, skip: Sequence[str]) -> None:
         )
 
 
-def _rival(table: GapBias | None, about: str) -> str:
-    """The agent that the headline holds the subject against; empty without a table."""
-    return "" if table is None else str(table.baselines[about])
+def _subject_part(
+    folder: StudyFolder, runs: Runs, about: str, metric: str, table: GapBias | None
+) -> dict[str, Any] | None:
+    """The subject beside every other agent, and the one that the headline holds it against; None
+    without a subject.
+    """
+    if not about:
+        return None
+    rival = "" if table is None else str(table.baselines[about])
+    return subject_section(folder, runs, about, metric, rival)
 
 
 def _subject(study: Study, runs: Runs, subject: str) -> str:
@@ -178,19 +236,16 @@ def _finished_runs(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str
 
 
 def _parts(
-    study: Study,
     runs: Runs,
-    subject: str,
+    finals: Finals,
+    cells: Cells,
     players: Players,
     skip: Sequence[Part],
     progress: Progress | None,
 ) -> dict[str, Any]:
     """What the agents learned, and what a look into some of them shows."""
     agents = list(dict.fromkeys(runs.names[run.key] for run in runs.runs))
-    finals = _finals(runs)
     parts = _learning(runs, finals, agents, players)
-    cells, note = panels.select_cells(runs, finals, study.baseline, subject)
-    parts["note"] = note
     parts["colours"] = {agent: f"c{place}" for place, agent in enumerate(agents)}
     parts["palette"] = list(agent_colours(agents).values())
     parts["strips"] = []
@@ -243,21 +298,35 @@ def _finals(runs: Runs) -> Finals:
     return agents_by_task(returns)
 
 
-def _players(folder: StudyFolder, runs: Runs, progress: Progress | None) -> Players:
+def _players(
+    folder: StudyFolder, runs: Runs, skip: Sequence[Part], progress: Progress | None
+) -> Players:
     """What the players earn under the rules and options that the study was trained with."""
-    players = {}
-    first_runs = {run.game: run for run in reversed(runs.runs)}
-    games = dict.fromkeys(run.game for run in runs.runs)
-    for done, game in enumerate(games, start=1):
-        run = first_runs[game]
-        import_again(run.path)  # of a game of the user's
-        config = run.config
-        rules = str(config.get("rules", "default"))
-        options = dict(config.get("env_options") or {})
-        players[game] = references(game, folder.analysis, rules, options, imports=run.imports)
+    players = dict[str, Mapping[str, Baseline]]()
+    if "references" in skip:
+        return players
+    first_runs = _first_runs(runs)
+    for done, (game, run) in enumerate(first_runs.items(), start=1):
+        players[game] = _players_of(folder, run)
         if progress is not None:
-            progress("random policy and oracles", done, len(games))
+            progress("random policy and oracles", done, len(first_runs))
     return players
+
+
+def _first_runs(runs: Runs) -> dict[str, Run]:
+    """The first run of every game."""
+    first_runs = dict[str, Run]()
+    for run in runs.runs:
+        first_runs.setdefault(run.game, run)
+    return first_runs
+
+
+def _players_of(folder: StudyFolder, run: Run) -> dict[str, Baseline]:
+    """What the players earn in the game of a run."""
+    import_again(run.path)  # of a game of the user's
+    rules = str(run.config.get("rules", "default"))
+    options = dict(run.config.get("env_options") or {})
+    return references(run.game, folder.analysis, rules, options, imports=run.imports)
 
 
 def _learning(
@@ -340,58 +409,3 @@ def _scores(
         "score_panels": gap_bias.score_panels(table) if table is not None else [],
         "caution": coverage_sentence(table) if table is not None else "",
     }
-
-
-def _repeat(folder: StudyFolder, study: Study, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Commands, versions and settings; settings of a run where they differ from those that all runs
-    share.
-    """
-    record = folder.record()
-    commands = record["runs"] if isinstance(record.get("runs"), dict) else {}
-    settings = _settings_of_runs(folder, study)
-    shared = _shared(list(settings.values()))
-    runs = []
-    for spec, row in zip(study.runs(), rows, strict=True):
-        different = {}
-        for key, value in settings.get(spec.name, {}).items():
-            if key not in shared:
-                different[key] = value
-        command = commands.get(spec.name, "")
-        runs.append({"row": row, "name": spec.name, "command": command, "settings": different})
-    return {
-        "shared": shared,
-        "runs": runs,
-        "versions": record.get("versions") or {},
-        "also": record.get("also") or [],
-        "command": record.get("command", ""),
-        "report_command": command_line(["report", str(folder.root)]),
-        "seconds": sum(float(row.get("seconds") or 0) for row in rows),
-    }
-
-
-def _settings_of_runs(folder: StudyFolder, study: Study) -> dict[str, dict[str, Any]]:
-    """The settings of the runs by name, flat; one that a run does not name has its default."""
-    settings = dict[str, dict[str, Any]]()
-    names = set[str]()
-    for spec in study.runs():
-        run = folder.run(spec)
-        if (run.path / "config.json").exists():
-            settings[spec.name] = flatten(run.config)
-            names.update(settings[spec.name])
-    defaults = {}
-    for name, value in flatten(TrainConfig().to_dict()).items():
-        if name in names:
-            defaults[name] = value
-    return {run: defaults | values for run, values in settings.items()}
-
-
-def _shared(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The settings that have one value in all runs."""
-    if not settings:
-        return {}
-    first, *others = settings
-    shared = {}
-    for name, value in first.items():
-        if all(name in other and other[name] == value for other in others):
-            shared[name] = value
-    return shared

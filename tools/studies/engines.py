@@ -59,6 +59,11 @@ class Job(NamedTuple):
         """Options of ``arcade-torch train`` that do it."""
         return ["--config", str(self.config), "--out", str(self.folder), "--resume"]
 
+    @property
+    def order(self) -> list[str]:
+        """Words of the command line that does it in a worker process."""
+        return ["train", *self.words, "--wait", f"{GRACE_S:g}"]
+
     def train(self) -> None:
         """Carry it out in this process; a run that was begun goes on.
 
@@ -88,9 +93,26 @@ class Job(NamedTuple):
 
     def add_to_log(self, text: str) -> None:
         """Add text to the log; its folder is made."""
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        with open_append(self.log) as stream:
-            stream.write(text.encode())
+        add_to_log(self.log, text)
+
+
+class Command(NamedTuple):
+    """A command line to carry out in a worker process, and the log for what it prints."""
+
+    name: str
+    order: list[str]
+    log: Path
+
+    def add_to_log(self, text: str) -> None:
+        """Add text to the log; its folder is made."""
+        add_to_log(self.log, text)
+
+
+def add_to_log(log: Path, text: str) -> None:
+    """Add text to a log; its folder is made."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with open_append(log) as stream:
+        stream.write(text.encode())
 
 
 class JobResult(NamedTuple):

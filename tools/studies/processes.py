@@ -18,7 +18,7 @@ from typing import IO
 
 from arcade_torch.agents.runs.files import open_append, read_end
 from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores
-from arcade_torch.tools.studies.engines import GRACE_S, Job, JobResult
+from arcade_torch.tools.studies.engines import GRACE_S, Command, Job, JobResult
 
 MOST_RUNS = 32
 """Runs that one process carries out."""
@@ -40,7 +40,7 @@ class Processes:
     poll_s: float = 0.1  # between two looks at the workers
     grace_s: float = GRACE_S
 
-    def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+    def run(self, jobs: Iterable[Job | Command]) -> Iterator[JobResult]:
         """Run the jobs, `workers` at a time; on Ctrl-C or close each worker gets SIGTERM and time
         to save.
         """
@@ -88,7 +88,7 @@ class Worker:
         cores: the processor cores it may use.
     """
 
-    job: Job | None
+    job: Job | Command | None
     """The run that is under way."""
 
     def __init__(
@@ -104,7 +104,7 @@ class Worker:
         self._begun_s = 0.0
         self._runs = 0
 
-    def take(self, job: Job) -> None:
+    def take(self, job: Job | Command) -> None:
         """Begin with a run."""
         self.job = job
         job.add_to_log("")
@@ -159,16 +159,16 @@ class Worker:
         seconds = time.monotonic() - self._begun_s
         return self._process is None or self._runs >= MOST_RUNS or seconds >= LONG_S
 
-    def _send(self, job: Job) -> bool:
+    def _send(self, job: Job | Command) -> bool:
         """Hand a run to the process; False if the process is no more."""
-        order = {"words": ["train", *job.words, "--wait", f"{GRACE_S:g}"], "log": str(job.log)}
+        order = {"words": job.order, "log": str(job.log)}
         try:
             self._orders.write(json.dumps(order).encode() + b"\n")
         except OSError:
             return False
         return True
 
-    def _start(self, job: Job) -> None:
+    def _start(self, job: Job | Command) -> None:
         """Start a process; what it says before its first run goes into the log of that."""
         with open_append(job.log) as log:
             process = subprocess.Popen(

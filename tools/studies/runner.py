@@ -4,7 +4,6 @@ fails.
 
 import contextlib
 import errno
-import re
 import shutil
 import threading
 import time
@@ -24,6 +23,7 @@ from arcade_torch.tools.studies.engines import Engine, Inline, Job, Ray, RayOpti
 from arcade_torch.tools.studies.folder import Row, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.studies.processes import Processes
+from arcade_torch.tools.studies.shards import part_of
 
 LOOK_EVERY_S = 0.5
 """The display is drawn this often, or less often where a look at all runs takes long."""
@@ -163,10 +163,7 @@ def planned(plan: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
     all checked.
     """
     _check_names(plan)
-    match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", shard or "1/1")
-    part, parts = map(int, match.groups()) if match else (0, 0)
-    if not 1 <= part <= parts:
-        raise ValueError(f"a shard is written 3/10, the third of ten; got {shard!r}")
+    part, parts = part_of(shard)
     configs = plan.configs(plan.runs()[part - 1 :: parts])
     _check_options(configs.values())
     return configs

@@ -25,6 +25,7 @@ LOWEST = -0.15  # of the axis: what is below is worse than a guess, however much
 
 
 PROBES: Mapping[str, Any] = {"episodes": 64, "max_steps": 96}
+OF_RUN = (measure.beliefs, PROBES)  # what a report measures of a run, and how
 """Options of `beliefs` for a report."""
 
 
@@ -329,7 +330,7 @@ def beliefs_section(
             for label in axis.get_xticklabels():
                 label.set(rotation=20, ha="right", rotation_mode="anchor")
 
-    parts = section("beliefs", hiding, (measure.beliefs, PROBES), summary, draw, progress)
+    parts = section("beliefs", hiding, OF_RUN, summary, draw, progress)
     parts["notes"] = [note for note in parts["notes"] if NO_FACTS not in note]
     parts["sentences"] = _sentences(parts["rows"])
     return parts

@@ -42,6 +42,7 @@ NOISE: Mapping[str, Any] = {
     "starts": 32,
     "cap": 96,
 }
+OF_RUN = (measure.contamination, NOISE)  # what a report measures of a run, and how
 """Options of `contamination` for a report; a figure for a paper takes whole episodes, and more."""
 
 # of one agent on one task: for each of `MEASURES` values [S, K] over its seeds
@@ -396,8 +397,7 @@ def contamination_section(
         from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    of_cell = (measure.contamination, NOISE)
-    parts = section("contamination", cells, of_cell, _section_row, draw, progress)
+    parts = section("contamination", cells, OF_RUN, _section_row, draw, progress)
     short = dict[str, int]()
     for row in parts["rows"]:
         task = f"{row['game']} {row['twin']}"

@@ -35,6 +35,7 @@ DONORS = {False: "all donors", True: "donors that differ"}
 STATE = "state"  # the place on the axis of lags where everything before the last frame is exchanged
 
 EXCHANGES: Mapping[str, Any] = {**DENSITY, "donors": 4, "most_lags": 24}
+OF_RUN = (measure.counterfactual, EXCHANGES)  # what a report measures of a run, and how
 """Options of `counterfactual` for a report: the decisions are those of its recall density."""
 
 
@@ -273,8 +274,7 @@ def counterfactual_section(
             axis.plot(np.arange(len(share)), share, color=colours[agent], ls="--", lw=1)
         axis.set_xlabel("steps back from the decision")
 
-    of_cell = (measure.counterfactual, EXCHANGES)
-    parts = section("counterfactual recall", cells, of_cell, summary, draw, progress)
+    parts = section("counterfactual recall", cells, OF_RUN, summary, draw, progress)
     parts["sentences"] = _sentences(parts["rows"])
     return parts
 

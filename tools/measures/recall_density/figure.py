@@ -30,6 +30,7 @@ POINTS = 101  # of the paper's curve, in the npz file
 # of a report: parts of an episode, or as many as the shortest episode of a task has frames
 BINS = 8
 DENSITY: Mapping[str, Any] = {"episodes": 16, "cap": 96}
+OF_RUN = (measure.recall_density, DENSITY)  # what a report measures of a run, and how
 """Options of `recall_density` for a report; a figure for a paper takes whole episodes, and more."""
 
 Densities = Sequence[tuple[Label, measure.RecallDensity]]
@@ -337,8 +338,7 @@ def recall_section(
         plot(series, axis, bins)
         axis.set_xlabel("time in the episode (1: the decision)")
 
-    of_cell = (measure.recall_density, DENSITY)
-    return section("recall density", cells, of_cell, _section_row, draw, progress)
+    return section("recall density", cells, OF_RUN, _section_row, draw, progress)
 
 
 def _shortest(densities: Sequence[measure.RecallDensity]) -> int:

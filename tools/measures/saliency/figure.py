@@ -3,6 +3,7 @@
 import math
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -154,18 +155,24 @@ def saliency_strips(cells: Cells, progress: Progress | None) -> list[dict[str, A
     """
     strips = []
     for done, ((agent, game, twin), paths) in enumerate(cells.items(), start=1):
-        settings = {"show": SHOW, "tries": TRIES}
-        _, episode = measure_run(paths[0], episode_saliency, settings)
-        warning = no_gradient(episode)
-        logits = None
-        if warning and episode.target == "probs":
-            _, by_logits = measure_run(paths[0], episode_saliency, settings | {"target": "logits"})
-            logits = _strip(by_logits)
+        episode, by_logits = measure_strip(paths[0])
+        logits = None if by_logits is None else _strip(by_logits)
         names = {"agent": agent, "game": game, "twin": twin}
-        strips.append(names | _strip(episode) | {"warning": warning, "logits": logits})
+        numbers = {"warning": no_gradient(episode), "logits": logits}
+        strips.append(names | _strip(episode) | numbers)
         if progress is not None:
             progress("saliency", done, len(cells))
     return strips
+
+
+def measure_strip(path: Path) -> tuple[EpisodeSaliency, EpisodeSaliency | None]:
+    """The episode of a strip, and the same by the logits where its gradients vanish."""
+    settings = {"show": SHOW, "tries": TRIES}
+    _, episode = measure_run(path, episode_saliency, settings)
+    if not no_gradient(episode) or episode.target != "probs":
+        return episode, None
+    _, by_logits = measure_run(path, episode_saliency, settings | {"target": "logits"})
+    return episode, by_logits
 
 
 def _strip(episode: EpisodeSaliency) -> dict[str, Any]:
