@@ -25,8 +25,8 @@ LOWEST = -0.15  # of the axis: what is below is worse than a guess, however much
 
 
 PROBES: Mapping[str, Any] = {"episodes": 64, "max_steps": 96}
-OF_RUN = (measure.beliefs, PROBES)  # what a report measures of a run, and how
 """Options of `beliefs` for a report."""
+OF_RUN = (measure.beliefs, PROBES)  # what a report measures of a run, and how
 
 
 class Scores(NamedTuple):

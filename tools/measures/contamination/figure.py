@@ -42,8 +42,8 @@ NOISE: Mapping[str, Any] = {
     "starts": 32,
     "cap": 96,
 }
-OF_RUN = (measure.contamination, NOISE)  # what a report measures of a run, and how
 """Options of `contamination` for a report; a figure for a paper takes whole episodes, and more."""
+OF_RUN = (measure.contamination, NOISE)  # what a report measures of a run, and how
 
 # of one agent on one task: for each of `MEASURES` values [S, K] over its seeds
 Measures = Mapping[str, Pooled]

@@ -35,8 +35,8 @@ DONORS = {False: "all donors", True: "donors that differ"}
 STATE = "state"  # the place on the axis of lags where everything before the last frame is exchanged
 
 EXCHANGES: Mapping[str, Any] = {**DENSITY, "donors": 4, "most_lags": 24}
-OF_RUN = (measure.counterfactual, EXCHANGES)  # what a report measures of a run, and how
 """Options of `counterfactual` for a report: the decisions are those of its recall density."""
+OF_RUN = (measure.counterfactual, EXCHANGES)  # what a report measures of a run, and how
 
 
 # of one agent on one task: each effect at every lag, and at last of the state, [L + 1]

@@ -30,8 +30,8 @@ POINTS = 101  # of the paper's curve, in the npz file
 # of a report: parts of an episode, or as many as the shortest episode of a task has frames
 BINS = 8
 DENSITY: Mapping[str, Any] = {"episodes": 16, "cap": 96}
-OF_RUN = (measure.recall_density, DENSITY)  # what a report measures of a run, and how
 """Options of `recall_density` for a report; a figure for a paper takes whole episodes, and more."""
+OF_RUN = (measure.recall_density, DENSITY)  # what a report measures of a run, and how
 
 Densities = Sequence[tuple[Label, measure.RecallDensity]]
 # (agent, game, twin) -> mass in bins, over trajectories, then seeds
