@@ -3,6 +3,7 @@ circles.
 """
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -136,18 +137,34 @@ def test_imports_of_the_package_are_absolute() -> None:
     assert not wrong, "write `from arcade_torch.models.scan import ...`:\n" + "\n".join(wrong)
 
 
+BARE = re.compile(rf"^\s*(?:from|import)\s(?:.*[ \t,])?(?:{'|'.join(LINKED)})\b", re.MULTILINE)
+
+
 def test_nobody_imports_a_code_folder_by_its_bare_name() -> None:
     everything = [
         *modules().values(),
         *(path for folder in OTHERS for path in (ROOT / folder).rglob("*.py")),
     ]
+    # Reading a file takes a hundredth of parsing it.
+    suspicious = [path for path in everything if BARE.search(path.read_text(encoding="utf-8"))]
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports {target}"
-        for path in everything
+        for path in suspicious
         for target, line in imports(tree(path))
         if target.split(".")[0] in LINKED
     ]
     assert not wrong, "write `from arcade_torch.models.scan import ...`:\n" + "\n".join(wrong)
+
+
+def test_a_bare_name_is_seen_in_every_form_of_an_import() -> None:
+    for line in (
+        "import tools",
+        "import os, models",
+        "    from agents.runs import a",
+        "import envs_jax.x",
+    ):
+        assert BARE.search(f"x = 1\n{line}\n")
+    assert not BARE.search("from arcade_torch.models import a\nmodels = 1\n")
 
 
 def at_import_time(path: Path) -> list[str]:
@@ -195,56 +212,61 @@ def test_the_code_folders_are_linked_into_the_package_by_relative_links(folder: 
     assert link.readlink() == Path("..") / folder
 
 
-def loaded_after(statement: str) -> set[str]:
-    """Top-level modules in memory after `statement` ran in a fresh interpreter."""
-    code = (
-        f"{statement}\nimport sys\n"
-        "print(' '.join(sorted({name.split('.')[0] for name in sys.modules})))"
-    )
+# What is imported without torch and JAX, and what with one of them: a process each, since importing
+# torch takes three seconds. What a statement loads is there for all below it.
+LIGHT = (
+    ("import arcade_torch", {"torch", "tensordict", "torchrl", "jax"}),
+    ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl", "jax"}),
+    (
+        "import arcade_torch; arcade_torch.registered_ids()",
+        {"torch", "tensordict", "torchrl", "jax"},
+    ),
+    ("import arcade_torch.agents.presets", {"torch", "tensordict", "torchrl", "jax"}),
+    ("import arcade_torch.tools.commands.train", {"torch", "tensordict", "torchrl", "jax"}),
+    ("import arcade_torch.tools.commands.figure", {"torch", "torchrl", "jax", "matplotlib"}),
+    ("import arcade_torch.tools.measures.gap_bias.measure", {"torch", "jax", "matplotlib"}),
+    (
+        "import arcade_torch.envs_jax as games; games.make('CartPoleEasy')",
+        {"torch", "tensordict", "torchrl"},
+    ),
+)
+MEASURES = ("saliency", "recall_density", "contamination", "counterfactual", "beliefs")
+WITH_TORCH = (
+    *(
+        (
+            f"import arcade_torch.tools.measures.{measure}.measure",
+            {"torchrl", "jax", "matplotlib", "tyro"},
+        )
+        for measure in MEASURES
+    ),
+    ("import arcade_torch.models", {"jax", "jaxlib"}),
+)
+
+
+@cache
+def loaded_after(statements: tuple[str, ...]) -> dict[str, set[str]]:
+    """Top-level modules in memory after a statement, of those that one fresh interpreter runs."""
+    print_loaded = "print(' '.join(sorted({name.split('.')[0] for name in sys.modules})))"
+    lines = [line for statement in statements for line in (statement, print_loaded)]
     result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+        [sys.executable, "-c", "\n".join(["import sys", *lines])],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
     )
     assert result.returncode == 0, result.stderr
-    return set(result.stdout.split())
+    loaded = [set(line.split()) for line in result.stdout.splitlines()]
+    return dict(zip(statements, loaded, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("statement", "absent"),
-    [
-        ("import arcade_torch", {"torch", "tensordict", "torchrl", "jax"}),
-        ("import arcade_torch.envs_jax", {"torch", "tensordict", "torchrl", "jax"}),
-        (
-            "import arcade_torch.envs_jax as games; games.make('CartPoleEasy')",
-            {"torch", "tensordict", "torchrl"},
-        ),
-        (
-            "import arcade_torch; arcade_torch.registered_ids()",
-            {"torch", "tensordict", "torchrl", "jax"},
-        ),
-        ("import arcade_torch.models", {"jax", "jaxlib"}),
-        ("import arcade_torch.agents.presets", {"torch", "tensordict", "torchrl", "jax"}),
-        ("import arcade_torch.tools.commands.train", {"torch", "tensordict", "torchrl", "jax"}),
-        ("import arcade_torch.tools.commands.figure", {"torch", "torchrl", "jax", "matplotlib"}),
-        ("import arcade_torch.tools.measures.gap_bias.measure", {"torch", "jax", "matplotlib"}),
-        *(
-            (
-                f"import arcade_torch.tools.measures.{measure}.measure",
-                {"torchrl", "jax", "matplotlib", "tyro"},
-            )
-            for measure in (
-                "saliency",
-                "recall_density",
-                "contamination",
-                "counterfactual",
-                "beliefs",
-            )
-        ),
-    ],
-)
+@pytest.mark.parametrize("chain", [LIGHT, WITH_TORCH], ids=["light", "with torch"])
 def test_importing_a_layer_loads_nothing_that_it_does_not_need(
-    statement: str, absent: set[str]
+    chain: tuple[tuple[str, set[str]], ...],
 ) -> None:
-    assert not loaded_after(statement) & absent
+    loaded = loaded_after(tuple(statement for statement, _ in chain))
+    for statement, absent in chain:
+        assert not loaded[statement] & absent, statement
 
 
 def test_the_public_names_of_the_package_resolve() -> None:
