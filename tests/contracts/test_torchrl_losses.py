@@ -39,6 +39,7 @@ from arcade_torch.agents.ppo import PPOLoss
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.models import memory_names
 from tests.contracts.pomdp import ACTIONS, CONTROL, STEPS, collected, explorer, network
+from tests.few import MEMORIES as OFTEN
 from tests.few import few_memories
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/losses.md"
@@ -253,6 +254,20 @@ def test_the_memory_learns_in_the_loss(loss: str, memory: str) -> None:
     assert outcome(loss, memory) == "yes"
 
 
+def test_the_table_in_the_documentation_has_every_loss_and_memory_and_is_true_of_a_few() -> None:
+    (page,) = re.findall(r"(?:^\|.*`lru`.*\n)(?:^\|.*\n)*", PAGE.read_text("utf-8"), re.MULTILINE)
+    head, _, *rows = [
+        [cell.strip(" `") for cell in row.split("|")[1:-1]] for row in page.splitlines()
+    ]
+    assert head == ["loss", *MEMORIES, CONTROL]
+    assert [row[0] for row in rows] == list(LOSSES)
+    for loss, *cells in rows:
+        for memory, cell in zip(head[1:], cells, strict=True):
+            if memory in {*OFTEN, CONTROL}:
+                assert cell == ("yes" if outcome(loss, memory) == "yes" else "no"), (loss, memory)
+
+
+@pytest.mark.slow
 def test_the_table_in_the_documentation_is_that_of_the_matrix() -> None:
     assert table() in PAGE.read_text(encoding="utf-8"), (
         "run: python -m tests.contracts.test_torchrl_losses"
