@@ -247,7 +247,7 @@ def test_one_network_for_both_learns_as_two_with_its_weights(form, whole):
 @pytest.mark.parametrize("towers", [1, 2])
 def test_the_documented_call_works_for_one_tower_and_for_two(memory, towers):
     network = make_actor_critic("small", memory, towers=towers, hidden_size=16)
-    env = arcade_torch.make("SkittlesEasy", num_envs=2, seed=1)
+    env = arcade_torch.make("SignpostEasy", num_envs=2, seed=1)
     collector = arcade_torch.ArcadeCollector(env, make_actor(network), 12, final_frames="truncated")
     batch = collector.collect()
     collector.shutdown()
@@ -276,7 +276,7 @@ def test_a_critic_whose_memory_did_not_run_while_collecting_is_named():
 
 def test_torchrls_losses_train_actor_and_critic_of_one_tower():
     network = make_actor_critic("small", "gru", hidden_size=16)
-    env = arcade_torch.make("SkittlesEasy", num_envs=4, seed=1)
+    env = arcade_torch.make("SignpostEasy", num_envs=4, seed=1)
     collector = arcade_torch.ArcadeCollector(env, make_actor(network), 48, final_frames="truncated")
     options = {"normalize_advantage": False, "entropy_coeff": 0.01}
     ours = PPOLoss(make_actor(network.actor), network.critic, critic_coeff=0.5, **options)

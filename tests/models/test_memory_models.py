@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from arcade_torch.models import linear_scan, make_memory, memory_names, register_memory, registry
 from arcade_torch.models.checks import check_memory
 from arcade_torch.models.memory import Memory, MemoryContract, ReplayableMemory
+from tests.few import few_memories
 
 MODELS = [
     ("lru", {}),
@@ -58,9 +59,19 @@ LENGTHS = [1, 2, 3, 7, 128, 132, 1000]
 
 
 @pytest.mark.parametrize(("name", "options"), MODELS)
-@pytest.mark.parametrize("sizes", [(4, 4), (3, 5)])
-def test_every_model_keeps_the_laws(name, options, sizes):
-    check_memory(make_memory(name, *sizes, **options))
+def test_every_model_keeps_the_laws(name, options):
+    check_memory(make_memory(name, 3, 5, **options))
+
+
+@pytest.mark.parametrize("name", few_memories(NAMES))
+def test_a_model_with_as_many_features_as_inputs_keeps_the_laws(name):
+    check_memory(make_memory(name, 4, 4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "options"), [model for model in MODELS if model[1]])
+def test_a_model_of_every_option_with_as_many_features_as_inputs_keeps_the_laws(name, options):
+    check_memory(make_memory(name, 4, 4, **options))
 
 
 @pytest.mark.parametrize("name", NAMES)
