@@ -3,8 +3,6 @@
 import subprocess
 import sys
 
-import pytest
-
 MISSING = (
     "jax",
     "jaxlib",
@@ -33,32 +31,29 @@ def run(body):
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        "memory = models.make_memory('lru', 3, 4)\nprint(len(models.check_memory(memory)))",
-        "network = models.make_network('small', memory='gru')\n"
-        "x = torch.zeros(2, 3, 128, 128, 3, dtype=torch.uint8)\n"
-        "flags = torch.zeros(2, 3, dtype=torch.bool)\n"
-        "action = torch.zeros(2, 3, dtype=torch.int64)\n"
-        "y, _ = network.remember(network.encode(x), action, flags, network.initial_state(2))\n"
-        "print(y.shape)",
-        "print(models.memory_names())",
-    ],
-    ids=["memory", "network", "names"],
-)
-def test_models_work_alone(body):
-    done = run(body)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip()
-
-
-def test_only_memory_module_asks_for_torchrl():
-    body = """
+BODIES = {
+    "memory": "memory = models.make_memory('lru', 3, 4)\nprint(len(models.check_memory(memory)))",
+    "network": "network = models.make_network('small', memory='gru')\n"
+    "x = torch.zeros(2, 3, 128, 128, 3, dtype=torch.uint8)\n"
+    "flags = torch.zeros(2, 3, dtype=torch.bool)\n"
+    "action = torch.zeros(2, 3, dtype=torch.int64)\n"
+    "y, _ = network.remember(network.encode(x), action, flags, network.initial_state(2))\n"
+    "print(y.shape)",
+    "names": "print(models.memory_names())",
+}
+ASKS = """
+print("then the module")
 module = models.MemoryModule(models.make_memory('gru', 3, 4))
 from tensordict import TensorDict
 data = TensorDict({'embed': torch.zeros(2, 3), 'is_init': torch.ones(2, 1, dtype=torch.bool)}, [2])
 module(data)
 """
-    done = run(body)
+
+
+def test_models_work_alone_and_only_memory_module_asks_for_torchrl():
+    """One process, of which torch's import is the most."""
+    done = run("\n".join([*BODIES.values(), ASKS]))
+    laws, shape, names, last = done.stdout.splitlines()
+    assert int(laws) > 0 and shape.startswith("torch.Size([2, 3,") and "gru" in names
+    assert last == "then the module", done.stderr
     assert done.returncode != 0 and "torchrl" in done.stderr.splitlines()[-1]
