@@ -21,6 +21,7 @@ from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, StubGame
+from tests.few import a_third
 
 N, T = 6, 8
 HASTY = CompiledGame(StubGame(risk=0.15, max_steps=3))  # both kinds of end, several in a row
@@ -164,10 +165,22 @@ def small(pixels: torch.Tensor) -> torch.Tensor:
     return pixels[..., ::2, ::4, :] + 1
 
 
-@pytest.mark.parametrize("compress", [None, small])
-@pytest.mark.parametrize("overlap", [0, 4, T + 3])
-@pytest.mark.parametrize("game", [GAME, LOCKSTEP, HASTY, MIXED])
-@pytest.mark.parametrize("mode", ["truncated", "none"])
+WINDOWS = a_third(
+    [GAME, LOCKSTEP, HASTY, MIXED], [0, 4, T + 3], ["truncated", "none"], [None, small]
+)
+
+
+def test_every_pair_of_a_game_and_an_option_of_its_windows_is_looked_at_on_every_change() -> None:
+    values = [tuple(map(str, case.values)) for case in WINDOWS]
+    often = [tuple(map(str, case.values)) for case in WINDOWS if not case.marks]
+    assert 3 * len(often) == len(values)
+    for one, other in itertools.combinations(range(4), 2):
+        assert {(case[one], case[other]) for case in often} == {
+            (case[one], case[other]) for case in values
+        }
+
+
+@pytest.mark.parametrize(("game", "overlap", "mode", "compress"), WINDOWS)
 def test_next_observations_of_sequences_are_those_of_a_rollout(
     game: CompiledGame, overlap: int, mode: Any, compress: Any
 ) -> None:

@@ -144,9 +144,18 @@ NAMES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("batch", [(), (3,)])
-@pytest.mark.parametrize("one_hot", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
+# Every kind of frame with both kinds of action, every pair of frame, action and batch, once.
+CASES = [
+    pytest.param(
+        kind, one_hot, batch, marks=[] if (i + one_hot + len(batch)) % 2 == 0 else pytest.mark.slow
+    )
+    for i, kind in enumerate(KINDS)
+    for one_hot in (False, True)
+    for batch in ((), (3,))
+]
+
+
+@pytest.mark.parametrize(("kind", "one_hot", "batch"), CASES)
 def test_every_measure_takes_any_frames_actions_and_batches_with_the_same_names(
     kind: str, one_hot: bool, batch: tuple[int, ...]
 ) -> None:
