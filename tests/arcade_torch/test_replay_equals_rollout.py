@@ -296,6 +296,7 @@ def test_the_loss_reads_the_q_values_that_were_acted_and_those_of_the_true_next_
     torch.testing.assert_close(target, expected, rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.parametrize("name", few_memories(memory_names()))
 @paths
 def test_the_loss_of_ppo_reads_the_policy_and_the_values_that_were_acted(
     name: str, path: str
