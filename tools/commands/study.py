@@ -151,7 +151,7 @@ class Demo(Resumable):
     seeds each.
 
     Ends in one HTML page with learning curves, observability gap, memory bias, saliency,
-    counterfactual recall and beliefs. Less than ten minutes on two cores; type the same again to go
+    counterfactual recall and beliefs. About six minutes on two cores; type the same again to go
     on after an interruption. One game is a probe, solved with memory and only with it; the other is
     one of the ten, where half a minute of training only begins to show it.
 
@@ -160,7 +160,7 @@ class Demo(Resumable):
 
     word = "demo"
     games: tuple[str, ...] = ("SignpostEasy", "MineSweeperEasy")  # Games to play.
-    frames: int = 45_000  # Environment steps of each run.
+    frames: int = 37_000  # Environment steps of each run.
     seeds: int = 3  # Runs of each agent and twin.
     out: Path = Path("runs/demo")  # Folder of the study.
     workers: int = 0  # Runs at once; 0 for one a core.
