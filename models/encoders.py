@@ -317,8 +317,7 @@ class SmallEncoder(Encoder):
 
     def _in_float32(self, frames: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
         """The three layers as products and a convolution."""
-        # a copy, minus the mean: two thirds of the time of a second copy, a third of that of bytes
-        x = frames.to(mean.dtype, copy=True).sub_(mean)
+        x = frames.to(mean.dtype) - mean  # half the time of subtracting from bytes
         x = F.leaky_relu_(F.linear(x, weight, self.conv1.bias)).permute(0, 3, 1, 2)
         return self._all_places(F.leaky_relu_(self.conv2(x)))
 
@@ -336,7 +335,5 @@ class SmallEncoder(Encoder):
 
     def _all_places(self, x: Tensor) -> Tensor:
         """The last layer, [N, 32, 6, 6] -> [N, 128]; pixel by pixel, as the values lie."""
-        # channels last, and then a view: half the time of a copy in this order
-        weight = self.linear.weight.contiguous(memory_format=torch.channels_last)
-        weight = weight.permute(0, 2, 3, 1).flatten(1)
+        weight = self.linear.weight.permute(0, 2, 3, 1).flatten(1)
         return F.linear(x.permute(0, 2, 3, 1).flatten(1), weight, self.linear.bias)
