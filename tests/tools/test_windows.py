@@ -4,6 +4,7 @@ was acted.
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ from tensordict import TensorDict
 import arcade_torch
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import greedy_window, saliency
+from arcade_torch.tools import contamination, greedy_window, recall_density, saliency
 from arcade_torch.tools.measures.windows import play
 
 GAME = "MineSweeperEasy"
@@ -118,3 +119,10 @@ def test_a_batch_of_several_is_refused() -> None:
         ValueError, match=r"the batch size of env must be \[\] or \[1\], for one episode; got \[2\]"
     ):
         greedy_window(Scripted([0]), arcade_torch.make(GAME, num_envs=2))
+
+
+@pytest.mark.parametrize("measure", [greedy_window, recall_density, contamination])
+@pytest.mark.parametrize("env", [GAME, gymnasium.make("CartPole-v1")], ids=["id", "gymnasium"])
+def test_what_is_no_environment_of_torchrl_is_refused_in_one_line(measure: Any, env: Any) -> None:
+    with pytest.raises(TypeError, match=r"env is .*expected an environment of TorchRL"):
+        measure(Scripted([0]), env)

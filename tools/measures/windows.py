@@ -16,6 +16,7 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.envs import EpisodeBatch
 from arcade_torch.tools.measures.keys import Keys, Names
@@ -97,14 +98,15 @@ def greedy_window(
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
     seed = held_out(seed) if env is None else seed
-    require(
-        env is None or tuple(env.batch_size) in ((), (1,)),
-        "the batch size of env",
-        [] if env is None else list(env.batch_size),
-        "[] or [1], for one episode",
-    )
+    is_users = env is not None
     # as many envs of its own as other measures play: what is compiled for those serves here too
     player, env = resolve_agent(agent, env, observability, **names)
+    require(
+        not is_users or tuple(env.batch_size) in ((), (1,)),
+        "the batch size of env",
+        list(env.batch_size),
+        "[] or [1], for one episode",
+    )
     require(max_steps >= 1, "max_steps", max_steps, "at least 1")
     (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps, most=1)
     return window
@@ -267,7 +269,13 @@ def resolve_agent(
 
     Raises:
         ValueError: there is no environment for it, or more than one.
+        TypeError: ``env`` is no environment of TorchRL.
     """
+    if env is not None and not hasattr(env, "step_and_maybe_reset"):
+        raise TypeError(
+            f"env is {format_value(env)}, expected an environment of TorchRL, such as "
+            "arcade_torch.make(...), or GymWrapper(env) around one of Gymnasium"
+        )
     if isinstance(agent, str | Path):
         agent = load_agent(Path(agent))
     acts = hasattr(agent, "act") and hasattr(agent, "initial_state")
