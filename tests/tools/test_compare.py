@@ -21,7 +21,7 @@ from tests.tools.fabricated import write_study
 from tests.tools.test_cli import one_error
 from tests.tools.test_report import LEVELS
 
-SPEED = Speed(frames_per_s=2500, start_s=8, report_s=30)
+SPEED = Speed(frames_per_s=2500, start_s=8, report_s=3.5)
 GAMES = compare.GAMES
 
 
@@ -58,7 +58,7 @@ def test_what_fits_into_the_minutes_takes_no_longer_and_is_not_much_shorter() ->
 
 def test_games_and_seeds_are_left_out_before_runs_become_too_short() -> None:
     budget = Budget(agents=3, workers=2, speed=SPEED)
-    assert budget.fit(GAMES, 10) == Size(GAMES[:2], 2, 75_000)
+    assert budget.fit(GAMES, 10) == Size(GAMES[:2], 2, 78_000)
     assert budget.fit(GAMES, 5).games == GAMES[:1]
     assert budget.fit(GAMES, 1) == Size(GAMES[:1], 2, 20_000)  # the least, which takes longer
     assert budget.minutes(1, 2, 20_000) > 1

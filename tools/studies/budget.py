@@ -22,8 +22,8 @@ UPDATES = 2
 """Updates of each memory that are timed."""
 START_S = 6.0
 """Seconds of a core for a run beside building and training: imports, evaluations, checkpoints."""
-REPORT_S = 30.0
-"""Seconds of a core for each game in the report."""
+REPORT_S = 3.5
+"""Seconds of a core for a run in the report, which the same workers measure."""
 SHARE = 0.85
 """Workers side by side are so much slower than one alone, which is timed."""
 
@@ -33,7 +33,7 @@ class Speed(NamedTuple):
 
     frames_per_s: float  # collecting and learning, the same number of frames of every memory
     start_s: float  # of a run, before and after its frames
-    report_s: float  # of the report, for each game
+    report_s: float  # of a run in the report
 
 
 class Size(NamedTuple):
@@ -88,16 +88,17 @@ class Budget:
 
     def minutes(self, games: int, seeds: int, frames: int) -> float:
         """How long a study takes."""
-        run_s = self.speed.start_s + frames / self.speed.frames_per_s
-        return (self._rounds(games, seeds) * run_s / SHARE + self.speed.report_s * games) / 60
+        training_s = self.speed.start_s + frames / self.speed.frames_per_s
+        run_s = training_s / SHARE + self.speed.report_s
+        return self._rounds(games, seeds) * run_s / 60
 
     def frames(self, games: int, seeds: int, minutes: float) -> int:
         """Frames of each run, in whole thousands, of a study that takes so long; below zero where
         the starts alone take longer.
         """
-        training_s = SHARE * (60 * minutes - self.speed.report_s * games)
-        run_s = training_s / self._rounds(games, seeds) - self.speed.start_s
-        frames = int(run_s * self.speed.frames_per_s) // 1000 * 1000
+        run_s = 60 * minutes / self._rounds(games, seeds)
+        training_s = SHARE * (run_s - self.speed.report_s)
+        frames = int((training_s - self.speed.start_s) * self.speed.frames_per_s) // 1000 * 1000
         return min(frames, MOST_FRAMES)
 
     def fit(
