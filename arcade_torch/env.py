@@ -128,16 +128,17 @@ class ArcadeEnv(BaseEnv):
         wait_for_torch(torch_device, jax_device)
         keys = self._keys(0)
         partial = jax.device_put(flags, jax_device)
-        first = self._batched.init(keys, partial)
+        blank = jax.device_put(self._batched.blank(keys, partial), jax_device)
+        # what every reset runs: to begin by ``init`` would compile the game's reset once more
+        first, _ = self._batched.reset_render(blank, np.ones(num_envs, np.bool_))
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
         no = jax.device_put(np.zeros(num_envs, np.bool_), jax_device)
         self._none_ended: Ended = (no, no)
-        running = self._batched.without_ends(first)
-        self._live = Live(running, self._none_ended, self._no_ends)
+        self._live = Live(first, self._none_ended, self._no_ends)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
         self._memory = FrameMemory(shape, jax_device)
         self._ends = FrameMemory(shape, jax_device)
-        self._snapshots = Snapshots(self._batched, first, torch_device, jax_device)
+        self._snapshots = Snapshots(self._batched, self._with_ends(), torch_device, jax_device)
         tasks = len(self.games) if self.task_in_td else 0
         action, observation, reward, done = make_specs(
             num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device

@@ -85,6 +85,7 @@ class JaxEnv(BaseEnv):
         one_action = suite_actions.action_of_one(self.action_spec)
         self._action_dtype = one_action.dtype
         suite.check(one_action)
+        self._begin = jax.jit(self._first)
         self._reset_rows = jax.jit(self._begin_anew)
         self._step_alone = jax.jit(self._advance)
         self._step_fused = jax.jit(self._advance_and_begin_anew)
@@ -308,7 +309,7 @@ class JaxEnv(BaseEnv):
         wait_for_torch(self.device, self._jax_device)
         with jax.default_device(self._jax_device):  # on another GPU than the first one, too
             keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-            self._go_on(jax.jit(self._first)(keys))
+            self._go_on(self._begin(keys))
 
     def _first(self, keys: jax.Array) -> Episodes:
         """Episodes that begin."""

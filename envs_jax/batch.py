@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
 from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, as_actions, keeps_ends
-from arcade_torch.envs_jax.settings import compiled, fixed, raw_key
+from arcade_torch.envs_jax.settings import compiled, fixed, is_key, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
 State = TypeVar("State")
@@ -132,6 +132,19 @@ class BatchedGame(Generic[State]):
         return with_flags(
             Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
         )
+
+    def blank(self, keys: Array, partial: Array) -> Batch:
+        """N envs in which nothing has begun: zeros in the shapes of ``init``, without flags of an
+        end, and nothing is compiled.
+
+        ``reset_where`` or ``reset_render`` of all of them begins the episodes that ``init`` begins.
+        """
+
+        def begun(keys: Array, partial: Array) -> Batch:
+            return self.without_ends(self.init(keys, partial))
+
+        zeros: Batch = jax.tree.map(_zeros, jax.eval_shape(begun, keys, partial))
+        return zeros._replace(key=jnp.asarray(keys), partial=jnp.asarray(partial))
 
     def _step(self, batch: Batch, action: Array) -> tuple[Batch, Outcome]:
         """Take one action in every env. What comes has the flags of an end, whether the batch has
@@ -273,6 +286,13 @@ def has_ends(batch: Batch) -> bool:
 def _keeper(batch: Batch) -> Any:
     """What of a batch of one game has the flags of an end: its state, or itself."""
     return batch.state if keeps_ends(batch.state) else batch
+
+
+def _zeros(leaf: Any) -> Array:
+    """Zeros of the shape and type of a leaf."""
+    if is_key(leaf):
+        return jnp.zeros(leaf.shape, leaf.dtype)
+    return jnp.asarray(np.zeros(leaf.shape, leaf.dtype))  # jnp.zeros would compile for every shape
 
 
 @partial(jax.vmap, out_axes=0)

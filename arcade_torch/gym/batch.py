@@ -75,11 +75,8 @@ class NumpyBatch:
         self._compiled = compiled
         self._batched = compiled.batched
         self.num_envs = len(flags)
-        # Nothing runs before the first reset, so its shape is all that is needed of a batch, and
-        # nothing is compiled.
-        shape = jax.eval_shape(self._batched.init, env_keys(0, self.num_envs), flags)
-        batch: Batch = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-        self._batch = batch._replace(partial=jnp.asarray(flags))
+        # Nothing runs before the first reset, so its shape is all that is needed of a batch.
+        self._batch = self._batched.blank(env_keys(0, self.num_envs), jnp.asarray(flags))
         self._no_ends = (jnp.zeros(self.num_envs, bool), jnp.zeros(self.num_envs, bool))
         (device,) = self._batch.partial.devices()
         self._finals = FinalObservations(compiled, self.num_envs, 1, device)

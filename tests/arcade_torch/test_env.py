@@ -152,6 +152,19 @@ def test_a_second_env_compiles_nothing_also_at_ends(game: CompiledGame) -> None:
 
 
 @pytest.mark.parametrize("game", [GAME, MIXED])
+def test_an_env_begins_where_init_begins_and_compiles_its_reset_once(game: CompiledGame) -> None:
+    env = stub_env(game, seed=0)
+    begun = game.batched.init(env_keys(0, N), np.zeros(N, np.bool_))
+    key = torch.from_numpy(np.array(env_keys(0, N)).view(np.int32))  # a seed sets it again
+    exported = env._snapshots.export(begun).set("key", key)
+    assert_same(env.get_state(), exported)
+    compiled = game.batched.reset_render._cache_size()
+    env.rollout(3, scripted)
+    env.reset()
+    assert game.batched.reset_render._cache_size() == compiled > 0
+
+
+@pytest.mark.parametrize("game", [GAME, MIXED])
 def test_writing_to_what_the_env_gave_does_not_change_its_future(game: CompiledGame) -> None:
     wanton, careful = stub_env(game, seed=2), stub_env(game, seed=2)
     ours, theirs = wanton.reset(), careful.reset()

@@ -207,6 +207,17 @@ def test_the_fused_step_gives_the_bits_of_step_and_reset(name: str) -> None:
         assert (root.select(*other.keys(True, True)) == other).all()
 
 
+def test_another_seed_compiles_nothing() -> None:
+    env = made("both")
+    before = env.reset()
+    events = list[str]()
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: events.append(name))
+    env.set_seed(1)
+    after = env.reset()
+    assert not [name for name in events if "backend_compile" in name]
+    assert not (before == after).all()
+
+
 @few_envs
 def test_a_snapshot_determines_the_future(name: str) -> None:
     env = made(name)
