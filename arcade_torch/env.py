@@ -128,7 +128,8 @@ class ArcadeEnv(BaseEnv):
         wait_for_torch(torch_device, jax_device)
         keys = self._keys(0)
         partial = jax.device_put(flags, jax_device)
-        blank = jax.device_put(self._batched.blank(keys, partial), jax_device)
+        with jax.default_device(jax_device):
+            blank = jax.device_put(self._batched.blank(keys, partial), jax_device)
         # what every reset runs: to begin by ``init`` would compile the game's reset once more
         first, _ = self._batched.reset_render(blank, np.ones(num_envs, np.bool_))
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
