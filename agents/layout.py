@@ -35,6 +35,11 @@ class NetworkInputs:
     """
 
     def __init__(self, network: TensorDictModuleBase) -> None:
+        if not hasattr(network, "in_keys"):
+            raise TypeError(
+                f"a network must be a TensorDict module; got a {type(network).__name__}: "
+                "TensorDictModule(network, [what it reads], [what it writes])"
+            )
         keys = [unravel_key(key) for key in network.in_keys]
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
@@ -321,6 +326,9 @@ def unroll(
 
     Returns:
         float [B, L + K, ...], the output along the extended sequence.
+
+    Raises:
+        KeyError: the network does not write it.
     """
     extended = sequences["extended"]
     state = sequences.get("initial_state", None)
@@ -339,7 +347,18 @@ def unroll(
     if state is not None:
         _begin_with(extended, state, inputs)
     with set_recurrent_mode(True):
-        return network(extended).get(key)  # type: ignore[no-any-return]
+        return written(network(extended), key, network)
+
+
+def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> Tensor:
+    """What a network has written under a key; a KeyError if it has not."""
+    value = steps.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"the network does not write {key!r}, it writes {list(network.out_keys)}: name the "
+            "entry with set_keys"
+        )
+    return value  # type: ignore[no-any-return]
 
 
 def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> TensorDictBase:
