@@ -119,7 +119,8 @@ class EpisodeBatch:
             list(value.shape),
             f"one number a step, {[*self.env.batch_size, 1]}",
         )
-        return value.reshape(self._envs, 1)[: self.size]
+        rows: Tensor = value.reshape(self._envs, 1)
+        return rows[: self.size]
 
 
 def one_hot(action: Tensor, count: int) -> Tensor:
