@@ -206,8 +206,7 @@ class ArcadeCollector(BaseCollector):
             compact = self.compact_obs or self._final_frames != "all"
             buffer, _ = self._collect_window(random=False, dense=not compact)
             batch = buffer.transitions(compact)
-            traj_ids = self._trajectories(buffer)
-            batch["collector"] = TensorDict({"traj_ids": traj_ids}, batch_size=batch.batch_size)
+            batch["collector", "traj_ids"] = self._trajectories(buffer)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             self._numbered = self._iter  # a window that a hook refused was not
