@@ -115,6 +115,19 @@ def insert_final_observations(
     return out
 
 
+def is_prepared(batch: TensorDictBase) -> bool:
+    """Whether a batch is what :func:`insert_final_observations` gave; an observation may be called
+    as an entry of that.
+    """
+    return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
+
+
+def _stored_state(batch: TensorDictBase) -> TensorDictBase | None:
+    """The ``initial_state`` of sequences; an observation of that name is none."""
+    state = batch.get("initial_state", None)
+    return state if isinstance(state, TensorDictBase) else None
+
+
 def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
     """A copy of the batch with the entries that have other names under ours as well."""
     if "steps_to_next_obs" in batch:
@@ -242,7 +255,7 @@ def _add_observations(
     ``burn_in``, the observations before.
     """
     keys = list(inputs.observation_keys)
-    if not inputs.reads_first_state_only and "initial_state" not in batch:
+    if not inputs.reads_first_state_only and _stored_state(batch) is None:
         # a stock batch has a state for every step
         keys += [key for key in inputs.state_keys if key in batch]
 
@@ -265,7 +278,7 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
     """Write ``initial_state``, the recurrent state before the first step."""
     if not inputs.state_keys:
         return
-    first = batch.get("initial_state", None)
+    first = _stored_state(batch)
     if first is not None:
         missing = [key for key in inputs.state_keys if key not in first]
         if missing:

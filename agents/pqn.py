@@ -19,7 +19,12 @@ from torchrl.objectives.value import ValueEstimatorBase
 from arcade_torch.agents.batch_checks import Key, is_stock, with_mask
 from arcade_torch.agents.checked import CountOrZero, coerce, require
 from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.agents.layout import (
+    NetworkInputs,
+    insert_final_observations,
+    is_prepared,
+    unroll,
+)
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import QLambdaEstimator
 
@@ -177,7 +182,7 @@ class PQNLoss(LossModule):
             KeyError: an entry is missing.
             ValueError: a needed next observation or recurrent state is not in the batch.
         """
-        prepared = "position" in tensordict
+        prepared = is_prepared(tensordict)
         data = tensordict if prepared else self.prepare(tensordict)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
         if steps == 0:
