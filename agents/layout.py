@@ -18,6 +18,7 @@ from torchrl.modules import set_recurrent_mode
 from arcade_torch.agents.batch_checks import (
     Key,
     check_order,
+    check_state_keys,
     check_stored_states,
     entry,
     flat,
@@ -40,6 +41,7 @@ class NetworkInputs:
                 f"a network must be a TensorDict module; got a {type(network).__name__}: "
                 "TensorDictModule(network, [what it reads], [what it writes])"
             )
+        check_state_keys(network)
         keys = [unravel_key(key) for key in network.in_keys]
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.modules import ActorValueOperator, ProbabilisticActor, ValueOperator
+from torchrl.modules import ActorValueOperator, LSTMModule, ProbabilisticActor, ValueOperator
 
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, make_actor
 from tests.agents.fakes import toy_actor_critic, toy_network
@@ -86,3 +86,20 @@ def test_an_actor_that_draws_nothing_gets_one_line():
     batch = ppo_batch()
     loss = PPOLoss(both.get_policy_operator(), both.get_value_operator())
     assert value(loss, batch).isfinite().all()
+
+
+def test_two_memories_under_one_key_are_refused():
+    """Before: each read the state that the other had written, in silence."""
+    first, second = toy_network(0), toy_network(1)
+    actor = make_actor(toy_network(0, out_key="logits"))
+    critic = toy_network(1, 1, out_key="state_value")
+    message = r"^state_key must be another for each memory of the networks; got two .*'memory', 'h'"
+    with pytest.raises(ValueError, match=message):
+        PPOLoss(actor, critic)
+    with pytest.raises(ValueError, match=message):
+        PQNLoss(TensorDictSequential(first, second))
+    twice = TensorDictSequential(first, first)  # one memory, and its state is one
+    assert PQNLoss(twice).inputs.state_keys == [("memory", "h")]
+    lstm = [LSTMModule(3, 3, in_key="x", out_key="y") for _ in range(2)]
+    with pytest.raises(ValueError, match="got two with their state under 'recurrent_state_h'"):
+        PQNLoss(TensorDictSequential(*lstm))
