@@ -371,7 +371,7 @@ def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> T
     if value is None:
         raise KeyError(
             f"the network does not write {key!r}, it writes {list(network.out_keys)}: name the "
-            "entry with set_keys"
+            "entry with set_keys, or let it write that"
         )
     return value  # type: ignore[no-any-return]
 

@@ -289,7 +289,7 @@ class PPOLoss(LossModule):
         for key in self.inputs.state_keys:
             if key in steps:
                 steps[key] = steps[key].detach()
-        steps = steps.exclude(keys.value)  # a stored value is none that has a gradient
+        steps = steps.exclude(keys.value, "prediction_error")  # what is stored has no gradient
 
         with self._parameters_in(self.actor_network, "actor_network_params"):
             policy = self.actor_network.get_dist(steps)
@@ -316,7 +316,8 @@ class PPOLoss(LossModule):
             "loss_entropy": -self.entropy_coeff * entropy,
         }
         if self.prediction_coeff:
-            losses["loss_prediction"] = self.prediction_coeff * steps["prediction_error"]
+            error = written(steps, "prediction_error", self.actor_network)
+            losses["loss_prediction"] = self.prediction_coeff * error
         diagnostics = {
             "entropy": entropy.detach(),
             "kl_approx": terms["kl"],

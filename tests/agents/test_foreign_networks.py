@@ -47,6 +47,9 @@ def test_a_stored_value_takes_the_place_of_no_critic():
         PPOLoss(make_actor(network.actor), head(1, "worth"))(batch)
     with pytest.raises(KeyError, match="does not write 'state_value', it writes"):
         PPOLoss(make_actor(network.actor), head(1, "worth"))(ppo_batch())
+    batch["prediction_error"] = torch.ones(4, 4)
+    with pytest.raises(KeyError, match="does not write 'prediction_error', it writes"):
+        PPOLoss(make_actor(network.actor), network.critic, prediction_coeff=1.0)(batch)
     named = PPOLoss(make_actor(network.actor), head(1, "worth"))
     named.set_keys(value="worth")
     critic_loss = named(batch.set("worth", batch["state_value"]))["loss_critic"]
