@@ -296,8 +296,8 @@ class PPOLoss(LossModule):
         if self.critic_network is not None:
             with self._parameters_in(self.critic_network, "critic_network_params"):
                 self.critic_network(steps)
-        network = self.actor_network if self.critic_network is None else self.critic_network
-        value = one_a_step(keys.value, written(steps, keys.value, network), steps)
+        value = written(steps, keys.value, self.critic_network or self.actor_network)
+        value = one_a_step(keys.value, value, steps)
         log_prob = policy.log_prob(_fitting(steps[keys.action], policy))
         terms = ppo_objective(
             log_prob=one_a_step("log_prob of the policy", log_prob, steps),
@@ -316,8 +316,7 @@ class PPOLoss(LossModule):
             "loss_entropy": -self.entropy_coeff * entropy,
         }
         if self.prediction_coeff:
-            error = written(steps, "prediction_error", self.actor_network)
-            losses["loss_prediction"] = self.prediction_coeff * error
+            losses["loss_prediction"] = self.prediction_coeff * steps["prediction_error"]
         diagnostics = {
             "entropy": entropy.detach(),
             "kl_approx": terms["kl"],
