@@ -1,12 +1,16 @@
 """Which layout a batch has, which of its steps count, and what no loss can read."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.modules import GRUModule, LSTMModule
 
 from arcade_torch.agents.checked import require
+from arcade_torch.models.memory_module import MemoryModule
+from arcade_torch.models.networks import MemoryNetwork
 
 if TYPE_CHECKING:
     from arcade_torch.agents.layout import NetworkInputs
@@ -88,6 +92,29 @@ def stored_numbers(
         number = one_a_step(key, steps[key].detach(), steps)
         numbers[key] = number if mask is None else number.where(mask.unsqueeze(-1), 0)
     return numbers
+
+
+def check_state_keys(network: TensorDictModuleBase) -> None:
+    """Refuse two memories that have their state under one key (ValueError): each would read what
+    the other has written. One memory in two networks is none of these.
+    """
+    owners = dict[Any, Any]()
+    for module in network.modules():
+        if isinstance(module, MemoryModule):
+            owner = module.memory
+        elif isinstance(module, MemoryNetwork):
+            owner = module.block
+        elif isinstance(module, LSTMModule | GRUModule):
+            owner = module
+        else:
+            continue
+        written = {unravel_key(key) for key in module.out_keys}
+        for key in map(unravel_key, module.in_keys):
+            if unravel_key(("next", key)) in written and owners.setdefault(key, owner) is not owner:
+                raise ValueError(
+                    f"state_key must be another for each memory of the networks; got two with "
+                    f"their state under {key!r}"
+                )
 
 
 def check_order(batch: TensorDictBase, cut: Tensor) -> None:

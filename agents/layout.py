@@ -18,6 +18,7 @@ from torchrl.modules import set_recurrent_mode
 from arcade_torch.agents.batch_checks import (
     Key,
     check_order,
+    check_state_keys,
     check_stored_states,
     entry,
     flat,
@@ -35,6 +36,12 @@ class NetworkInputs:
     """
 
     def __init__(self, network: TensorDictModuleBase) -> None:
+        if not hasattr(network, "in_keys"):
+            raise TypeError(
+                f"a network must be a TensorDict module; got a {type(network).__name__}: "
+                "TensorDictModule(network, [what it reads], [what it writes])"
+            )
+        check_state_keys(network)
         keys = [unravel_key(key) for key in network.in_keys]
         written = {unravel_key(key) for key in network.out_keys}
         self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
@@ -108,6 +115,19 @@ def insert_final_observations(
     _add_observations(out, batch, inputs, final_steps, order, burn_in)
     _add_state(out, batch, inputs, burn_in)
     return out
+
+
+def is_prepared(batch: TensorDictBase) -> bool:
+    """Whether a batch is what :func:`insert_final_observations` gave; an observation may be called
+    as an entry of that.
+    """
+    return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
+
+
+def _stored_state(batch: TensorDictBase) -> TensorDictBase | None:
+    """The ``initial_state`` of sequences; an observation of that name is none."""
+    state = batch.get("initial_state", None)
+    return state if isinstance(state, TensorDictBase) else None
 
 
 def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
@@ -237,7 +257,7 @@ def _add_observations(
     ``burn_in``, the observations before.
     """
     keys = list(inputs.observation_keys)
-    if not inputs.reads_first_state_only and "initial_state" not in batch:
+    if not inputs.reads_first_state_only and _stored_state(batch) is None:
         # a stock batch has a state for every step
         keys += [key for key in inputs.state_keys if key in batch]
 
@@ -260,7 +280,7 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
     """Write ``initial_state``, the recurrent state before the first step."""
     if not inputs.state_keys:
         return
-    first = batch.get("initial_state", None)
+    first = _stored_state(batch)
     if first is not None:
         missing = [key for key in inputs.state_keys if key not in first]
         if missing:
@@ -321,6 +341,9 @@ def unroll(
 
     Returns:
         float [B, L + K, ...], the output along the extended sequence.
+
+    Raises:
+        KeyError: the network does not write it.
     """
     extended = sequences["extended"]
     state = sequences.get("initial_state", None)
@@ -339,7 +362,18 @@ def unroll(
     if state is not None:
         _begin_with(extended, state, inputs)
     with set_recurrent_mode(True):
-        return network(extended).get(key)  # type: ignore[no-any-return]
+        return written(network(extended), key, network)
+
+
+def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> Tensor:
+    """What a network has written under a key; a KeyError if it has not."""
+    value = steps.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"the network does not write {key!r}, it writes {list(network.out_keys)}: name the "
+            "entry with set_keys, or let it write that"
+        )
+    return value  # type: ignore[no-any-return]
 
 
 def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> TensorDictBase:

@@ -30,7 +30,7 @@ from arcade_torch.agents.batch_checks import (
 )
 from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, as_steps
+from arcade_torch.agents.layout import NetworkInputs, as_steps, written
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import SequenceGAE
 
@@ -182,6 +182,12 @@ class PPOLoss(LossModule):
         super().__init__()
         self.functional = functional
         self.critic_network = None
+        if not hasattr(actor_network, "get_dist"):
+            raise TypeError(
+                "actor_network must be a probabilistic TensorDict module, such as a "
+                f"ProbabilisticActor; got a {type(actor_network).__name__} (of an "
+                "ActorValueOperator: get_policy_operator(), get_value_operator())"
+            )
         if critic_network is None:
             require(
                 _may_write_value(actor_network, self.tensor_keys.value),
@@ -283,13 +289,15 @@ class PPOLoss(LossModule):
         for key in self.inputs.state_keys:
             if key in steps:
                 steps[key] = steps[key].detach()
+        steps = steps.exclude(keys.value, "prediction_error")  # what is stored has no gradient
 
         with self._parameters_in(self.actor_network, "actor_network_params"):
             policy = self.actor_network.get_dist(steps)
         if self.critic_network is not None:
             with self._parameters_in(self.critic_network, "critic_network_params"):
                 self.critic_network(steps)
-        value = one_a_step(keys.value, steps[keys.value], steps)
+        value = written(steps, keys.value, self.critic_network or self.actor_network)
+        value = one_a_step(keys.value, value, steps)
         log_prob = policy.log_prob(_fitting(steps[keys.action], policy))
         terms = ppo_objective(
             log_prob=one_a_step("log_prob of the policy", log_prob, steps),

@@ -19,7 +19,12 @@ from torchrl.objectives.value import ValueEstimatorBase
 from arcade_torch.agents.batch_checks import Key, is_stock, with_mask
 from arcade_torch.agents.checked import CountOrZero, coerce, require
 from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.agents.layout import (
+    NetworkInputs,
+    insert_final_observations,
+    is_prepared,
+    unroll,
+)
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.returns import QLambdaEstimator
 
@@ -177,13 +182,16 @@ class PQNLoss(LossModule):
             KeyError: an entry is missing.
             ValueError: a needed next observation or recurrent state is not in the batch.
         """
-        prepared = "position" in tensordict
+        prepared = is_prepared(tensordict)
         data = tensordict if prepared else self.prepare(tensordict)
         steps = data["reward"].shape[1] - (self.bootstrap == "last")
         if steps == 0:
             raise ValueError("bootstrap must be 'next' where sequences are of one step; got 'last'")
         with self._with_parameters():
             q = unroll(self.value_network, self.inputs, data, self.tensor_keys.action_value)
+        if q.ndim != 3:
+            name = f"{self.tensor_keys.action_value!r} of the network"
+            require(False, name, list(q.shape), "[B, T, A], one number an action")
         chosen = _chosen_values(q, data["position"][:, :steps], data["action"][:, :steps])
         target = self.targets(data, q.detach(), steps)
 
@@ -270,7 +278,24 @@ def _chosen_values(q: Tensor, position: Tensor, action: Tensor) -> Tensor:
     if action.ndim == 3 and action.shape[-1] == num_actions:
         action = action.int().argmax(-1)
     action = action.reshape(position.shape).long()
-    return q.flatten(1).gather(1, position * num_actions + action)
+    if action.device.type == "cpu" and not torch.compiler.is_compiling():
+        _check_range(action, num_actions)
+    # in two steps: an action that there is not would be one of the next observation
+    of_steps = q.gather(1, position.unsqueeze(-1).expand(-1, -1, num_actions))
+    return of_steps.gather(2, action.unsqueeze(-1)).squeeze(-1)
+
+
+def _check_range(action: Tensor, num_actions: int) -> None:
+    """Refuse actions that the network has no value for (ValueError)."""
+    try:
+        lowest, highest = (int(x) for x in action.aminmax())
+    except RuntimeError:  # inside of vmap they have no values to read
+        return
+    if lowest < 0 or highest >= num_actions:
+        raise ValueError(
+            f"actions must be from 0 to {num_actions - 1}, the outputs of the network; got {lowest}"
+            f" to {highest}"
+        )
 
 
 class PQN(Learner):

@@ -48,7 +48,8 @@ class ArcadeCollector(BaseCollector):
         total_frames: Iteration ends after so many frames; -1 for never. ``collect`` does not look
             at it.
         overlap: Steps of the previous window that stand in front of ``collect``'s sequences. Their
-            ``initial_state`` is the one that was theirs when they were acted.
+            ``initial_state`` is the one that was theirs when they were acted. What is written to a
+            batch in place does not come back in them, but for frames, which are not copied twice.
         compress: uint8 [N, S, S, 3] -> uint8 [N, ...], what is stored of a frame. The policy sees
             the compressed frame too, so that acting and learning see the same. For envs that
             observe one array.
@@ -205,8 +206,7 @@ class ArcadeCollector(BaseCollector):
             compact = self.compact_obs or self._final_frames != "all"
             buffer, _ = self._collect_window(random=False, dense=not compact)
             batch = buffer.transitions(compact)
-            traj_ids = self._trajectories(buffer)
-            batch["collector"] = TensorDict({"traj_ids": traj_ids}, batch_size=batch.batch_size)
+            batch["collector", "traj_ids"] = self._trajectories(buffer)
             if self.post_collect_hook is not None:
                 self.post_collect_hook(batch)
             self._numbered = self._iter  # a window that a hook refused was not
@@ -244,6 +244,7 @@ class ArcadeCollector(BaseCollector):
             for key, array in drawn.items():
                 final[key] = to_torch(array, self.env.device)[counting]
             buffer.write_final(rows, steps, self._compressed(final))
+        buffer.keep_overlap()
         initial_state = self._window_starts.popleft()
         self._frames += self._num_envs * self._steps
         self._iter += 1

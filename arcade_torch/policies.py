@@ -57,6 +57,8 @@ class PolicyRunner:
             self._ends = {key: no for key in ENDS if key in getattr(policy, "in_keys", ENDS)}
         # what is never stored as something that the policy wrote
         self._known = {path_of(key)[0] for key in root_keys} | {"action", *ENDS}
+        # what the env writes under "next", whatever a policy has written there
+        self._outcomes = {path_of(key) for key in (*root_keys, "reward", *ENDS)}
         # A module that reads is_init begins anew by itself. Stored states show what it begins with.
         self._sets_initial = store_states or "is_init" not in reads
         self._initial = TensorDict({}, batch_size=self._size, device=device)
@@ -81,7 +83,10 @@ class PolicyRunner:
                 state[key] = zeros + torch.as_tensor(value, dtype=spec.dtype, device=self._device)
         written = [unravel_key(key) for key in getattr(self._policy, "out_keys", [])]
         for key in getattr(self._policy, "in_keys", []):
-            if unravel_key(("next", key)) in written and key not in state.keys(True, True):
+            is_carried = (
+                unravel_key(("next", key)) in written and path_of(key) not in self._outcomes
+            )
+            if is_carried and key not in state.keys(True, True):
                 raise KeyError(
                     f"the policy reads {key!r} and writes it for the next step, but has no primer "
                     "that says how it "
@@ -125,6 +130,8 @@ class PolicyRunner:
         states = set(map(path_of, state.keys(True, True)))
         for key, value in td.items(True, True):
             path = path_of(key)
+            if path[0] == "next" and path[1:] in self._outcomes:
+                continue
             if path[0] == "next":
                 carried[path[1:]] = value
             is_state = path[0] == "next" or path in states

@@ -126,6 +126,9 @@ class RolloutBuffer:
         self._wanted = np.zeros((num_envs, self.length), np.bool_)
         self._first = 0
         self._fills_dense = False
+        # what the next window begins with, apart from bytes: a batch may be written to
+        self._kept: dict[NestedKey, torch.Tensor] = {}
+        self._kept_final: dict[NestedKey, torch.Tensor] = {}
         self._allocate()
 
     def _allocate(self) -> None:
@@ -167,7 +170,7 @@ class RolloutBuffer:
         carry = carry and self.overlap > 0
         self._first = self.overlap if carry else 0
         before = self._buffers()
-        final = self._final
+        final = self._final | self._kept_final
         wanted = self._wanted
         if not reuse:
             self._allocate()
@@ -179,6 +182,9 @@ class RolloutBuffer:
         if not carry:
             return self._first
         for key, target in self._buffers().items():
+            if key in self._kept:
+                target[:, : self.overlap] = self._kept[key]
+                continue
             # Step by step when source and target overlap; upwards, so that nothing is overwritten
             # before it is read.
             portion = self.overlap if self.overlap <= self.steps else 1
@@ -297,6 +303,21 @@ class RolloutBuffer:
         new[:, :first] = False
         return new
 
+    def keep_overlap(self) -> None:
+        """Copy what the next window begins with, before somebody gets the batch; not bytes, of
+        which there are too many.
+        """
+        self._kept.clear()
+        self._kept_final.clear()
+        if not self.overlap:
+            return
+        for key, buffer in self._buffers().items():
+            if buffer.dtype is not torch.uint8:
+                self._kept[key] = buffer[:, self.steps :].clone()
+        for key, places in self._final.items():
+            if places.dtype is not torch.uint8:
+                self._kept_final[key] = places.clone()
+
     def write_final(
         self, rows: np.ndarray, steps: np.ndarray, obs: Mapping[NestedKey, torch.Tensor]
     ) -> None:
@@ -351,9 +372,10 @@ class RolloutBuffer:
         out = self._entries(self.overlap, size)
         for key in ("done", "terminated", "truncated", ("next", "is_init")):
             out[key] = torch.zeros((*size, 1), dtype=torch.bool, device=self.device)
-        out["next", "last_action"] = out["action"]
+        # copies, for either may be written to
+        out["next", "last_action"] = out["action"].clone()
         if self._task is not None:
-            out["next", "task"] = out["task"]
+            out["next", "task"] = out["task"].clone()
         if not compact and self._dense is not None:
             for key, dense in self._dense.items():
                 out["next", *path_of(key)] = dense[:, self.overlap :]
@@ -380,7 +402,7 @@ class RolloutBuffer:
         for key, buffer in (self.observation | self._extras).items():
             entries[key] = buffer[:, first:]
         if self._task is not None:
-            entries["task"] = self._task[:, first:]
+            entries["task"] = self._task[:, first:].clone()
         for key, value in entries.items():
             out[key] = value
         return out
@@ -404,22 +426,19 @@ class RolloutBuffer:
 
     def _overlap_buffers(self) -> dict[str, torch.Tensor]:
         """The steps of all buffers that the next window begins with, by path; views."""
-        buffers = {}
-        for key, buffer in self._buffers().items():
-            buffers["/".join(path_of(key))] = buffer[:, self.steps :]
-        return buffers
-
-    def _final_buffers(self) -> dict[str, torch.Tensor]:
-        """The places for final observations, by path."""
-        return {"/".join(("final", *path_of(key))): value for key, value in self._final.items()}
+        buffers = _by_path(self._buffers())
+        return {name: buffer[:, self.steps :] for name, buffer in buffers.items()}
 
     def overlap_state(self) -> dict[str, Any]:
         """What the next window needs of this one, as plain tensors: nothing without an overlap."""
         if not self.overlap:
             return {}
+        steps = self._overlap_buffers()
+        steps.update(_by_path(self._kept))
+        final = _by_path(self._final | self._kept_final, "final")
         return {
-            "buffers": {name: steps.clone() for name, steps in self._overlap_buffers().items()},
-            "final": {name: places.clone() for name, places in self._final_buffers().items()},
+            "buffers": {name: value.clone() for name, value in steps.items()},
+            "final": {name: value.clone() for name, value in final.items()},
             "wanted": torch.from_numpy(self._wanted).clone(),
         }
 
@@ -437,7 +456,7 @@ class RolloutBuffer:
                 self._add_extra(key, buffer.shape[2:], buffer.dtype)
         if self.final_frames == "all":
             self._dense = _taken(self._new_dense)
-        ours = self._overlap_buffers() | self._final_buffers()
+        ours = self._overlap_buffers() | _by_path(self._final, "final")
         saved = state["buffers"] | state["final"]
         for name in ours | saved:
             our_shape = tuple(ours[name].shape) if name in ours else None
@@ -453,6 +472,12 @@ class RolloutBuffer:
                 f"saved overlap 'wanted' is {wanted.shape}, this collector's {self._wanted.shape}"
             )
         self._wanted = wanted
+        self.keep_overlap()
+
+
+def _by_path(buffers: Mapping[NestedKey, torch.Tensor], *above: str) -> dict[str, torch.Tensor]:
+    """Buffers by their path as one word."""
+    return {"/".join((*above, *path_of(key))): buffer for key, buffer in buffers.items()}
 
 
 def _write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:

@@ -1,14 +1,17 @@
 """What the laws of a memory model are put to, a copy of the module; the error of a broken law."""
 
 import copy
+import operator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-__all__ = ["MemoryLawError", "Subject", "leaves", "pairs_of", "subject_of"]
+__all__ = ["MemoryLawError", "Subject", "held_by", "leaves", "pairs_of", "subject_of"]
 
 # Largest difference allowed between two ways to compute the same thing; see ``_difference``.
 TOLERANCES = {
@@ -65,7 +68,7 @@ class Subject:
 
     def copied(self) -> "Subject":
         """The same, with a copy of the module, for calls that may leave something in it."""
-        return replace(self, module=copy.deepcopy(self.module))
+        return replace(self, module=_copy_of(self.module))
 
     def initial(self, batch: int) -> TensorDict:
         """The state at the start of an episode, TensorDict [batch]."""
@@ -90,11 +93,13 @@ def subject_of(
     module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
 ) -> Subject:
     """The copy of a module that is checked."""
-    size = getattr(module, "input_size", None) if input_size is None else input_size
-    if not isinstance(size, int):
+    given: Any = getattr(module, "input_size", None) if input_size is None else input_size
+    try:
+        size = operator.index(given)  # also of numpy
+    except TypeError as error:
         raise ValueError(
             "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
-        )
+        ) from error
     if not hasattr(module, "initial_state"):
         raise TypeError(
             f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
@@ -107,10 +112,39 @@ def subject_of(
         dtype = torch.float32  # there is nothing to convert, so its states are what they are
     if tolerance is None:
         tolerance = TOLERANCES[dtype]
-    checked = copy.deepcopy(module).eval()
     # not ``.to(dtype)``, which takes the imaginary part away from complex weights
-    checked._apply(partial(_in_precision, dtype=dtype))
+    convert = partial(_in_precision, dtype=dtype)
+    checked = _copy_of(module, convert).eval()
+    checked._apply(convert)
     return Subject(checked, size, dtype, tolerance)
+
+
+def _copy_of(module: nn.Module, convert: Callable[[Tensor], Tensor] = torch.detach) -> nn.Module:
+    """A copy of a module that has been at work: what it keeps of a call, its attention for a
+    picture or the weight of ``weight_norm``, is converted without the graph, which nobody can copy.
+    """
+    memo = dict[int, Any]()
+    for part in module.modules():
+        for value in vars(part).values():
+            for thing in held_by(value):
+                if isinstance(thing, Tensor) and not thing.is_leaf:
+                    memo[id(thing)] = convert(thing.detach().clone())
+    return copy.deepcopy(module, memo)
+
+
+def held_by(value: Any) -> Iterator[Any]:
+    """What an attribute of a module is, or holds in plain lists, tuples, sets and dictionaries,
+    those inside of each other too.
+    """
+    waiting = [value]
+    opened = set[int]()
+    while waiting:
+        thing = waiting.pop()
+        if not isinstance(thing, dict | list | tuple | set):
+            yield thing
+        elif id(thing) not in opened:
+            opened.add(id(thing))
+            waiting += thing.values() if isinstance(thing, dict) else thing
 
 
 def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:

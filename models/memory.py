@@ -236,7 +236,7 @@ def _check_start_flags(is_init: Any, x: Tensor) -> None:
 
 def batch_shape(batch_size: int | Sequence[int]) -> list[int]:
     """A batch size, one number or several, as a list."""
-    return [batch_size] if isinstance(batch_size, int) else list(batch_size)
+    return list(batch_size) if isinstance(batch_size, Sequence) else [batch_size]
 
 
 def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDict:

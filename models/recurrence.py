@@ -96,7 +96,7 @@ class Recurrence:
         return self.default_recurrent_mode if mode is None else bool(mode)
 
     def start_flags(self, tensordict: TensorDictBase) -> Tensor:
-        """The start flags of a tensordict, bool [*batch].
+        """The start flags of a tensordict, bool [*batch], whatever their type.
 
         Raises:
             ValueError: they are not [*batch, 1].
@@ -112,7 +112,7 @@ class Recurrence:
             raise ValueError(
                 f"{self.is_init_key!r} must be bool {[*shape, 1]}, got {list(is_init.shape)}"
             )
-        return is_init.squeeze(-1)  # type: ignore[no-any-return]
+        return is_init.squeeze(-1).bool()  # type: ignore[no-any-return]
 
     def read(self, memory: nn.Module, tensordict: TensorDictBase, x: Tensor) -> Tensor:
         """Let a memory read steps, or in recurrent mode sequences.

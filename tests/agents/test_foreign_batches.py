@@ -266,6 +266,15 @@ def test_a_critic_of_several_numbers_a_step_gets_one_line():
         loss(batch)
 
 
+@LOSSES
+@pytest.mark.parametrize("name", ["position", "initial_state", "extended"])
+def test_an_observation_may_be_called_as_an_entry_of_ours(make, name):
+    """Before: ``position``, which MuJoCo has, made a batch one that had been prepared."""
+    other = ppo_batch().set(name, torch.ones(4, 4, 2))
+    other["next", name] = torch.ones(4, 4, 2)
+    assert torch.equal(value(make(), other), value(make(), ppo_batch()))
+
+
 # -- padding -----------------------------------------------------------------------------------------
 
 

@@ -753,3 +753,23 @@ def test_a_state_of_other_sizes_is_refused() -> None:
         ValueError, match=re.escape("(envs, steps, overlap) [6, 8, 0], this one has [6, 8, 2]")
     ):
         stub_collector(scripted, overlap=2).load_state_dict(state)
+
+
+def test_what_a_policy_writes_in_the_place_of_the_envs_outcomes_is_overwritten() -> None:
+    """Before: the reward of a batch was what a policy had written under "next"."""
+
+    def writes(pixels: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        nines = torch.full((len(pixels), 1), 9)
+        return pixels + 1, nines.float(), nines > 0, nines, nines
+
+    names = ("pixels", "reward", "terminated", "step_count")
+    keys = [*(("next", name) for name in names), ("collector", "guess")]
+    policy = TensorDictSequential(
+        TensorDictModule(writes, ["pixels"], keys),
+        TensorDictModule(lambda frames: frames[:, 0, 0, 0].long() % 5, ["pixels"], ["action"]),
+    )
+    batch = next(stub_collector(policy).iterator())
+    expected = next(stub_collector(policy[1]).iterator())
+    assert set(batch.keys(True, True)) - set(expected.keys(True, True)) == {("collector", "guess")}
+    for key in expected.keys(True, True):
+        assert torch.equal(batch[key], expected[key]), key

@@ -259,3 +259,42 @@ def test_what_is_not_one_hot_is_refused(wrong: list[int]) -> None:
             ValueError, match=r"action of env 1 is .*, expected one-hot: a single 1 among zeros"
         ):
             step(root.clone().set("action", right))
+
+
+# -- batches that are written to in place ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["all", "truncated"])
+def test_what_is_written_to_a_batch_does_not_come_back_in_the_overlap(
+    mode: Any, tmp_path: Any
+) -> None:
+    """Before: rewards that were scaled in place were scaled twice where windows overlap."""
+    plain = collector(overlap=3, final_frames=mode)
+    scaled = collector(overlap=3, final_frames=mode)
+    scaled._generator.set_state(plain._generator.get_state())
+    for _ in range(3):
+        expected = plain.collect()
+        batch = scaled.collect()
+        for key in expected.keys(True, True):
+            assert torch.equal(batch[key], expected[key]), key
+        for value in batch.values(True, True):
+            if value.dtype is not torch.uint8:
+                value.zero_()
+    saved = scaled.state_dict()
+    resumed = collector(overlap=3, final_frames=mode)
+    resumed.load_state_dict(saved)
+    assert torch.equal(resumed.collect()["next", "reward"], plain.collect()["next", "reward"])
+
+
+def test_no_two_entries_of_a_batch_and_no_two_batches_share_memory() -> None:
+    """Before: ``batch["action"] += 1`` moved the last action that follows, and ``batch["task"] +=
+    1`` those of all batches.
+    """
+    one = ArcadeCollector(ArcadeEnv(GAME, N, task_in_td=True), None, N * STEPS)
+    windows = one.iterator()
+    batches = [next(windows), next(windows)]
+    entries = [value for batch in batches for value in batch.values(True, True)]
+    places = [value.untyped_storage().data_ptr() for value in entries]
+    for key in ("task", ("next", "task"), ("next", "last_action")):
+        for batch in batches:
+            assert places.count(batch[key].untyped_storage().data_ptr()) == 1, key

@@ -364,3 +364,16 @@ def test_features_of_more_than_one_vector_a_step_are_refused(sequences):
     message = r"x is \[2, .*5, 3\] in a batch of shape .*, expected one vector a step"
     with set_recurrent_mode(sequences), pytest.raises(ValueError, match=message):
         module(agents)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.float32])
+def test_start_flags_may_be_of_any_type(dtype):
+    """Before: floats ended in a TypeError of torch, integers were refused as [B, T] that wanted a
+    squeeze.
+    """
+    module = MemoryModule(make_memory("mingru", 3, 4), in_key="x", out_key="y")
+    flags = torch.tensor([[[1], [0], [1], [0]]], dtype=dtype)
+    steps = TensorDict({"x": torch.randn(1, 4, 3), "is_init": flags}, [1, 4])
+    with set_recurrent_mode(True):
+        given = module(steps.clone())["y"]
+        assert torch.equal(given, module(steps.set("is_init", flags.bool()))["y"])

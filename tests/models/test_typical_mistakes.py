@@ -5,13 +5,20 @@ Those of `test_passed_before` went through it without a word.
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from arcade_torch.models import MemoryLawError, MemoryModule, check_memory, make_network
+from arcade_torch.models import (
+    MemoryLawError,
+    MemoryModule,
+    check_memory,
+    make_memory,
+    make_network,
+)
 from arcade_torch.models.checks import law_results
 
 WIDTH = 4
@@ -204,6 +211,36 @@ class LazyLayer(Cell):
         return self.late(y)
 
 
+class ListOfTuples(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = [(nn.Linear(WIDTH, WIDTH), nn.Identity())]
+
+    def written(self, y: Tensor) -> Tensor:
+        return self.layers[0][0].to(y.dtype)(y)
+
+
+class AloneIsAnother(Cell):
+    """A batch of one begins anew at every call, as a squeeze() makes it."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        return super().forward(x, state.apply(torch.zeros_like) if len(x) == 1 else state, is_init)
+
+
+class MeanOfBefore(Cell):
+    """A running mean that a call takes as it was, and moves in training mode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(3))
+
+    def read(self, x: Tensor) -> Tensor:
+        mean = self.mean.clone()
+        if self.training:
+            self.mean.lerp_(x.detach().mean((0, 1)), 0.1)
+        return super().read(x - mean)
+
+
 def refusal(model: type[Cell]) -> MemoryLawError:
     """What check_memory says of a model."""
     torch.manual_seed(0)
@@ -225,6 +262,9 @@ def test_the_model_without_a_mistake_passes() -> None:
         (ComplexState, "shapes are fixed", "hold torch.view_as_real(h)"),
         (MadeInForward, "weights are registered", "new weights: out.bias, out.weight"),
         (TrainableTensor, "weights are registered", "scale of TrainableTensor"),
+        (ListOfTuples, "weights are registered", "layers of ListOfTuples, a list"),
+        (MeanOfBefore, "equal calls give equal results", "differs in training mode"),
+        (AloneIsAnother, "batch rows are independent", "one row of a batch of four"),
     ],
 )
 def test_passed_before(model: type[Cell], law: str, said: str) -> None:
@@ -312,6 +352,42 @@ class NoWeights(nn.Module):
 def test_a_memory_without_weights_is_checked_in_the_dtype_of_its_state() -> None:
     assert max(check_memory(NoWeights()).values()) < 1e-5
     assert all(result.passed for result in law_results(NoWeights()))
+
+
+class KeepsItsOutput(Cell):
+    """Right: the last output is kept, for a picture."""
+
+    def written(self, y: Tensor) -> Tensor:
+        self.seen = {"last": [y]}
+        return y
+
+
+class WeightNorm(Cell):
+    """Right: a weight that is computed before each call, and no leaf of the graph."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        nn.utils.weight_norm(self.linear)
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm.*:FutureWarning")
+@pytest.mark.parametrize("model", [KeepsItsOutput, WeightNorm])
+def test_a_memory_that_has_learned_already_can_be_checked(model: type[Cell]) -> None:
+    """Before: nobody could copy what hangs on a graph."""
+    memory = model()
+    x = torch.ones(2, 3, 3)
+    y, _ = memory(x, memory.initial_state(2), torch.zeros(2, 3, dtype=torch.bool))
+    y.sum().backward()
+    assert max(check_memory(memory).values()) < 1e-7
+    assert all(result.passed for result in law_results(memory))
+
+
+def test_sizes_of_numpy_are_sizes() -> None:
+    memory = Cell()
+    memory.input_size = np.prod((1, 3))
+    assert max(check_memory(memory, gradients=False).values()) < 1e-12
+    state = make_memory("mingru", np.int64(3), np.int64(4)).initial_state(np.int64(2))
+    assert state["h"].shape == (2, 4)
 
 
 @pytest.mark.parametrize("model", [ComplexWeight, Ordered])

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
@@ -27,7 +27,7 @@ class EpisodeBatch:
         size: N, or ``most``.
 
     Raises:
-        ValueError: it has more than one batch dimension.
+        ValueError: it has more than one batch dimension or reward, or reads no such action.
     """
 
     def __init__(self, env: Any, keys: Keys, most: int | None = None) -> None:
@@ -38,6 +38,10 @@ class EpisodeBatch:
         self.is_batch = bool(shape)
         self._envs = int(shape[0]) if shape else 1
         self.size = min(self._envs, most or self._envs)
+        rewards = _keys_of(env, "reward")
+        require(len(rewards) == 1, "the rewards of env", rewards, "one: name it reward")
+        self._reward = ("next", *_path(rewards[0]))
+        self._ends = [("next", *_path(key)) for key in _keys_of(env, "done")]
         spec = _action_spec(env, keys.action)
         self._one_hot = spec if _is_one_hot(spec) else None
         self._count = getattr(spec, "n", None)  # of actions
@@ -77,9 +81,10 @@ class EpisodeBatch:
             given = given.reshape(self._action_shape)
         self._root.set(self.keys.action, given)
         step, self._root = self.env.step_and_maybe_reset(self._root)
-        reward = self._batch(step.get(("next", "reward")))[: self.size]
-        done = self._batch(step.get(("next", "done")))[: self.size].reshape(-1, 1)
-        return self._observe(encoded, done), reward.reshape(-1, 1), done.reshape(-1)
+        reward = self._one_a_row(step, self._reward)
+        ends = [self._one_a_row(step, key) for key in self._ends]
+        done = torch.cat(ends, -1).any(-1, keepdim=True)
+        return self._observe(encoded, done), reward, done.reshape(-1)
 
     def _observe(self, last_action: Tensor, is_init: Tensor) -> TensorDictBase:
         """What the env gives, with defaults for what it lacks, under the names of the measures."""
@@ -105,8 +110,17 @@ class EpisodeBatch:
             return action
         return one_hot(action, self._one_hot.shape[-1]).to(self._one_hot.dtype)
 
-    def _batch(self, value: Tensor) -> Tensor:
-        return value if self.is_batch else value.unsqueeze(0)
+    def _one_a_row(self, step: TensorDictBase, key: tuple[str, ...]) -> Tensor:
+        """An entry of a step, one number or flag for each env, as [N, 1]."""
+        value = step[key]
+        require(
+            value.numel() == self._envs,
+            f"the entry {key!r} of env",
+            list(value.shape),
+            f"one number a step, {[*self.env.batch_size, 1]}",
+        )
+        rows: Tensor = value.reshape(self._envs, 1)
+        return rows[: self.size]
 
 
 def one_hot(action: Tensor, count: int) -> Tensor:
@@ -114,10 +128,26 @@ def one_hot(action: Tensor, count: int) -> Tensor:
     return torch.nn.functional.one_hot(action, count)
 
 
+def _keys_of(env: Any, name: str) -> list[Key]:
+    """Where an env has its reward, or says that an episode is done: under the usual name, else
+    under all that its specs say.
+    """
+    keys: list[Key] = [unravel_key(key) for key in getattr(env, f"{name}_keys", [])]
+    return [name] if name in keys or not keys else keys
+
+
+def _path(key: Key) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
+
+
 def _action_spec(env: Any, key: Key) -> Any:
     """The spec of an env's action; None for an env without specs."""
     specs = getattr(env, "full_action_spec", None)
-    return None if specs is None else specs.get(key, None)
+    if specs is None:
+        return None
+    keys = list(specs.keys(True, True))
+    require(key in keys, "the action of env", keys, f"under {key!r}, or be named with action_key")
+    return specs[key]
 
 
 def _is_one_hot(spec: Any) -> bool:

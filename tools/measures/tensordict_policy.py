@@ -23,6 +23,7 @@ from torchrl.modules import (
     set_recurrent_mode,
 )
 
+from arcade_torch.agents.checked import require
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Names, action_index
@@ -147,7 +148,16 @@ class TensorDictPolicy:
         state = start if state is None else start.clone(recurse=False).update(state)
         for module in self._rest:
             state = self._run(module, steps, is_init, state, start)
-        return torch.cat([steps[key] for key in self.output.keys], -1), state
+        outputs = [steps[key] for key in self.output.keys]
+        for key, output in zip(self.output.keys, outputs, strict=True):
+            require(
+                output.ndim == steps.ndim + 1,
+                f"the policy's output {key!r}",
+                list(output.shape[steps.ndim :]),
+                "one number an action, [*, A]: a distribution of values needs its mean beside it, "
+                "named with output_key",
+            )
+        return torch.cat(outputs, -1), state
 
     def _set_flags(self, steps: TensorDictBase, is_init: Tensor) -> None:
         """Write start flags [*batch, 1] where the policy reads them, and where TorchRL's modules

@@ -289,6 +289,32 @@ class ByType(nn.Module):
         return scaled.flatten(1).mean(1, keepdim=True) * torch.arange(1.0, 1 + ACTIONS)
 
 
+def test_rewards_and_ends_have_the_names_that_the_env_says() -> None:
+    """Before: ``'NoneType' object is not subscriptable``."""
+    names = {"reward": "gain", "done": "over", "terminated": "lost"}
+    renamed = TransformedEnv(Foreign(), RenameTransform(list(names), list(names.values())))
+    window = greedy_window(policy_of(), renamed, seed=3, **NAMES)
+    expected = greedy_window(policy_of(), Foreign(), seed=3, **NAMES)
+    assert torch.equal(window.reward, expected.reward) and len(window.reward) == LENGTH
+    assert torch.equal(window.frames, expected.frames)
+
+
+def test_what_an_env_has_several_of_is_refused_in_one_line() -> None:
+    """Before: tracebacks out of TensorDicts."""
+    two = Foreign()
+    two.reward_spec = Unbounded(shape=(2,))
+    two._step = lambda td: Foreign._step(two, td).set("reward", torch.ones(2))  # type: ignore
+    with pytest.raises(ValueError, match=r"^the entry \('next', 'reward'\) of env must be one num"):
+        greedy_window(policy_of(), two, **NAMES)
+    both = Foreign()
+    both.reward_spec = Composite(mine=Unbounded(shape=(1,)), yours=Unbounded(shape=(1,)))
+    with pytest.raises(ValueError, match=r"^the rewards of env must be one.*'mine', 'yours'"):
+        greedy_window(policy_of(), both, **NAMES)
+    names = NAMES | {"action_key": "action"}
+    with pytest.raises(ValueError, match=r"^the action of env must be under 'action', .*'move'"):
+        greedy_window(policy_of(), Foreign(), **names)
+
+
 def test_what_would_be_measured_wrong_is_refused_in_one_line() -> None:
     bytes_alone = TensorDictModule(ByType(), [("view", "image")], ["action_value"])
     for measure in (recall_density, contamination):

@@ -507,6 +507,15 @@ def test_what_cannot_be_wrapped_is_refused_in_one_line(name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_distribution_of_values_is_refused_in_one_line() -> None:
+    """Before: saliency ended in a mismatch of shapes inside of autograd."""
+    atoms = nn.Sequential(nn.Flatten(), nn.Linear(12, 6), nn.Unflatten(-1, (3, 2)))
+    policy = as_policy(TensorDictModule(atoms, ["pixels"], ["action_value"]))
+    message = r"^the policy's output 'action_value' must be one number an action, .*got \[3, 2\]$"
+    with pytest.raises(ValueError, match=message):
+        policy.forward_frames(torch.zeros(1, 4, 2, 2, 3))
+
+
 def test_evaluation_mode_is_on_while_it_runs_and_every_mode_comes_back() -> None:
     network = module("GRUModule")
     network.train()

@@ -1,0 +1,56 @@
+"""The law that all weights of a memory model are registered: trained, saved and moved with it."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
+
+from arcade_torch.models.law_subject import MemoryLawError, Subject, held_by
+
+__all__ = ["weights_are_registered"]
+
+
+@torch.no_grad()
+def weights_are_registered(s: Subject, law: str) -> float:
+    """Refuse weights that ``parameters()`` does not list, or that come with the first call."""
+    for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
+        if is_lazy(weight):
+            symptom = f"{name} has no shape before the first call"
+            raise MemoryLawError(law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
+    registered = {id(weight) for weight in s.module.parameters()}
+    for part in s.module.modules():
+        for name, value in vars(part).items():
+            if all(id(weight) in registered for weight in _weights_in(value)):
+                continue
+            raise MemoryLawError(
+                law,
+                f"parameters() does not list what is in {name} of {type(part).__name__}, a "
+                f"{type(value).__name__}",
+                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
+                "nn.ParameterList or nn.Parameter",
+            )
+    module = s.copied().module
+    before = set(module.state_dict())
+    x = s.random(2, 3)
+    module(x, s.initial(2), torch.zeros_like(x[..., 0], dtype=torch.bool))
+    if new := set(module.state_dict()) - before:
+        raise MemoryLawError(
+            law,
+            f"the first call makes new weights: {', '.join(sorted(new))}",
+            "a layer made in forward, which the optimiser does not know: make it in __init__",
+        )
+    return 0.0
+
+
+def _weights_in(value: Any) -> list[Tensor]:
+    """The weights that an attribute of a module is, or holds in plain lists and dictionaries."""
+    if isinstance(value, Tensor):
+        return [value] if value.requires_grad and value.is_leaf else []
+    weights = list[Tensor]()
+    for thing in held_by(value):
+        if isinstance(thing, nn.Module) and thing is not value:
+            weights += thing.parameters()
+        elif isinstance(thing, nn.Parameter):
+            weights.append(thing)
+    return weights
