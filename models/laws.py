@@ -1,14 +1,13 @@
 """The laws of a memory model, each a function of a copy of the module that is put to the test."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.nn.parameter import is_lazy
 
 from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
+from arcade_torch.models.law_weights import weights_are_registered
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
 
 __all__ = ["Law", "laws_of"]
@@ -151,52 +150,6 @@ def _calls_repeat(s: Subject, law: str) -> float:
             *pairs_of(after, after_trained),
         ),
     )
-
-
-@torch.no_grad()
-def _weights_are_registered(s: Subject, law: str) -> float:
-    for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
-        if is_lazy(weight):
-            symptom = f"{name} has no shape before the first call"
-            raise MemoryLawError(law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
-    registered = {id(weight) for weight in s.module.parameters()}
-    for part in s.module.modules():
-        for name, value in vars(part).items():
-            if all(id(weight) in registered for weight in _weights_in(value)):
-                continue
-            raise MemoryLawError(
-                law,
-                f"parameters() does not list what is in {name} of {type(part).__name__}, a "
-                f"{type(value).__name__}",
-                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
-                "nn.ParameterList or nn.Parameter",
-            )
-    module = s.copied().module
-    before = set(module.state_dict())
-    x = s.random(2, 3)
-    module(x, s.initial(2), torch.zeros_like(x[..., 0], dtype=torch.bool))
-    if new := set(module.state_dict()) - before:
-        raise MemoryLawError(
-            law,
-            f"the first call makes new weights: {', '.join(sorted(new))}",
-            "a layer made in forward, which the optimiser does not know: make it in __init__",
-        )
-    return 0.0
-
-
-def _weights_in(value: Any) -> list[Tensor]:
-    """The weights that an attribute of a module is, or holds in a plain list or dictionary."""
-    if isinstance(value, Tensor):
-        return [value] if value.requires_grad and value.is_leaf else []
-    if isinstance(value, dict):
-        value = list(value.values())
-    weights = list[Tensor]()
-    for entry in value if isinstance(value, list | tuple) else ():
-        if isinstance(entry, nn.Module):
-            weights += entry.parameters()
-        elif isinstance(entry, nn.Parameter):
-            weights.append(entry)
-    return weights
 
 
 def _steps(s: Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
@@ -427,7 +380,7 @@ def _gradients_of_steps(s: Subject, law: str) -> float:
 def laws_of(module: nn.Module, dtype: torch.dtype, gradients: bool) -> dict[str, Law]:
     """The laws that a module has to keep, by name."""
     laws: dict[str, Law] = {
-        "weights are registered": _weights_are_registered,
+        "weights are registered": weights_are_registered,
         "shapes are fixed": _shapes,
         "equal calls give equal results": _calls_repeat,
         "scan equals step by step": _scan_equals_steps,

@@ -1,0 +1,91 @@
+"""The law of the weights of a memory model: registered, made early, and taken by name."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
+
+from arcade_torch.models.law_subject import MemoryLawError, Subject
+
+
+@torch.no_grad()
+def weights_are_registered(s: Subject, law: str) -> float:
+    """All weights are parameters, there before the first call, and taken by name.
+
+    Args:
+        s: what is checked.
+        law: its name, for the error.
+
+    Returns:
+        0: it is no law of numbers.
+
+    Raises:
+        MemoryLawError: one of the three is not so.
+    """
+    for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
+        if is_lazy(weight):
+            symptom = f"{name} has no shape before the first call"
+            raise MemoryLawError(law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
+    registered = {id(weight) for weight in s.module.parameters()}
+    for part in s.module.modules():
+        for name, value in vars(part).items():
+            if all(id(weight) in registered for weight in _weights_in(value)):
+                continue
+            raise MemoryLawError(
+                law,
+                f"parameters() does not list what is in {name} of {type(part).__name__}, a "
+                f"{type(value).__name__}",
+                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
+                "nn.ParameterList or nn.Parameter",
+            )
+    module = s.copied().module
+    before = set(module.state_dict())
+    x = s.random(2, 3)
+    module(x, s.initial(2), torch.zeros_like(x[..., 0], dtype=torch.bool))
+    if new := set(module.state_dict()) - before:
+        raise MemoryLawError(
+            law,
+            f"the first call makes new weights: {', '.join(sorted(new))}",
+            "a layer made in forward, which the optimiser does not know: make it in __init__",
+        )
+    _check_taken_by_name(s, law, x)
+    return 0.0
+
+
+def _weights_in(value: Any) -> list[Tensor]:
+    """The weights that an attribute of a module is, or holds in a plain list or dictionary."""
+    if isinstance(value, Tensor):
+        return [value] if value.requires_grad and value.is_leaf else []
+    if isinstance(value, dict):
+        value = list(value.values())
+    weights = list[Tensor]()
+    for entry in value if isinstance(value, list | tuple) else ():
+        if isinstance(entry, nn.Module):
+            weights += entry.parameters()
+        elif isinstance(entry, nn.Parameter):
+            weights.append(entry)
+    return weights
+
+
+def _check_taken_by_name(s: Subject, law: str, x: Tensor) -> None:
+    """Call it with ``parameters()`` empty and the numbers there by their names, as a loss with
+    target networks does.
+    """
+    bare = s.copied().module
+    for part in bare.modules():
+        for name, weight in list(part.named_parameters(recurse=False)):
+            delattr(part, name)
+            part.register_buffer(name, weight.detach())
+    begin = s.initial(len(x))
+    try:
+        bare(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
+        bare.initial_state(len(x))  # type: ignore[operator]
+    except Exception as error:
+        raise MemoryLawError(
+            law,
+            "it fails where a loss with target networks keeps the parameters elsewhere, "
+            f"{type(error).__name__} {error}".rstrip(),
+            "self.parameters() in forward or initial_state: take weights by name, such as "
+            "self.cell.weight",
+        ) from error
