@@ -13,7 +13,8 @@ import jax
 from arcade_torch.envs_jax.settings import as_numpy
 
 _ADDRESS = re.compile("0x[0-9a-f]+")  # of a Python object; another one at every tracing
-_LIBRARIES = {"arcade_torch", "contextlib", "functools", "jax", "jaxlib", "numpy"}
+_OURS = __name__.partition(".")[0]
+_LIBRARIES = {_OURS, "contextlib", "functools", "jax", "jaxlib", "numpy"}
 # The first that fits says what to write; of two related errors the narrower one stands first.
 _HINTS: list[tuple[type[Exception], str]] = [
     (jax.errors.TracerBoolConversionError, "use jnp.where instead of if"),
