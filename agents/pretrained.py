@@ -2,7 +2,6 @@
 the Hugging Face hub.
 """
 
-import difflib
 import os
 from os import PathLike
 from pathlib import Path
@@ -20,7 +19,7 @@ from arcade_torch.agents.runs.bundle import (
 )
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.agents.runs.shipped import agent_folder, pretrained_names
+from arcade_torch.agents.runs.shipped import agent_folder, agents_hint
 from arcade_torch.models.presets import FEED_FORWARD
 from arcade_torch.models.registry import ALIASES, memory_names
 
@@ -73,7 +72,7 @@ def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
     :func:`from_pretrained`.
     """
     if not folder.is_dir():
-        raise CheckpointError(f"{folder} is not a folder; {_near(folder)}")
+        raise CheckpointError(f"{folder} is not a folder; {agents_hint(folder)}")
     if sha256 is not None and not is_bundle(folder):
         raise CheckpointError(
             f"{folder} has no model.safetensors: sha256 is for an agent that was shared"
@@ -88,14 +87,3 @@ def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
             "taken from an agent: pass --import FILE.py with it, or register_memory before"
         )
     return checkpoint
-
-
-def _near(folder: Path) -> str:
-    """Which names there are."""
-    names = pretrained_names()
-    near = difflib.get_close_matches(folder.name, names, n=1)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return (
-        f"{hint}give a run folder, one of its checkpoints, an agent that was shared, or one of "
-        f"this package: {', '.join(names)}"
-    )

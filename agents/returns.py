@@ -29,11 +29,11 @@ def q_lambda_return(
     r"""Backward Q(lambda) return over a window.
 
     With ``m[t]`` the best value of the observation that step ``t`` really led to, ``done =
-    terminated | truncated``::
+    terminated | truncated``, and the end that of the window::
 
-        G[t] = r[t] + gamma * m[t]                                          at a truncation and at
-        the last step G[t] = r[t]                                                         at a
-        termination G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])           elsewhere
+        G[t] = r[t]                                                    at a termination
+        G[t] = r[t] + gamma * m[t]                                     at a truncation, at the end
+        G[t] = r[t] + gamma * ((1 - lam) * m[t] + lam * G[t + 1])      elsewhere
 
     Traces are not cut at exploratory actions (Peng's Q(lambda)). The recurrence is solved by
     doubling, in ``ceil(log2(T))`` batched steps, so that no device waits for a Python loop over

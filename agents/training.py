@@ -166,8 +166,9 @@ class _Run:
         where = error.filename or self.folder.path
         newest = list_checkpoints(self.folder.checkpoints)[:1]
         safe = f"{newest[0].name} is whole" if newest else "there is no checkpoint yet"
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        cure = "make room" if full else "put that right"
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        too_large = error.errno == errno.EFBIG
+        cure = "make room" if full else "raise ulimit -f" if too_large else "put that right"
         return (
             f"could not write {where}: {error.strerror or error}; {safe}: {cure}, then go on with "
             "--resume"

@@ -2,6 +2,7 @@
 anything; on request also what random play shows.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from arcade_torch.envs_jax.game import NUM_ACTIONS, Game, keeps_ends
+from arcade_torch.envs_jax.game import MEMORY_KINDS, NUM_ACTIONS, ORACLES, Game, keeps_ends
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.tracing import check_array, check_same, leaves, traced
 
@@ -36,7 +37,8 @@ def check_game(game: Game[Any], play: bool = False) -> None:
             gives something of a wrong shape or type; ``step`` changes the structure of the state;
             or an attribute is missing or of no use. With ``play`` also: a code has no picture, a
             reward or a state entry is not a number, an episode ends too late or is truncated too
-            early, or a return is out of range. One line: the game, what arrived, what is wanted.
+            early, a return is out of range, or the twins never differ. One line: the game, what
+            arrived, what is wanted.
 
     Example:
         >>> from arcade_torch.envs_jax import make
@@ -46,6 +48,8 @@ def check_game(game: Game[Any], play: bool = False) -> None:
     name = game.id
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     first = traced(name, "reset", game.reset, key)
+    if first is None:
+        raise ValueError(f"{name}: reset gives None, wanted a state: a tree of arrays")
     stepped = traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
     if not isinstance(stepped, tuple) or len(stepped) != 4:
         got = (
@@ -54,7 +58,7 @@ def check_game(game: Game[Any], play: bool = False) -> None:
             else f"a {type(stepped).__name__}"
         )
         raise ValueError(
-            f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated"
+            f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated (a tuple)"
         )
     check_same(name, "state", first, stepped[0])
     check_array(name, "step gives reward as", stepped[1], (), "float32")
@@ -94,16 +98,26 @@ def _check_play(game: Game[Any]) -> None:
     step = compiled(game.step)
     steps = 0
     episodes = 0
+    differ = False
     while steps < _STEPS_TO_PLAY:
-        steps += _check_episode(game, reset, step, seed=episodes)
+        length, differs = _check_episode(game, reset, step, seed=episodes)
+        steps += length
+        differ |= differs
         episodes += 1
+    if not differ:
+        raise ValueError(
+            f"{game.id}: render gives both twins the same frames in {steps} steps at random: where "
+            "partial is true it has to hide something that the MDP shows"
+        )
 
 
-def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> int:
-    """Play one episode at random, to the end and beyond; returns its length."""
+def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> tuple[int, bool]:
+    """Play one episode at random, to the end and beyond; returns its length, and whether the frames
+    of the twins differ anywhere.
+    """
     actions = np.random.default_rng(seed)
     state = reset(_key(seed, 0))
-    _check_frames(game, state, 0)
+    differs = _check_frames(game, state, 0)
     episode_return = 0.0
     length = 0
     done = False
@@ -112,7 +126,7 @@ def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> int:
         action = actions.integers(NUM_ACTIONS, dtype=np.int32)
         state, reward, terminated, truncated = step(_key(seed, length), state, action)
         _check_numbers(game, state, reward, length)
-        _check_frames(game, state, length)
+        differs |= _check_frames(game, state, length)
         episode_return += float(reward)
         done = bool(terminated) or bool(truncated)
         if not done and length >= game.max_steps:
@@ -135,7 +149,7 @@ def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> int:
             action = actions.integers(NUM_ACTIONS, dtype=np.int32)
             state = step(_key(seed, beyond), state, action)[0]
             _check_frames(game, state, beyond)
-    return length
+    return length, differs
 
 
 def _key(seed: int, step: int) -> npt.NDArray[np.uint32]:
@@ -143,13 +157,14 @@ def _key(seed: int, step: int) -> npt.NDArray[np.uint32]:
     return np.array([seed, step], np.uint32)
 
 
-def _check_frames(game: Game[Any], state: Any, steps: int) -> None:
-    """Draw both twins, not compiled, so that ``Layers`` sees the codes."""
-    for partial in (False, True):
-        try:
-            game.render(state, jnp.bool_(partial))
-        except ValueError as error:
-            raise ValueError(f"{game.id}: render after {steps} steps: {error}") from error
+def _check_frames(game: Game[Any], state: Any, steps: int) -> bool:
+    """Draw both twins, not compiled, so that ``Layers`` sees the codes; whether they differ."""
+    try:
+        full = game.render(state, jnp.bool_(False))
+        partial = game.render(state, jnp.bool_(True))
+    except ValueError as error:
+        raise ValueError(f"{game.id}: render after {steps} steps: {error}") from error
+    return not np.array_equal(full, partial)
 
 
 def _check_numbers(game: Game[Any], state: Any, reward: Any, step: int) -> None:
@@ -215,4 +230,16 @@ def _check_attributes(game: Game[Any]) -> None:
         raise ValueError(
             f"{name}: num_actions is {game.num_actions!r}, wanted {NUM_ACTIONS}, the same in every "
             "game"
+        )
+    if game.memory_kind not in ("", *MEMORY_KINDS):
+        raise ValueError(
+            f"{name}: memory_kind is {game.memory_kind!r}, wanted {', '.join(MEMORY_KINDS)}, or "
+            "nothing"
+        )
+    oracles: Any = game.oracles
+    players = oracles.items() if isinstance(oracles, Mapping) else [("", None)]
+    if not all(kind in ORACLES and callable(player) for kind, player in players):
+        raise ValueError(
+            f"{name}: oracles is {oracles!r}, wanted a dictionary with players under "
+            f"{' or '.join(map(repr, ORACLES))}"
         )

@@ -19,6 +19,7 @@ NUM_ACTIONS = 5
 ACTION_NAMES = ("up", "down", "left", "right", "fire")
 UP, DOWN, LEFT, RIGHT, FIRE = range(NUM_ACTIONS)
 ENDS = ("terminated", "truncated")  # the flags of an end
+ORACLES = ("state", "frames")  # what scripted players see
 MEMORY_KINDS = {
     "recall": "what was seen once",
     "counting": "how often something was seen",

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
 from arcade_torch.envs_jax.checks import check_ends
-from arcade_torch.envs_jax.game import NUM_ACTIONS, Game
+from arcade_torch.envs_jax.game import NUM_ACTIONS, ORACLES, Game
 from arcade_torch.envs_jax.settings import as_numpy
 from arcade_torch.envs_jax.validation import check_choice, format_value
 
@@ -101,14 +101,19 @@ def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
         kind: ``"state"`` sees the state, ``"frames"`` the frames of the POMDP twin.
 
     Raises:
-        ValueError: Unknown ``kind``, or the game has no such oracle.
+        ValueError: Unknown ``kind``, the game has no such oracle, or it is no player.
     """
-    check_choice("kind", kind, ("state", "frames"))
+    check_choice("kind", kind, ORACLES)
     if kind not in game.oracles:
         raise ValueError(
             f"{game.id} has no {kind} oracle: name one in {type(game).__name__}.oracles"
         )
     player: Player = game.oracles[kind](game)
+    if not callable(getattr(player, "act", None)):
+        raise ValueError(
+            f"{game.id}: the {kind} oracle is a {type(player).__name__}, wanted a player with "
+            "act(seen, is_init)"
+        )
     return player
 
 

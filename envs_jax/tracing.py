@@ -2,7 +2,9 @@
 is compiled.
 """
 
+import os
 import re
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +13,18 @@ import jax
 from arcade_torch.envs_jax.settings import as_numpy
 
 _ADDRESS = re.compile("0x[0-9a-f]+")  # of a Python object; another one at every tracing
+_OURS = __name__.partition(".")[0]
+_LIBRARIES = {_OURS, "contextlib", "functools", "jax", "jaxlib", "numpy"}
+# The first that fits says what to write; of two related errors the narrower one stands first.
+_HINTS: list[tuple[type[Exception], str]] = [
+    (jax.errors.TracerBoolConversionError, "use jnp.where instead of if"),
+    (
+        jax.errors.TracerIntegerConversionError,
+        "use jnp.array(...) instead of a list, and jax.lax.fori_loop instead of range",
+    ),
+    (jax.errors.TracerArrayConversionError, "use jnp instead of np"),
+    (jax.errors.ConcretizationTypeError, "use .astype instead of int and float"),
+]
 
 
 class ContractError(TypeError):
@@ -41,22 +55,36 @@ def traced(name: str, method: str, function: Callable[..., Any], *args: Any) -> 
     except ContractError as error:
         raise TypeError(str(error)) from None
     except Exception as error:
-        reason = str(error).strip().partition("\n")[0].rstrip(".")
-        hint = (
-            "; use jnp.where instead of if"
-            if isinstance(error, jax.errors.TracerBoolConversionError)
-            else ""
-        )
+        raise ValueError(f"{name}: {method} cannot be traced by JAX, {_refusal(error)}") from error
+    if any(isinstance(const, jax.core.Tracer) for const in (*program.consts, *again.consts)):
         raise ValueError(
-            f"{name}: {method} cannot be traced by JAX, wanted a pure function of arrays{hint} "
-            f"({type(error).__name__}: {reason})"
-        ) from error
+            f"{name}: {method} uses an array that an earlier call kept outside of the state, in "
+            "self or a global: keep in the state what changes"
+        )
     if not _is_same(program, again):
         raise ValueError(
             f"{name}: {method} is another function when it is called again, and JAX calls it once "
             "for all steps: keep in the state what changes, and draw random numbers from the key"
         )
     return given
+
+
+def _refusal(error: Exception) -> str:
+    """What is wanted of a function that raised this while it was traced, and where it did."""
+    hint = next((f"; {hint}" for kind, hint in _HINTS if isinstance(error, kind)), "")
+    reason = str(error).strip().partition("\n")[0].rstrip(".")
+    place = _place(error)
+    return f"wanted a pure function of arrays{hint} ({type(error).__name__}: {reason}{place})"
+
+
+def _place(error: Exception) -> str:
+    """The last line outside of the libraries that the error went through, or nothing."""
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__", ""))
+        if module.partition(".")[0] not in _LIBRARIES:
+            place = f"; {os.path.basename(frame.f_code.co_filename)}, line {line}"
+    return place
 
 
 def _is_same(one: Any, other: Any) -> bool:

@@ -8,8 +8,8 @@ those that are up: there the player has to remember.
 Importing this file registers the game, and every tool knows it; run as a script it is
 ``arcade-torch train`` itself:
 
-    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy --total-frames
-    1e5 python examples/own_game.py --preset small --observability partial
+    arcade-torch train --import examples/own_game.py --preset small --env PairsEasy
+    python examples/own_game.py --preset small --observability partial
 """
 
 import sys

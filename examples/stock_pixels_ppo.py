@@ -1,15 +1,16 @@
 """Feed-forward PPO for pixels from TorchRL's parts alone: one line makes our environment instead of
 theirs.
 
-    env = GymEnv("CartPole-v1", from_pixels=True, pixels_only=True,
-    categorical_action_encoding=True) env = arcade_torch.make("SignpostEasy", num_envs=32)
+    env = GymEnv("CartPole-v1", from_pixels=True, categorical_action_encoding=True)  # theirs
+    env = arcade_torch.make("SignpostEasy", num_envs=32)
 
 Everything else stays: networks (which take their sizes from the first frame), collector, buffer,
 loss. Frames stay uint8 until the network, a quarter of the memory that ``ToTensorImage`` in the
 environment would take.
 
-    python examples/stock_pixels_ppo.py --frames 20000   # prints returns of -0.58, then 0.99 after
-    16,000 frames python examples/stock_pixels_ppo.py --theirs --frames 10000
+    python examples/stock_pixels_ppo.py --frames 20000
+    # prints returns of -0.58, then 0.99 after 16,000 frames
+    python examples/stock_pixels_ppo.py --theirs --frames 10000
 """
 
 import argparse

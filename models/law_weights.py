@@ -1,4 +1,4 @@
-"""The law that all weights of a memory model are registered: trained, saved and moved with it."""
+"""The law of the weights of a memory model: registered, made early, and taken by name."""
 
 from typing import Any
 
@@ -13,7 +13,18 @@ __all__ = ["weights_are_registered"]
 
 @torch.no_grad()
 def weights_are_registered(s: Subject, law: str) -> float:
-    """Refuse weights that ``parameters()`` does not list, or that come with the first call."""
+    """All weights are parameters, there before the first call, and taken by name.
+
+    Args:
+        s: what is checked.
+        law: its name, for the error.
+
+    Returns:
+        0: it is no law of numbers.
+
+    Raises:
+        MemoryLawError: one of the three is not so.
+    """
     for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
         if is_lazy(weight):
             symptom = f"{name} has no shape before the first call"
@@ -40,6 +51,7 @@ def weights_are_registered(s: Subject, law: str) -> float:
             f"the first call makes new weights: {', '.join(sorted(new))}",
             "a layer made in forward, which the optimiser does not know: make it in __init__",
         )
+    _check_taken_by_name(s, law, x)
     return 0.0
 
 
@@ -54,3 +66,26 @@ def _weights_in(value: Any) -> list[Tensor]:
         elif isinstance(thing, nn.Parameter):
             weights.append(thing)
     return weights
+
+
+def _check_taken_by_name(s: Subject, law: str, x: Tensor) -> None:
+    """Call it with ``parameters()`` empty and the numbers there by their names, as a loss with
+    target networks does.
+    """
+    bare = s.copied().module
+    for part in bare.modules():
+        for name, weight in list(part.named_parameters(recurse=False)):
+            delattr(part, name)
+            part.register_buffer(name, weight.detach())
+    begin = s.initial(len(x))
+    try:
+        bare(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
+        bare.initial_state(len(x))  # type: ignore[operator]
+    except Exception as error:
+        raise MemoryLawError(
+            law,
+            "it fails where a loss with target networks keeps the parameters elsewhere, "
+            f"{type(error).__name__} {error}".rstrip(),
+            "self.parameters() in forward or initial_state: take weights by name, such as "
+            "self.cell.weight",
+        ) from error

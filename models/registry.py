@@ -109,7 +109,11 @@ def make_memory(name: str, input_size: int, hidden_size: int, **options: Any) ->
     try:
         inspect.signature(_FACTORIES[name]).bind(input_size, hidden_size, **options)
     except TypeError as error:
-        raise TypeError(f"memory {name!r} has other options: {error}") from error
+        if options:
+            raise TypeError(f"memory {name!r} has other options: {error}") from error
+        raise TypeError(
+            f"memory {name!r} cannot be made from (input_size, hidden_size) alone: {error}"
+        ) from error
     return _FACTORIES[name](input_size, hidden_size, **options)
 
 
@@ -137,14 +141,17 @@ def register_memory(name: str, factory: MemoryFactory, *, overwrite: bool = Fals
         ValueError: the name is taken, or not a lower-case identifier.
         TypeError: ``factory`` cannot be called.
     """
-    if not name.isidentifier() or name != name.lower():
+    if not isinstance(name, str) or not name.isidentifier() or name != name.lower():
         raise ValueError(
             f"a memory's name must be a lower-case identifier such as 'my_memory', got {name!r}"
         )
     if not callable(factory) or isinstance(factory, nn.Module):
+        kind = type(factory).__name__
+        is_module = isinstance(factory, nn.Module)
+        got = f"an instance of {kind}: give {kind}" if is_module else repr(factory)
         raise TypeError(
             "factory must be a class or function of (input_size, hidden_size, **options), got "
-            f"{factory!r}"
+            f"{got}"
         )
     if (name in _FACTORIES or name in ALIASES) and not overwrite:
         raise ValueError(

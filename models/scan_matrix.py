@@ -1,8 +1,7 @@
 """The matrix-valued linear recurrence: what linear attention, the delta rule and its gated form do
 over time.
 
-    S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T,        o_t = S_t^T q_t,        S [K,
-    V]
+    S_t = alpha_t (I - beta_t k_t k_t^T) S_{t-1} + k_t v_t^T,    o_t = S_t^T q_t,    S [K, V]
 
 :func:`matrix_scan` is the function to use. :func:`matrix_scan_loop` beside it is the same thing as
 a loop that can be read at a glance, and the oracle of the tests. :func:`matrix_scan_stored` begins

@@ -5,6 +5,7 @@ examples; each failure names file and line.
 """
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -141,3 +142,29 @@ def test_the_slow_cases_are_cases_of_tests_that_exist() -> None:
         if f"def {function}(" not in (ROOT / file).read_text():
             missing.append(case)
     assert not missing
+
+
+COMMAND = re.compile(r" (python -m \S|python \S+\.py|arcade-torch [a-z]+ --)")
+GAP = re.compile(r"\S {3,}(?=\S)")
+
+
+def indented_blocks(text: str) -> Iterator[list[str]]:
+    """Indented lines of a docstring that stand together, without those of an interpreter."""
+    for paragraph in re.split(r"\n\s*\n", text):
+        block = [line for line in paragraph.splitlines() if line.startswith("    ")]
+        yield [line for line in block if not line.lstrip().startswith(("...", ">>>"))]
+
+
+@pytest.mark.parametrize("folder", (*FOLDERS, "examples"))
+def test_formulas_and_commands_in_docstrings_are_not_wrapped_into_one_another(folder):
+    wrapped = []
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    for path in files(folder):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            text = (isinstance(node, kinds) and ast.get_docstring(node)) or ""
+            for block in indented_blocks(text):
+                columns = {gap.end() for line in block for gap in [GAP.search(line)] if gap}
+                commands = [line for line in block if COMMAND.search(line.lstrip(), 1)]
+                if len(columns) > 1 or any("XLA_FLAGS" not in line for line in commands):
+                    wrapped.append(f"{path.relative_to(ROOT)}: {block}")
+    assert not wrapped, "\n".join(wrapped)

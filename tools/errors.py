@@ -49,11 +49,12 @@ WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
 """Own error types that do not mean bad input; told in one line too."""
 
 _FULL = "make room and type the same again; what was finished before is whole"
+_TOO_LARGE = "a file may not grow so large here: raise the limit with ulimit -f"
 _FORBIDDEN = "choose another folder, or let it be written"
 MACHINE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
-    errno.EFBIG: _FULL,
+    errno.EFBIG: _TOO_LARGE,
     errno.EROFS: _FORBIDDEN,
     errno.EACCES: "choose another place, or change its permissions",
     errno.EPERM: "choose another place, or change its permissions",
@@ -93,11 +94,25 @@ def is_told(error: BaseException) -> bool:
     if isinstance(error, OSError) and not isinstance(error, ValueError):
         is_named = error.errno is not None and error.filename is not None
         return isinstance(error, FILES) or is_named or error.errno in MACHINE
+    if is_unnameable(error):
+        return True
     if isinstance(error, ValueError):
         return _raising_module(error).startswith("arcade_torch.")
     if isinstance(error, TypeError):
         return _raising_module(error).startswith(WITH_OPTIONS)
     return False
+
+
+def is_unnameable(error: BaseException) -> bool:
+    """Whether a file could not be opened because this shell's locale has no way to write its
+    name.
+    """
+    encoding = sys.getfilesystemencoding()
+    return (
+        isinstance(error, UnicodeEncodeError)
+        and encoding != "utf-8"
+        and error.encoding in (encoding, encoding.removeprefix("us-"))
+    )
 
 
 def _raising_module(error: BaseException) -> str:
@@ -125,6 +140,11 @@ def is_of_the_machine(error: BaseException) -> bool:
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line, or its type if it has none."""
+    if isinstance(error, UnicodeEncodeError) and is_unnameable(error):
+        return printable(
+            f"the name {error.object} cannot be written in this shell's {error.encoding}: set "
+            "PYTHONUTF8=1, or LC_ALL=C.UTF-8"
+        )
     if isinstance(error, OSError) and not type(error).__module__.startswith("arcade_torch."):
         return printable(_of_a_file(error))
     return printable(" ".join(str(error).split())) or type(error).__name__
@@ -137,7 +157,7 @@ def _of_a_file(error: OSError) -> str:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         return f"{error.filename} does not exist"
     place = "a file" if error.filename is None else str(error.filename)
-    verb = "write" if MACHINE.get(error.errno) in (_FULL, _FORBIDDEN) else "use"
+    verb = "write" if MACHINE.get(error.errno) in (_FULL, _TOO_LARGE, _FORBIDDEN) else "use"
     advice = MACHINE.get(error.errno)
     return f"could not {verb} {place}: {error.strerror}" + (f"; {advice}" if advice else "")
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
-from arcade_torch.agents.runs.shipped import agent_folder
+from arcade_torch.agents.runs.shipped import agent_folder, agents_hint
 from arcade_torch.tools.errors import one_line
 
 if TYPE_CHECKING:
@@ -163,6 +163,16 @@ def load_agent(path: Path) -> "Agent":
     folder = agent_folder(path)
     import_again(folder)
     return agent_of(read_shared(folder))
+
+
+def existing_agent(path: Path) -> Path:
+    """The folder of an agent that a user names; a ``FileNotFoundError`` if there is none, before
+    anything heavy is imported.
+    """
+    folder = agent_folder(path)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is not a folder; {agents_hint(folder)}")
+    return folder
 
 
 def remembered_imports(record: Any, file: Path) -> dict[str, str]:

@@ -83,14 +83,14 @@ class Bars:
             words.append(text)
         said = printable(", ".join(words))
         task.fields["text"] = said
-        self._line = f"{name}: {done:,}"
+        self._line = f"{name}: {done:,}" if total or self.unit or not said else f"{name}: {said}"
         if total:
             self._line += f" of {total:,}"
         if self.unit:
             self._line += f" {self.unit}"
         if total:
             self._line += f" ({task.percentage:.0f} %)"
-        if said:
+        if said and (total or self.unit):
             self._line += f", {said}"
         if not self.terminal and time.monotonic() >= self._next_line_s:
             self.note(self._line)

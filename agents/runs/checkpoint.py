@@ -4,11 +4,11 @@ absent.
 ``checkpoints/`` of a run holds the last two, named by their frame count, and ``latest``, the name
 of the newest::
 
-    checkpoints/latest                              text: frames-000000204800
-    checkpoints/frames-000000204800/weights.safetensors    network that acts, with buffers
-    checkpoints/frames-000000204800/trainer.pt             optimiser, counters, generators,
-    environments, memory checkpoints/frames-000000204800/meta.json              format, config,
-    frames, checksums; written last
+    checkpoints/latest                       text: frames-000000204800
+    checkpoints/frames-000000204800/
+        weights.safetensors                  network that acts, with buffers
+        trainer.pt                           optimiser, counters, generators, environments, memory
+        meta.json                            format, config, frames, checksums; written last
 
 A learner with a replay keeps it beside, in ``replay/`` of the run: the trainer's state names its
 files. Nothing is unpickled: weights are safetensors, the rest is loaded with ``weights_only=True``.

@@ -398,8 +398,17 @@ def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
         raise ValueError(f"{path} has a header that names a column twice, or over several lines")
     elif wrong := next((row for row in rows if len(row) != len(header)), None):
         which = "more" if len(wrong) > len(header) else "fewer"
-        raise ValueError(f"{path} has a line with {which} cells than its header names")
+        raise ValueError(
+            f"{path} has a line with {which} cells than its header names{_divided(header)}"
+        )
     return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def _divided(header: Sequence[str]) -> str:
+    """A hint where a spreadsheet has divided the cells by something else than commas."""
+    marks = {";": "semicolons", "\t": "tabs"}
+    used = [words for mark, words in marks.items() if any(mark in name for name in header)]
+    return f": it is divided by {used[0]}, wanted are commas" if used else ""
 
 
 def _check_size(path: Path, text: str) -> None:

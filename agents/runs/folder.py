@@ -4,6 +4,7 @@ import contextlib
 import importlib.metadata
 import os
 import platform
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,6 +35,10 @@ EVAL_COLUMNS = ("frames", "mean", "std", "n")
 LOCK = "lock"
 """File in a run folder that the process which trains there holds locked. The file itself stays; a
 killed process loses the lock at once."""
+
+
+_MOST_FIELDS = 8
+"""Settings that are named where two runs differ; an agent of another preset differs in 30."""
 
 
 # in place, so never behind a link
@@ -138,8 +143,13 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunFolderError(f"{self._config} does not describe a run: {error}") from error
         if fields := differing_fields(saved, config):
+            text = ", ".join(fields[:_MOST_FIELDS])
+            if len(fields) > _MOST_FIELDS:
+                text += f" and {len(fields) - _MOST_FIELDS} more"
             raise RunFolderError(
-                f"{self.path} holds another run; differing fields: {', '.join(fields)}"
+                f"{self.path} holds another run; differing fields: {text}; to go on with it: "
+                f"arcade-torch train --config {shlex.quote(str(self._config))} --out "
+                f"{shlex.quote(str(self.path))} --resume"
             )
 
     def check_there(self) -> None:

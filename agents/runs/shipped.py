@@ -1,5 +1,6 @@
 """The folders of the agents that this package ships, by name; imports nothing heavy."""
 
+import difflib
 import os
 from os import PathLike
 from pathlib import Path
@@ -33,3 +34,14 @@ def agent_folder(name: str | PathLike[str]) -> Path:
     if text in pretrained_names() and not path.exists():
         return SHIPPED / text
     return path
+
+
+def agents_hint(folder: Path) -> str:
+    """What to give in the place of a folder that is not there; the nearest name first."""
+    names = pretrained_names()
+    near = difflib.get_close_matches(folder.name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return (
+        f"{hint}give a run folder, one of its checkpoints, an agent that was shared, or one of "
+        f"this package: {', '.join(names)}"
+    )

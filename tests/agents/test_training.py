@@ -157,6 +157,10 @@ def test_a_folder_that_is_taken_is_refused_and_left_alone(whole, tmp_path):
     ):
         pqn = dataclasses.replace(CONFIG.pqn, lam=0.5)
         train(dataclasses.replace(CONFIG, seed=3, pqn=pqn), folder, resume=True)
+    with pytest.raises(RunFolderError) as error:
+        train(preset("small"), folder, resume=True)
+    command = f"arcade-torch train --config {folder}/config.json --out {folder} --resume"
+    assert str(error.value).endswith(f" more; to go on with it: {command}")
     assert before == {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(RunFolderError, match="is not empty; choose another folder"):

@@ -1,9 +1,9 @@
 """Digests of what all configurations of the games do, to be compared between settings of JAX.
 
-    python -m tests.envs_jax.digests                      all ids, in this process's settings, as
-    JSON python -m tests.envs_jax.digests CartPoleEasy-v0      one of them
-    python -m tests.envs_jax.digests --compare            all ids in every setting of ``SETTINGS``,
-    each in a process
+    python -m tests.envs_jax.digests                    all ids, in this process's settings: JSON
+    python -m tests.envs_jax.digests CartPoleEasy-v0    one of them
+    python -m tests.envs_jax.digests --compare          all ids in every setting of ``SETTINGS``,
+                                                        each in a process
 
 A walk is 32 steps in 4 envs, with ends and new episodes as they come, through ``BatchedGame`` and
 in pure JAX. All bits of states, outcomes and frames count, those of floats too: the processes run

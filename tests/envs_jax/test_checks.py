@@ -144,6 +144,17 @@ WRONG = [
         {"reset": lambda s, key: key.no_such},
         "reset cannot be traced by JAX, wanted a pure function of arrays (Attr",
     ),
+    ({"reset": lambda s, key: None}, "reset gives None, wanted a state: a tree of arrays"),
+    (
+        {"step": lambda s, key, state, action: [state, 0.0, False, False]},
+        "step gives a list, wanted 4: state, reward, terminated, truncated (a tuple)",
+    ),
+    ({"memory_kind": "telepathy"}, "memory_kind is 'telepathy', wanted recall, counting, "),
+    ({"oracles": {"stat": len}}, "oracles is {'stat': "),
+    (
+        {"oracles": [1]},
+        "oracles is [1], wanted a dictionary with players under 'state' or 'frames'",
+    ),
     ({"max_steps": 0}, "max_steps is 0, wanted an int of 1 or more"),
     ({"obs_size": 128.0}, "obs_size is 128.0, wanted an int of 1 or more"),
     ({"return_range": (1.0, 0.0)}, "return_range is (1.0, 0.0), wanted (lowest, highest)"),
@@ -226,6 +237,45 @@ def test_an_attribute_that_is_missing_is_named():
         check_game(Nameless())
 
 
+UNTRACED = {
+    "if state.count > 1: pass": "use jnp.where instead of if",
+    "int(state.count)": "use .astype instead of int and float",
+    "float(state.count)": "use .astype instead of int and float",
+    "list(range(state.count))": "use jnp.array(...) instead of a list, and jax.lax.fori_loop",
+    "[4, 5][action]": "use jnp.array(...) instead of a list, and jax.lax.fori_loop",
+    "numpy.array([4, 5])[action]": "use jnp instead of np",
+    "numpy.maximum(state.count, 1)": "use jnp instead of np",
+    "state.no_such": "wanted a pure function of arrays (AttributeError: ",
+}
+
+
+@pytest.mark.parametrize("statement", UNTRACED)
+def test_what_cannot_be_traced_is_named_by_its_line_and_says_what_to_write(statement):
+    source = f"import numpy\n\ndef step(self, key, state, action):\n    {statement}\n"
+    module = {"__name__": "mine"}
+    exec(compile(source, "/somewhere/mine.py", "exec"), module)
+    with pytest.raises(ValueError, match="step cannot be traced by JAX") as error:
+        check_game(with_methods(step=module["step"]))
+    assert UNTRACED[statement] in str(error.value)
+    assert str(error.value).endswith("; mine.py, line 4)")
+    assert "\n" not in str(error.value)
+
+
+def test_a_state_that_is_kept_in_the_game_is_refused_in_one_line():
+    class Keeps(Right):
+        def reset(self, key):
+            self.kept = State(key[0].astype(jnp.int32), jnp.zeros(3, bool))
+            return self.kept
+
+        def step(self, key, state, action):
+            return super().step(key, self.kept, action)
+
+    message = "RightEasy-v0: step uses an array that an earlier call kept outside of the state, in "
+    with pytest.raises(ValueError, match=message + "self or a global: keep") as error:
+        check_game(Keeps())
+    assert "\n" not in str(error.value)
+
+
 def test_nothing_is_compiled_by_the_check():
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(
@@ -254,7 +304,7 @@ class Counter(Right):
         self.layers = Layers(blank(128, 128, (0, 0, 0)), slot)
 
     def render(self, state, partial):
-        return self.layers.draw(state.count)
+        return self.layers.draw(jnp.where(partial & (state.count == 1), 0, state.count))
 
 
 def counter_with(**methods):
@@ -297,6 +347,11 @@ PLAYED_WRONG = [
         "an episode returned 1.5, and return_range is (0.0, 1.0)",
     ),
     ({"step": step_paying(reward=jnp.nan)}, "step 1 gives the reward nan"),
+    (
+        {"render": lambda s, state, partial: s.layers.draw(state.count)},
+        "render gives both twins the same frames in 100 steps at random: where partial is true it "
+        "has to hide something that the MDP shows",
+    ),
 ]
 
 

@@ -1,9 +1,9 @@
 """The campaign: every case of `tests.fuzz.attacks` in a process of its own, within limits, and what
 became of it.
 
-    python -m tests.fuzz.campaign                        everything, about twenty minutes of one
-    core python -m tests.fuzz.campaign --only file/fifo       the cases whose names begin so, such
-    as one that failed
+    python -m tests.fuzz.campaign                     everything, about twenty minutes of one core
+    python -m tests.fuzz.campaign --only file/fifo    the cases whose names begin so, such as one
+                                                      that failed
 
 Every case works in a fresh copy of a trained run, a study and their files. Beside it lies a folder
 that nobody may touch. A case is fine if it worked, if it was refused in one line, or if it was

@@ -3,10 +3,10 @@ page made of them.
 
 ::
 
-    python -m tests.gpu.stages FOLDER                  all stages on the GPU, as many as eight
-    minutes hold python -m tests.gpu.stages FOLDER                  again: goes on with what is not
-    finished python -m tests.gpu.stages FOLDER --device cpu     a rehearsal: every stage on the CPU,
-    in a tiny form
+    python -m tests.gpu.stages FOLDER                 all stages on the GPU, as many as eight
+                                                      minutes hold; again: what is not finished
+    python -m tests.gpu.stages FOLDER --device cpu    a rehearsal: every stage on the CPU, in a
+                                                      tiny form
 
 A stage is a process; its output is FOLDER/NAME.log. FOLDER/NAME.done says that it never runs again.
 What failed does not stop the others, and is tried again by the next call, after them. Where the

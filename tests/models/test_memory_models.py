@@ -371,9 +371,18 @@ def test_names_are_registered_once_and_must_be_identifiers(monkeypatch):
     assert make_memory("fart", 3, 4, width=2).hidden_size == 8
     with pytest.raises(ValueError, match="identifier"):
         register_memory("Wide GRU", factory)
+    with pytest.raises(ValueError, match="identifier such as 'my_memory', got 3"):
+        register_memory(3, factory)
     for number in (3, make_memory("gru", 3, 4)):  # a number, a memory in the place of its class
-        with pytest.raises(TypeError, match="a class or function"):
+        with pytest.raises(TypeError, match="a class or function") as error:
             register_memory("tests_number", number)
+        assert "\n" not in str(error.value)
+    assert str(error.value).endswith("got an instance of GRU: give GRU")
+    register_memory("tests_one_size", lambda size: number)
+    with pytest.raises(
+        TypeError, match=r"'tests_one_size' cannot be made from \(input_size, hidden"
+    ):
+        make_memory("tests_one_size", 3, 4)
 
 
 @pytest.mark.parametrize("name", NAMES)

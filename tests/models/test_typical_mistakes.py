@@ -241,6 +241,19 @@ class MeanOfBefore(Cell):
         return super().read(x - mean)
 
 
+class AsksForADevice(Cell):
+    """A copy of it in a loss with a target network has no parameters of its own."""
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return super().initial_state(batch_size).to(next(self.parameters()).device)
+
+
+class TakesTheFirst(Cell):
+    def read(self, x: Tensor) -> Tensor:
+        weights = list(self.parameters())
+        return super().read(x).to(weights[0].dtype)
+
+
 def refusal(model: type[Cell]) -> MemoryLawError:
     """What check_memory says of a model."""
     torch.manual_seed(0)
@@ -290,6 +303,12 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
         (NotANumber, "shapes are fixed", "NaN or infinite"),
         (RandomStart, "equal calls give equal results", "initial_state differ"),
         (LazyLayer, "weights are registered", "late.weight has no shape"),
+        (
+            AsksForADevice,
+            "weights are registered",
+            "keeps the parameters elsewhere, StopIteration.",
+        ),
+        (TakesTheFirst, "weights are registered", "elsewhere, IndexError list index out of range"),
     ],
 )
 def test_said_something_else_before(model: type[Cell], law: str, said: str) -> None:

@@ -89,7 +89,7 @@ def test_every_command_explains_itself_with_an_example(
         (["report", "no/such/study"], "not the folder of a study"),
         (["analyze", "gap-bias"], "name at least one"),
         (["analyze", "gap-bias", "no/such.csv"], "does not exist"),
-        (["analyze", "gap-bias", "README.md", "--confidence", "2"], "between 0 and 1"),
+        (["analyze", "gap-bias", str(ROOT / "README.md"), "--confidence", "2"], "between 0 and 1"),
         (
             ["bench", "envs", "--out", "x.txt"],
             "--out must be a file that ends in .csv or .json; got 'x.txt'",

@@ -362,6 +362,19 @@ def test_scores_of_several_rules_are_not_pooled_and_lost_runs_are_told(tmp_path:
         read_scores(tmp_path / "s.csv")
 
 
+def test_returns_of_a_game_of_ones_own_outside_of_0_and_1_are_noted(tmp_path: Path) -> None:
+    head = "memory,game,observability,seed,status,rules,eval_final"
+    rows = [
+        f"{memory},{game},{twin},0,finished,default,{value}"
+        for memory, twin in product(("lru", "mlp"), ("full", "partial"))
+        for game, value in (("LampEasy-v0", -0.5), ("TetrisEasy-v0", -1.0), ("OwnEasy-v0", 1.0))
+    ]
+    (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
+    made, *_ = figure._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
+    notes = [note for note in made.notes if "outside of [0, 1]" in note]
+    assert len(notes) == 1 and notes[0].startswith("returns of LampEasy-v0 lie outside of [0, 1]")
+
+
 def test_a_bare_name_and_its_version_are_one_game() -> None:
     twins = [("mlp", "full"), ("mlp", "partial"), ("lru", "full"), ("lru", "partial")]
     bare = [Score(agent, "TetrisEasy", twin, 0, 0.5) for agent, twin in twins]

@@ -171,3 +171,14 @@ def test_small_things_that_are_no_text_or_no_json(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="is not text in UTF-8"):
         write_between(page, "a", "b", "c")
     assert name_and_value("x=" + "9" * 5000) == ("x", "9" * 5000)
+
+
+@pytest.mark.parametrize(("mark", "words"), [(";", "semicolons"), ("\t", "tabs")])
+def test_a_table_that_a_spreadsheet_divided_otherwise_says_so(
+    tmp_path: Path, mark: str, words: str
+) -> None:
+    header = mark.join(("agent", "game", "observability", "seed", "score"))
+    file = tmp_path / "scores.csv"
+    file.write_text(f"{header}\nlru{mark}TetrisEasy{mark}full{mark}0{mark}0,5\n")
+    with pytest.raises(ValueError, match=f"more cells .*: it is divided by {words}, wanted are"):
+        read_csv(file)

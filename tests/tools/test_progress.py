@@ -44,6 +44,9 @@ def test_what_is_no_work_of_frames_prints_a_line_now_and_then_only() -> None:
         bars.update("players", 2, 3)
         bars.update("film", 7, 0, "frame 7")
     assert stream.getvalue() == "players: 2 of 3 (67 %)\n"
+    with Bars(stream, first_line_s=0) as bars:
+        bars.update("card gru", 0, 0, "laws")
+    assert stream.getvalue().splitlines()[1:] == ["card gru: laws"]
 
 
 def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appears_when_there_is_one() -> (

@@ -514,6 +514,24 @@ def test_a_study_on_a_full_disk_stops_at_the_first_run_that_fails_for_it(tmp_pat
     assert len(engine.done) == 1
 
 
+def test_a_run_that_another_process_finished_meanwhile_has_not_failed(tmp_path: Path) -> None:
+    class Second(Fabricator):
+        """Finds a run in training, which is finished before the last of its own is."""
+
+        def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+            taken, lost, *others = list(jobs)
+            yield JobResult(taken.name, "another process trains in it")
+            yield JobResult(lost.name, "no luck")
+            write_run(taken.folder, self.runs[taken.name], 0.5)
+            yield from super().run(others)
+
+    what = small_study()
+    result = study(what, tmp_path / "s", Second(what), stream=io.StringIO())
+    assert list(result.errors) == [what.runs()[1].name]
+    assert result.finished == len(what.runs()) - 1
+    assert [row["error"] for row in result.rows if row["error"]] == ["no luck"]
+
+
 def test_the_presets_are_studies() -> None:
     sizes = {name: len(study_preset(name).runs()) for name in STUDY_PRESETS}
     assert sizes == {"demo": 24, "paper-easy": 800, "paper": 2400, "size-sweep": 192}

@@ -85,6 +85,11 @@ class Card(Command):
                 done += 1
 
             card = measure_card(name, self.tests, tell)
+        laws = card["laws"]
+        if isinstance(laws, dict) or not all(row["passed"] for row in laws):
+            from arcade_torch.tools.cards.page import findings
+
+            say(f"{name}: {findings(card)[0]}")
         pictures = list[str]()
         failed = 0
         if self.study:

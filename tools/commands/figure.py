@@ -62,6 +62,9 @@ class Figure(Command):
 
     def run(self) -> int:
         """Measure, draw, save, print."""
+        for path in self.options.runs:
+            if not path.exists():  # told before anything heavy is imported
+                raise FileNotFoundError(f"{path} does not exist")
         from arcade_torch.tools.figures.style import import_matplotlib
 
         keep_freed_memory()

@@ -9,7 +9,7 @@ import tyro
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable_folder, read_bytes, write_atomic
 from arcade_torch.agents.runs.shipped import agent_folder
-from arcade_torch.tools.imports import import_again
+from arcade_torch.tools.imports import existing_agent, import_again
 from arcade_torch.tools.options import Command, at_least
 from arcade_torch.tools.text import say
 
@@ -40,12 +40,12 @@ class Push(Command):
 
     def run(self) -> int:
         """Write, evaluate, and upload unless it is a folder."""
+        run = existing_agent(self.run_folder)
         from arcade_torch.agents import hub
         from arcade_torch.tools.sharing import card
         from arcade_torch.tools.sharing.share import share
 
         at_least(self, episodes=1)
-        run = agent_folder(self.run_folder)
         import_again(run)
         into_folder = is_folder(self.repo)
         allowed = "owner/name, or a folder that begins with ./ or /"

@@ -13,6 +13,7 @@ from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import Command, command_line
 from arcade_torch.tools.studies.engines import Engine, Inline, RayOptions
+from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
 from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
@@ -199,6 +200,7 @@ class Report(Command):
 
     def run(self) -> int:
         """Write the page, or measure a share of what it shows."""
+        StudyFolder(self.study).load()  # refuses what is none before anything heavy is imported
         least = "at least 1, or 0 for one a core"
         require(self.workers >= 0, "workers", self.workers, least)
         if self.shard:

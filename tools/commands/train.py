@@ -11,7 +11,7 @@ import tyro
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import check_writable, read_json, write_json
-from arcade_torch.tools.imports import import_again, imports_of, load_agent
+from arcade_torch.tools.imports import existing_agent, import_again, imports_of, load_agent
 from arcade_torch.tools.memory_files import check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
@@ -156,6 +156,7 @@ class Evaluate(Command):
 
     def run(self) -> int:
         """Evaluate and print."""
+        existing_agent(self.run_folder)
         from arcade_torch.agents.evaluation import evaluate
 
         if self.json is not None and self.json.exists():

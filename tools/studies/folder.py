@@ -2,14 +2,15 @@
 
 ::
 
-    study.json    the study, its versions, the command of every run
-    configs/NAME.json  the config of a run, which `arcade-torch train --config` takes
-    results.csv   one row a run, in the order of the grid; the same to the bit on every engine,
-    interrupted or not timings.csv   seconds of every run
-    runs/NAME/    one run folder each (see `arcade_torch.agents`)
-    logs/NAME.log what the run printed, or why it failed
-    failures/NAME.json the same in one line; gone when the run succeeds
-    analysis/     numbers and figures made from the runs
+    study.json            the study, its versions, the command of every run
+    configs/NAME.json     the config of a run, which `arcade-torch train --config` takes
+    results.csv           one row a run, in the order of the grid; the same to the bit on every
+                          engine, interrupted or not
+    timings.csv           seconds of every run
+    runs/NAME/            one run folder each (see `arcade_torch.agents`)
+    logs/NAME.log         what the run printed, or why it failed
+    failures/NAME.json    the same in one line; gone when the run succeeds
+    analysis/             numbers and figures made from the runs
     report.html
 """
 

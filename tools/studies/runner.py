@@ -282,7 +282,20 @@ def _watch(
                 raise DiskFullError(
                     f"the disk with {folder.root} is full ({error}); make room and start it again"
                 )
-    return errors
+    return _still_failed(folder, runs, errors)
+
+
+def _still_failed(
+    folder: StudyFolder, runs: Mapping[str, RunSpec], errors: Mapping[str, str]
+) -> dict[str, str]:
+    """The errors without those of runs that another process, which trained them, has finished."""
+    left = dict[str, str]()
+    for name, error in errors.items():
+        if folder.run(runs[name]).final is None:
+            left[name] = error
+        else:
+            folder.note_failure(runs[name], "")
+    return left
 
 
 @contextlib.contextmanager

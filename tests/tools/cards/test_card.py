@@ -126,9 +126,13 @@ def test_torch_lstm_from_outside_has_a_card(
     assert "Tests that separate" not in (tmp_path / "torch_lstm.html").read_text()
 
 
-def test_a_memory_that_fails_has_a_card_that_says_so(tmp_path: Path) -> None:
+def test_a_memory_that_fails_has_a_card_that_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     register_memory("broken", Broken)
-    card = measure.measure_card("broken", tests=False)
+    assert cli.main(["card", "broken", "--no-tests", "--out", str(tmp_path)]) == 0
+    assert "broken: It breaks " in capsys.readouterr().out
+    card = json.loads((tmp_path / "broken.json").read_text())
     assert not any(row["passed"] for row in card["laws"])
     assert card["reach"]["error"] == "RuntimeError: no such luck"
     assert findings(card)[0].startswith(f"It breaks {len(card['laws'])} of {len(card['laws'])}")

@@ -26,7 +26,13 @@ from arcade_torch.tools.figures.style import (
 from arcade_torch.tools.files import Table, read_csv
 from arcade_torch.tools.measures.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
-from arcade_torch.tools.measures.gap_bias.measure import BOTH_TWINS, AgentRow, GapBias, gap_and_bias
+from arcade_torch.tools.measures.gap_bias.measure import (
+    BOTH_TWINS,
+    AgentRow,
+    GapBias,
+    gap_and_bias,
+    tasks_out_of_range,
+)
 from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.names import agent_names, memory_free
 from arcade_torch.tools.runs import Score
@@ -299,6 +305,12 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
         )
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
+    wide = tasks_out_of_range(scores, table.tasks)
+    if wide:
+        notes.append(
+            f"returns of {', '.join(wide)} lie outside of [0, 1] and count as they are, so gap and "
+            "bias are not of that scale: give a game of yours returns in [0, 1]"
+        )
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
     note = f"{tasks}, {_seeds([table], options)}"
     return Made(notes=notes, tables=[_printed(table, tasks)]), table, note

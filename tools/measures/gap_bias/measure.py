@@ -34,6 +34,7 @@ SIGNED_GAMES = ("BattleShip", "MineSweeper", "Breakout", "Tetris", "Navigator", 
 """Games whose returns lie in [-1, 1]; the others' lie in [0, 1] already, and so should those of
 your own games.
 """
+_ROUNDING = 1e-4  # of a return
 
 
 def game_of(env_id: str) -> str:
@@ -61,6 +62,16 @@ def normalise(env_id: str, value: Any) -> Any:
         (0.25, 0.5)
     """
     return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value
+
+
+def tasks_out_of_range(scores: Iterable[Score], tasks: Iterable[str]) -> list[str]:
+    """Those tasks of which a normalised return lies outside of [0, 1]: games of one's own."""
+    wide = set[str]()
+    for score in scores:
+        value = normalise(score.game, score.value)
+        if not -_ROUNDING <= value <= 1 + _ROUNDING:
+            wide.add(score.game)
+    return [task for task in tasks if task in wide]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,55 @@
+"""Refusals that need nothing heavy come before it is imported, and say what helps."""
+
+import errno
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from arcade_torch.tools.errors import is_told, one_line
+
+ROOT = Path(__file__).resolve().parents[2]
+MISSING = [
+    ("evaluate nosuch", "nosuch is not a folder; give a run folder"),
+    ("push nosuch someone/agent", "nosuch is not a folder; give a run folder"),
+    ("analyze saliency nosuch", "nosuch does not exist"),
+    ("figure returns --runs nosuch", "nosuch does not exist"),
+    ("report nosuch", "nosuch is not the folder of a study: it has no study.json"),
+]
+
+
+def test_a_folder_that_is_not_there_is_refused_before_torch_is_imported(tmp_path: Path) -> None:
+    source = (
+        "import sys; from arcade_torch.tools.cli import main\n"
+        f"codes = [main(line.split()) for line in {[line for line, _ in MISSING]}]\n"
+        "print(codes, 'torch' in sys.modules)"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", source],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT)},
+        check=True,
+    )
+    assert ended.stdout.strip() == "[2, 2, 2, 2, 2] False"
+    for (_, message), said in zip(MISSING, ended.stderr.splitlines(), strict=True):
+        assert said.startswith(f"arcade-torch: {message}")
+
+
+def test_a_name_that_the_locale_cannot_write_says_what_to_set(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    error = UnicodeEncodeError("ascii", f"{tmp_path}/\xfc", 0, 1, "ordinal not in range(128)")
+    assert not is_told(error)
+    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "ascii")
+    assert is_told(error)
+    wanted = f"the name {tmp_path}/\xfc cannot be written in this shell's ascii: set PYTHONUTF8=1"
+    assert one_line(error).startswith(wanted)
+
+
+def test_a_file_that_grows_too_large_is_no_full_disk() -> None:
+    said = one_line(OSError(errno.EFBIG, "File too large", "x.pdf"))
+    limit = "a file may not grow so large here: raise the limit with ulimit -f"
+    assert said == f"could not write x.pdf: File too large; {limit}"
