@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.modules import set_recurrent_mode
 
 from arcade_torch.collector_arguments import check_arguments
 from arcade_torch.compiled import TERMINATED, TRUNCATED
@@ -234,7 +235,8 @@ class ArcadeCollector(BaseCollector):
         random = random or self.policy is None or self._frames < self.init_random_frames
         # of the whole process: threads must not take turns
         as_wanted = exploration_type() is self.exploration_type
-        with nullcontext() if as_wanted else set_exploration_type(self.exploration_type):
+        exploring = nullcontext() if as_wanted else set_exploration_type(self.exploration_type)
+        with exploring, set_recurrent_mode(False):  # whatever a memory's own default is
             for step in range(first, buffer.length):
                 obs = self._advance(buffer, obs, step, random)
         last = {key: obs[key] for key in self.env.observation_keys}

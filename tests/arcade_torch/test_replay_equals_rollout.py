@@ -231,6 +231,20 @@ class Frames(nn.Module):
 OVERLAP, Q, LOGITS = 4, ("action_value", "memory"), ("logits", ("memory", "actor"))
 
 
+@pytest.mark.parametrize("outside", [True, None])
+def test_a_collector_acts_step_by_step_whatever_the_mode_of_the_memory_is(outside: bool) -> None:
+    """Before: a memory that reads sequences by default read a step of all envs as one."""
+    policy = make_agent("lru").get_policy_operator()
+    (memory,) = (part for part in policy.modules() if isinstance(part, MemoryModule))
+    collected = []
+    for by_default in (False, True):
+        memory.recurrence.default_recurrent_mode = by_default
+        torch.manual_seed(0)
+        with set_recurrent_mode(outside if by_default else None):
+            collected.append(ours(policy).collect()["action_log_prob"])
+    assert torch.equal(*collected)
+
+
 def make_memory_network(
     name: str, outputs: int, key: str, state: str | tuple[str, ...]
 ) -> MemoryNetwork:
