@@ -133,6 +133,11 @@ class Page(Command):
 
     def run(self) -> int:
         """Write."""
+        for path in (self.page, self.results):
+            if not path.exists():
+                raise FileNotFoundError(
+                    f"{path} does not exist: run it in a checkout, or give --page and --results"
+                )
         from arcade_torch.tools.board.page import write_page
 
         say(write_page(self.page, self.results))
