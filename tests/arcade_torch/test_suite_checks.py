@@ -231,6 +231,22 @@ def test_random_actions_of_a_space_without_bounds_are_numbers() -> None:
         from_jax(env_with(action_space=Box(0, np.inf, (3,))), num_envs=N)
 
 
+Space = namedtuple("Space", "n shape start", defaults=[(), 0])
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (Space(4, (4,)), r"are a Space of 3 of shape \[4\], expected one choice: .*Bounded\(0, 1,"),
+        (Space(3, start=1), r"begin at 1, expected 0: let step add 1, .*Categorical\(3, shape=\("),
+    ],
+)
+def test_a_space_with_n_that_is_another_choice_is_refused(space: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"the actions of Own {message}"):
+        from_jax(env_with(action_space=space), num_envs=N)
+    assert from_jax(env_with(action_space=Space(3)), num_envs=N).action_spec.space.n == 3
+
+
 class Gymnax(Count):
     """Has gymnax's four functions."""
 
