@@ -62,7 +62,7 @@ class Suite:
                 "observation and state"
             )
         obs, state = result
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, state)
+        return jax.tree.map(_array, obs), jax.tree.map(_array, state)
 
     def step(
         self, key: jax.Array, state: Any, action: jax.Array, count: jax.Array
@@ -84,7 +84,7 @@ class Suite:
             )
         terminated, truncated = self._ends([flag.astype(bool) for flag in flags], after, count)
         outcome = Outcome(reward.astype(jnp.float32), terminated, truncated)
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, after), outcome
+        return jax.tree.map(_array, obs), jax.tree.map(_array, after), outcome
 
     def check(self, action: Any) -> None:
         """Refuse an env whose functions do not fit together; nothing is compiled.
@@ -135,6 +135,14 @@ class Suite:
             truncated = self._number(self.env.is_truncated(after, *self.extra))
             return flags[0], jnp.logical_or(truncated, is_limit)
         return jnp.logical_and(flags[0], jnp.logical_not(is_limit)), is_limit
+
+
+def _array(value: Any) -> Any:
+    """An array of a type that does not give way to others, as that of a Python number does: the
+    types that a step gives must not hang on where its state comes from.
+    """
+    array = jnp.asarray(value)
+    return array if is_key(array) else jax.lax.convert_element_type(array, array.dtype)
 
 
 def _function(env: Any, name: str) -> Callable[..., Any]:

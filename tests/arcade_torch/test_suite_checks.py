@@ -247,6 +247,31 @@ def test_a_space_with_n_that_is_another_choice_is_refused(space: Any, message: s
     assert from_jax(env_with(action_space=Space(3)), num_envs=N).action_spec.space.n == 3
 
 
+def test_python_numbers_in_a_state_change_no_type_and_compile_nothing_twice() -> None:
+    half = jnp.ones(2, jnp.float16)
+
+    def begin(self: Any, key: Any) -> Any:
+        return half, 0.0
+
+    def step(self: Any, key: Any, state: Any, action: Any) -> Any:
+        return half * state, state + jnp.float32(1), 1.0, state >= 2, {}
+
+    # beside a Python number half stays half, beside the float32 of the next step it does not
+    with pytest.raises(
+        ValueError, match=r"step gives observation as float32 \[2\], wanted float16"
+    ):
+        made(env_with(reset=begin, step=step))
+
+    def narrow(self: Any, key: Any, state: Any, action: Any) -> Any:
+        obs, *rest = step(self, key, state, action)
+        return obs.astype(half.dtype), *rest
+
+    env = made(env_with(reset=begin, step=narrow))
+    seen = env.rollout(5, break_when_any_done=False)["next", "observation"]
+    assert seen.dtype is torch.float16 and seen[0, :, 0].tolist() == [0, 1, 2, 0, 1]
+    assert env._step_fused._cache_size() == 1
+
+
 class Gymnax(Count):
     """Has gymnax's four functions."""
 
