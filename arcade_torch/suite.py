@@ -104,7 +104,7 @@ class Suite:
         following, after, _ = traced(name, "step", self.step, key, state, action, count)
         check_same(name, "observation", obs, following)
         for place, leaf in leaves(obs, "observation").items():
-            if is_key(leaf) or leaf.dtype == jnp.bfloat16:
+            if is_key(leaf) or leaf.dtype.kind not in "biuf":  # V: bfloat16, int4, ...; c: complex
                 raise TypeError(
                     f"{name}: reset shows {place} as {leaf.dtype}, which torch does not share: "
                     "give float32, or jax.random.key_data of a key"
@@ -185,8 +185,14 @@ def _limit_of(params: Any) -> int | None:
     entries = params if isinstance(params, Mapping) else None
     for name in _LIMITS:
         limit = getattr(params, name, None) if entries is None else entries.get(name)
-        if limit is not None:
-            return int(limit)
+        if limit is None or limit == float("inf"):
+            continue
+        if limit < 1:
+            raise ValueError(
+                f"params have {name} {limit}, expected a time limit of 1 or more: set it to None "
+                "where there is none, or pass max_steps="
+            )
+        return int(limit)
     return None
 
 

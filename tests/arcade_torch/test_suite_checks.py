@@ -129,6 +129,20 @@ WRONG = {
         ),
         "Own: reset shows observation as bfloat16, which torch does not share",
     ),
+    "complex numbers to see": (
+        env_with(
+            reset=lambda self, key: (jnp.zeros(2, jnp.complex64), 0),
+            step=giving(lambda s: jnp.zeros(2, jnp.complex64), goes_on, pays, ends),
+        ),
+        "Own: reset shows observation as complex64, which torch does not share: give float32",
+    ),
+    "half a byte to see": (
+        env_with(
+            reset=lambda self, key: (jnp.zeros(2, jnp.int4), 0),
+            step=giving(lambda s: jnp.zeros(2, jnp.int4), goes_on, pays, ends),
+        ),
+        "Own: reset shows observation as int4, which torch does not share: give float32",
+    ),
     "nothing to see": (
         env_with(reset=lambda self, key: ({}, 0), step=giving(lambda s: {}, goes_on, pays, ends)),
         "Own: reset gives an observation without any array",
@@ -270,6 +284,15 @@ def test_python_numbers_in_a_state_change_no_type_and_compile_nothing_twice() ->
     seen = env.rollout(5, break_when_any_done=False)["next", "observation"]
     assert seen.dtype is torch.float16 and seen[0, :, 0].tolist() == [0, 1, 2, 0, 1]
     assert env._step_fused._cache_size() == 1
+
+
+def test_no_limit_of_params_ends_every_step() -> None:
+    for none in (None, float("inf")):
+        assert Suite(Count(), {"max_steps": none}).max_steps is None
+    for limit in (-1, 0):
+        with pytest.raises(ValueError, match=f"params have max_steps {limit}, expected a time"):
+            Suite(Count(), {"max_steps": limit})
+        assert Suite(Count(), {"max_steps": limit}, max_steps=7).max_steps == 7
 
 
 class Gymnax(Count):
