@@ -1,5 +1,6 @@
 """An env of another suite, by two functions: gymnax's, or what has their shape."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -165,6 +166,8 @@ def _function(env: Any, name: str) -> Callable[..., Any]:
             "step(key, state, action, params) -> (obs, state, reward, done, info); give another "
             "suite's env these two"
         )
+    if isinstance(env, type) and inspect.isfunction(inspect.getattr_static(env, name, None)):
+        raise TypeError(f"env is the class {env.__name__}, expected an env: pass {env.__name__}()")
     checked: Callable[..., Any] = function
     return checked
 

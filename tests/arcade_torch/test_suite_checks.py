@@ -286,6 +286,17 @@ def test_python_numbers_in_a_state_change_no_type_and_compile_nothing_twice() ->
     assert env._step_fused._cache_size() == 1
 
 
+def test_a_class_in_the_place_of_an_env_is_refused_unless_it_needs_no_self() -> None:
+    with pytest.raises(TypeError, match=r"env is the class Gymnax, expected .*: pass Gymnax\(\)"):
+        made(Gymnax)
+
+    class Static:
+        reset = staticmethod(Count().reset)
+        step = staticmethod(Count().step)
+
+    assert Suite(Static).reset(jax.random.PRNGKey(0))[1] == 0
+
+
 def test_no_limit_of_params_ends_every_step() -> None:
     for none in (None, float("inf")):
         assert Suite(Count(), {"max_steps": none}).max_steps is None
