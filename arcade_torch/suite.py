@@ -1,5 +1,6 @@
 """An env of another suite, by two functions: gymnax's, or what has their shape."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -62,7 +63,7 @@ class Suite:
                 "observation and state"
             )
         obs, state = result
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, state)
+        return jax.tree.map(_array, obs), jax.tree.map(_array, state)
 
     def step(
         self, key: jax.Array, state: Any, action: jax.Array, count: jax.Array
@@ -84,7 +85,7 @@ class Suite:
             )
         terminated, truncated = self._ends([flag.astype(bool) for flag in flags], after, count)
         outcome = Outcome(reward.astype(jnp.float32), terminated, truncated)
-        return jax.tree.map(jnp.asarray, obs), jax.tree.map(jnp.asarray, after), outcome
+        return jax.tree.map(_array, obs), jax.tree.map(_array, after), outcome
 
     def check(self, action: Any) -> None:
         """Refuse an env whose functions do not fit together; nothing is compiled.
@@ -104,7 +105,7 @@ class Suite:
         following, after, _ = traced(name, "step", self.step, key, state, action, count)
         check_same(name, "observation", obs, following)
         for place, leaf in leaves(obs, "observation").items():
-            if is_key(leaf) or leaf.dtype == jnp.bfloat16:
+            if is_key(leaf) or leaf.dtype.kind not in "biuf":  # V: bfloat16, int4, ...; c: complex
                 raise TypeError(
                     f"{name}: reset shows {place} as {leaf.dtype}, which torch does not share: "
                     "give float32, or jax.random.key_data of a key"
@@ -137,6 +138,14 @@ class Suite:
         return jnp.logical_and(flags[0], jnp.logical_not(is_limit)), is_limit
 
 
+def _array(value: Any) -> Any:
+    """An array of a type that does not give way to others, as that of a Python number does: the
+    types that a step gives must not hang on where its state comes from.
+    """
+    array = jnp.asarray(value)
+    return array if is_key(array) else jax.lax.convert_element_type(array, array.dtype)
+
+
 def _function(env: Any, name: str) -> Callable[..., Any]:
     """``reset_env`` or ``step_env``, else ``reset`` or ``step``.
 
@@ -157,6 +166,8 @@ def _function(env: Any, name: str) -> Callable[..., Any]:
             "step(key, state, action, params) -> (obs, state, reward, done, info); give another "
             "suite's env these two"
         )
+    if isinstance(env, type) and inspect.isfunction(inspect.getattr_static(env, name, None)):
+        raise TypeError(f"env is the class {env.__name__}, expected an env: pass {env.__name__}()")
     checked: Callable[..., Any] = function
     return checked
 
@@ -177,8 +188,14 @@ def _limit_of(params: Any) -> int | None:
     entries = params if isinstance(params, Mapping) else None
     for name in _LIMITS:
         limit = getattr(params, name, None) if entries is None else entries.get(name)
-        if limit is not None:
-            return int(limit)
+        if limit is None or limit == float("inf"):
+            continue
+        if limit < 1:
+            raise ValueError(
+                f"params have {name} {limit}, expected a time limit of 1 or more: set it to None "
+                "where there is none, or pass max_steps="
+            )
+        return int(limit)
     return None
 
 

@@ -31,6 +31,7 @@ def action_spec(
         space = space(*suite.extra)
     categories: Any = getattr(space, "n", None)
     if categories is not None and np.ndim(categories) == 0:
+        _check_choice(suite, space, num_envs)
         return Categorical(int(categories), shape=(num_envs,), dtype=torch.int64, device=device)
     if hasattr(space, "low") and hasattr(space, "high") and hasattr(space, "shape"):
         return _box(suite, space, num_envs, device)
@@ -100,6 +101,26 @@ def _check_spec(spec: TensorSpec, num_envs: int) -> None:
             f"action_spec is a Categorical of shape {list(spec.shape)}, expected [{num_envs}]; "
             f"several choices at once are Bounded(0, {spec.space.n - 1}, "
             f"shape={tuple(spec.shape)}, dtype=torch.int64)"
+        )
+
+
+def _check_choice(suite: Suite, space: Any, num_envs: int) -> None:
+    """Refuse a space with ``n`` that is something else than one number from 0 to n - 1, such as
+    Gymnasium's MultiBinary, or its Discrete with a start.
+    """
+    shape = tuple(getattr(space, "shape", None) or ())
+    start = getattr(space, "start", 0)
+    if shape:
+        raise ValueError(
+            f"the actions of {name_of(suite.env)} are {described(space)} of shape {list(shape)}, "
+            "expected one choice: pass action_spec=, for instance "
+            f"torchrl.data.Bounded(0, 1, shape={(num_envs, *shape)}, dtype=torch.int64)"
+        )
+    if start != 0:
+        raise ValueError(
+            f"the actions of {name_of(suite.env)} begin at {start}, expected 0: let step add "
+            f"{start}, and pass action_spec=torchrl.data.Categorical({space.n}, "
+            f"shape=({num_envs},))"
         )
 
 

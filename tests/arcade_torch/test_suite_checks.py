@@ -129,6 +129,20 @@ WRONG = {
         ),
         "Own: reset shows observation as bfloat16, which torch does not share",
     ),
+    "complex numbers to see": (
+        env_with(
+            reset=lambda self, key: (jnp.zeros(2, jnp.complex64), 0),
+            step=giving(lambda s: jnp.zeros(2, jnp.complex64), goes_on, pays, ends),
+        ),
+        "Own: reset shows observation as complex64, which torch does not share: give float32",
+    ),
+    "half a byte to see": (
+        env_with(
+            reset=lambda self, key: (jnp.zeros(2, jnp.int4), 0),
+            step=giving(lambda s: jnp.zeros(2, jnp.int4), goes_on, pays, ends),
+        ),
+        "Own: reset shows observation as int4, which torch does not share: give float32",
+    ),
     "nothing to see": (
         env_with(reset=lambda self, key: ({}, 0), step=giving(lambda s: {}, goes_on, pays, ends)),
         "Own: reset gives an observation without any array",
@@ -229,6 +243,67 @@ def test_random_actions_of_a_space_without_bounds_are_numbers() -> None:
     assert env.rand_action()["action"].isfinite().all()
     with pytest.raises(ValueError, match="actions of Own have an infinite bound"):
         from_jax(env_with(action_space=Box(0, np.inf, (3,))), num_envs=N)
+
+
+Space = namedtuple("Space", "n shape start", defaults=[(), 0])
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        (Space(4, (4,)), r"are a Space of 3 of shape \[4\], expected one choice: .*Bounded\(0, 1,"),
+        (Space(3, start=1), r"begin at 1, expected 0: let step add 1, .*Categorical\(3, shape=\("),
+    ],
+)
+def test_a_space_with_n_that_is_another_choice_is_refused(space: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"the actions of Own {message}"):
+        from_jax(env_with(action_space=space), num_envs=N)
+    assert from_jax(env_with(action_space=Space(3)), num_envs=N).action_spec.space.n == 3
+
+
+def test_python_numbers_in_a_state_change_no_type_and_compile_nothing_twice() -> None:
+    half = jnp.ones(2, jnp.float16)
+
+    def begin(self: Any, key: Any) -> Any:
+        return half, 0.0
+
+    def step(self: Any, key: Any, state: Any, action: Any) -> Any:
+        return half * state, state + jnp.float32(1), 1.0, state >= 2, {}
+
+    # beside a Python number half stays half, beside the float32 of the next step it does not
+    with pytest.raises(
+        ValueError, match=r"step gives observation as float32 \[2\], wanted float16"
+    ):
+        made(env_with(reset=begin, step=step))
+
+    def narrow(self: Any, key: Any, state: Any, action: Any) -> Any:
+        obs, *rest = step(self, key, state, action)
+        return obs.astype(half.dtype), *rest
+
+    env = made(env_with(reset=begin, step=narrow))
+    seen = env.rollout(5, break_when_any_done=False)["next", "observation"]
+    assert seen.dtype is torch.float16 and seen[0, :, 0].tolist() == [0, 1, 2, 0, 1]
+    assert env._step_fused._cache_size() == 1
+
+
+def test_a_class_in_the_place_of_an_env_is_refused_unless_it_needs_no_self() -> None:
+    with pytest.raises(TypeError, match=r"env is the class Gymnax, expected .*: pass Gymnax\(\)"):
+        made(Gymnax)
+
+    class Static:
+        reset = staticmethod(Count().reset)
+        step = staticmethod(Count().step)
+
+    assert Suite(Static).reset(jax.random.PRNGKey(0))[1] == 0
+
+
+def test_no_limit_of_params_ends_every_step() -> None:
+    for none in (None, float("inf")):
+        assert Suite(Count(), {"max_steps": none}).max_steps is None
+    for limit in (-1, 0):
+        with pytest.raises(ValueError, match=f"params have max_steps {limit}, expected a time"):
+            Suite(Count(), {"max_steps": limit})
+        assert Suite(Count(), {"max_steps": limit}, max_steps=7).max_steps == 7
 
 
 class Gymnax(Count):
