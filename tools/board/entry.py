@@ -17,6 +17,7 @@ from arcade_torch.agents.checked import Checked, Options, PositiveOrZero, Range,
 from arcade_torch.agents.config import GROUPS, Seed, TrainConfig
 from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import read_bytes, write_json
+from arcade_torch.envs_jax.registry import is_built_in, probe_ids, registered_ids
 from arcade_torch.tools.board.protocol import OBSERVATIONS, PROTOCOL, TWINS, Protocol
 
 MOST_BYTES = 4 * 2**20
@@ -256,8 +257,8 @@ def check_protocol(entry: Entry, protocol: Protocol = PROTOCOL) -> None:
 
     Raises:
         EntryRefusedError: another protocol, other evaluation seeds or episodes, other rules or
-            sizes of the picture, a privileged observation, a run twice, a missing cell; in one line
-            that names it.
+            sizes of the picture, a privileged observation, a run twice, a missing cell, a game that
+            is none of this package; in one line that names it.
     """
     _check_equal("protocol", entry.protocol, protocol.version)
     _check_equal("evaluation.episodes", entry.evaluation.get("episodes"), protocol.episodes)
@@ -267,6 +268,7 @@ def check_protocol(entry: Entry, protocol: Protocol = PROTOCOL) -> None:
     for phase in ("training", "acting"):
         check_observations(phase, entry.observations.get(phase))
     _check_grid(entry.runs)
+    _check_games(entry.runs)
     for run in entry.runs:
         entry.config(run)
 
@@ -310,6 +312,17 @@ def _check_grid(runs: Iterable[BoardRun]) -> None:
                         f"missing cell: {game} {twin}, seed {seed}; an entry has every seed of "
                         "every game on both twins"
                     )
+
+
+def _check_games(runs: Iterable[BoardRun]) -> None:
+    """Refuse games that are none of this package: nobody else could check their scores."""
+    games = {id for id in registered_ids() + probe_ids() if is_built_in(id)}
+    for run in runs:
+        if run.game not in games:
+            raise EntryRefusedError(
+                f"the game {run.game} is none of this package, and the board compares agents on "
+                "its games alone: arcade-torch report or figure gap-bias show games of yours"
+            )
 
 
 def write_entry(path: Path, entry: Entry) -> Path:

@@ -126,6 +126,11 @@ def repeat_cell(plain: Plain) -> None:
     plain["runs"].append(plain["runs"][0])
 
 
+def set_game(plain: Plain) -> None:
+    for run in plain["runs"]:
+        run["game"] = "PairsEasy-v0"
+
+
 def set_protocol(plain: Plain) -> None:
     plain["protocol"] = 2
 
@@ -177,6 +182,7 @@ FALSIFIED: dict[Callable[[Plain], None], str] = {
     set_checkpoint: f"checkpoint of {GAME} partial, seed 2: the weights below",
     remove_cell: f"missing cell: {GAME} partial, seed 1",
     repeat_cell: f"two runs of one cell: {GAME} full, seed 1",
+    set_game: "the game PairsEasy-v0 is none of this package, and the board compares agents on",
     set_protocol: "protocol is 2; the protocol of this version demands 1",
     show_the_state: "privileged observation in training: 'state'",
     hide_the_observations: "observations.training does not say what the agent reads",
