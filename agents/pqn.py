@@ -192,7 +192,10 @@ class PQNLoss(LossModule):
         if q.ndim != 3:
             name = f"{self.tensor_keys.action_value!r} of the network"
             require(False, name, list(q.shape), "[B, T, A], one number an action")
-        chosen = _chosen_values(q, data["position"][:, :steps], data["action"][:, :steps])
+        action = _indices(data["action"][:, :steps], q.shape[-1])
+        if not prepared:  # rows of a window that a learner has prepared wait for nothing
+            _check_range(action, q.shape[-1])
+        chosen = _chosen_values(q, data["position"][:, :steps], action)
         target = self.targets(data, q.detach(), steps)
 
         rows = tensordict
@@ -266,27 +269,37 @@ class PQNLoss(LossModule):
         return value.gather(1, following)
 
 
+def _indices(action: Tensor, num_actions: int) -> Tensor:
+    """Actions as int64 [B, S].
+
+    Args:
+        action: categorical [B, S] or [B, S, 1], or one-hot [B, S, A].
+        num_actions: A.
+    """
+    if action.ndim == 3 and action.shape[-1] == num_actions:
+        action = action.int().argmax(-1)
+    return action.reshape(action.shape[:2]).long()
+
+
 def _chosen_values(q: Tensor, position: Tensor, action: Tensor) -> Tensor:
     """The Q-values of the actions that were taken, float [B, S].
 
     Args:
         q: float [B, L + K, A].
         position: int64 [B, S], where the observation of each step stands.
-        action: categorical [B, S] or [B, S, 1], or one-hot [B, S, A].
+        action: int64 [B, S].
     """
-    num_actions = q.shape[-1]
-    if action.ndim == 3 and action.shape[-1] == num_actions:
-        action = action.int().argmax(-1)
-    action = action.reshape(position.shape).long()
-    if action.device.type == "cpu" and not torch.compiler.is_compiling():
-        _check_range(action, num_actions)
     # in two steps: an action that there is not would be one of the next observation
-    of_steps = q.gather(1, position.unsqueeze(-1).expand(-1, -1, num_actions))
+    of_steps = q.gather(1, position.unsqueeze(-1).expand(-1, -1, q.shape[-1]))
     return of_steps.gather(2, action.unsqueeze(-1)).squeeze(-1)
 
 
 def _check_range(action: Tensor, num_actions: int) -> None:
-    """Refuse actions that the network has no value for (ValueError)."""
+    """Refuse actions that the network has no value for (ValueError); on a GPU, whose work a look
+    would wait for, nothing is refused.
+    """
+    if action.device.type != "cpu" or torch.compiler.is_compiling():
+        return
     try:
         lowest, highest = (int(x) for x in action.aminmax())
     except RuntimeError:  # inside of vmap they have no values to read

@@ -17,6 +17,7 @@ from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, study_preset
 from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
+from arcade_torch.tools.studies.shards import part_of
 from arcade_torch.tools.text import say
 
 
@@ -200,9 +201,11 @@ class Report(Command):
 
     def run(self) -> int:
         """Write the page, or measure a share of what it shows."""
-        StudyFolder(self.study).load()  # refuses what is none before anything heavy is imported
         least = "at least 1, or 0 for one a core"
         require(self.workers >= 0, "workers", self.workers, least)
+        if self.shard:
+            part_of(self.shard)
+        StudyFolder(self.study).load()  # refuses what is none before anything heavy is imported
         if self.shard:
             from arcade_torch.tools.reports import report_shard
 
