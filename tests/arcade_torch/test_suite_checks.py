@@ -60,6 +60,15 @@ def ends(state: Any) -> Any:
     return state >= 3
 
 
+def env_that_shows(obs: Any) -> Any:
+    """One whose observation is always this."""
+
+    def reset(self: Any, key: Any) -> Any:
+        return obs, 0
+
+    return env_with(reset=reset, step=giving(lambda state: obs, goes_on, pays, ends))
+
+
 class Keeps(Count):
     """Counts in Python, which JAX does once."""
 
@@ -123,28 +132,19 @@ WRONG = {
         "key",
     ),
     "bfloat16 to see": (
-        env_with(
-            reset=lambda self, key: (jnp.zeros(2, jnp.bfloat16), 0),
-            step=giving(lambda s: jnp.zeros(2, jnp.bfloat16), goes_on, pays, ends),
-        ),
+        env_that_shows(jnp.zeros(2, jnp.bfloat16)),
         "Own: reset shows observation as bfloat16, which torch does not share",
     ),
     "complex numbers to see": (
-        env_with(
-            reset=lambda self, key: (jnp.zeros(2, jnp.complex64), 0),
-            step=giving(lambda s: jnp.zeros(2, jnp.complex64), goes_on, pays, ends),
-        ),
+        env_that_shows(jnp.zeros(2, jnp.complex64)),
         "Own: reset shows observation as complex64, which torch does not share: give float32",
     ),
     "half a byte to see": (
-        env_with(
-            reset=lambda self, key: (jnp.zeros(2, jnp.int4), 0),
-            step=giving(lambda s: jnp.zeros(2, jnp.int4), goes_on, pays, ends),
-        ),
+        env_that_shows(jnp.zeros(2, jnp.int4)),
         "Own: reset shows observation as int4, which torch does not share: give float32",
     ),
     "nothing to see": (
-        env_with(reset=lambda self, key: ({}, 0), step=giving(lambda s: {}, goes_on, pays, ends)),
+        env_that_shows({}),
         "Own: reset gives an observation without any array",
     ),
 }
