@@ -262,8 +262,7 @@ def _no_leak(s: Subject, law: str) -> float:
         raise MemoryLawError(
             law, "no gradient comes from y to x", "torch.no_grad, a detach or .data in forward"
         )
-    after = y[:, 4:].sum()
-    grads = torch.autograd.grad(after, [x, *carried], allow_unused=True, materialize_grads=True)
+    grads = _gradients_of(law, y[:, 4:].sum(), [x, *carried])
     earlier = [grads[0][:, :4], *grads[1:]]
     worst = s.compare(
         law,
@@ -346,6 +345,19 @@ def _averages(s: Subject, law: str) -> float:
     )
 
 
+def _gradients_of(law: str, number: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
+    """The gradient of a number, zeros where an input has no part in it."""
+    try:
+        return torch.autograd.grad(number, inputs, allow_unused=True, materialize_grads=True)
+    except RuntimeError as error:
+        raise MemoryLawError(
+            law,
+            f"torch cannot compute the gradient ({' '.join(str(error).split())})",
+            "an in-place write (h.mul_(), h[:] = ..., copy_()) into a tensor that the gradient of "
+            "an earlier step reads: make a new one at every step, or write to a clone()",
+        ) from error
+
+
 def _gradients(s: Subject, law: str) -> float:
     x, state, flags = s.inputs(2, 5)
     flags[0, 2] = True
@@ -386,8 +398,7 @@ def _gradients_of_steps(s: Subject, law: str) -> float:
     for read in (s.module, lambda *inputs: _steps(s, *inputs)):
         given = x.clone().requires_grad_()
         y, _ = read(given, state, flags)
-        arguments = [given, *parameters]
-        gradients.append(torch.autograd.grad((weight * y).sum(), arguments, materialize_grads=True))
+        gradients.append(_gradients_of(law, (weight * y).sum(), [given, *parameters]))
     pairs = zip(*gradients, strict=True)
     symptom = "the gradients of one call and of a call a step differ"
     return s.compare(

@@ -262,6 +262,19 @@ def refusal(model: type[Cell]) -> MemoryLawError:
     return caught.value
 
 
+class RollsItsStateInPlace(Cell):
+    """Writes into what an earlier step's gradient reads, in a copy of the state it was given."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        h = state["h"].clone()
+        outputs = []
+        for t, inputs in enumerate(self.read(x).unbind(1)):
+            h.masked_fill_(is_init[:, t, None], 0)
+            h.mul_(0.9).add_(inputs)
+            outputs.append(torch.tanh(h * h))
+        return torch.stack(outputs, 1), self.state_of(h)
+
+
 def test_the_model_without_a_mistake_passes() -> None:
     assert max(check_memory(Cell()).values()) < 1e-12
 
@@ -308,6 +321,7 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
             "weights are registered",
             "keeps the parameters elsewhere, StopIteration.",
         ),
+        (RollsItsStateInPlace, "nothing leaks over a start", "an in-place write"),
         (TakesTheFirst, "weights are registered", "elsewhere, IndexError list index out of range"),
     ],
 )
