@@ -8,6 +8,8 @@ before which everything is forgotten.
 * :func:`make_memory`, :func:`memory_names`, :func:`register_memory`: models by name (``lru mingru
   gru mlp linear_transformer attention gdn ttt lstm frame_stack s5 mamba slstm mlstm gtrxl ffm shm
   rtu deltaproduct rwkv7 bmru``).
+* :class:`RecurrentMemory`: a recurrent module of any library, such as ``torch.nn.LSTM``, as such a
+  model.
 * :func:`check_memory`: check that a module, ours or yours, is a correct memory model;
   :class:`MemoryLawError` says what is wrong with it, :func:`law_results` checks on behind it.
 * :class:`MemoryModule`: any of them behind TorchRL's recurrent contract, in place of
@@ -39,6 +41,7 @@ from arcade_torch.models.memory import Memory, MemoryContract, ReplayableMemory
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryBlock, MemoryNetwork
 from arcade_torch.models.presets import make_network
+from arcade_torch.models.recurrent_memory import RecurrentMemory
 from arcade_torch.models.registry import make_memory, memory_names, register_memory
 from arcade_torch.models.scan import linear_scan
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_loop
@@ -55,6 +58,7 @@ __all__ = [
     "MemoryModule",
     "MemoryNetwork",
     "PaperEncoder",
+    "RecurrentMemory",
     "ReplayableMemory",
     "SmallEncoder",
     "check_memory",

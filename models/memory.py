@@ -249,7 +249,8 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
     if not hasattr(memory, "initial_state"):
         raise TypeError(
             f"{name} has no initial_state(batch_size), which gives a TensorDict: see "
-            "docs/guides/memory.md, and examples/own_memory.py for torch.nn.LSTM"
+            "docs/guides/memory.md; RecurrentMemory makes a memory of a module that is called as "
+            "y, state = module(x, state), examples/own_memory.py writes one out"
         )
     state = memory.initial_state(batch_size)  # type: ignore[operator]
     if not isinstance(state, TensorDictBase):
