@@ -90,7 +90,7 @@ $(SUITES)/.installed: setup.cfg pyproject.toml
 
 test-suites: $(SUITES)/.installed
 	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(SUITES)/jax-cache SUITES_ARE_THERE=1 \
-	  $(SUITES)/bin/python -m pytest tests/contracts/test_jax_suites.py -k "not popgym" $(ARGS)
+	  $(SUITES)/bin/python -m pytest --timeout=3600 tests/contracts/test_jax_suites.py -k "not popgym" $(ARGS)
 
 $(VENV)/.parity: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[parity]'
