@@ -340,7 +340,7 @@ class JaxEnv(BaseEnv):
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         wait_for_torch(self.device, self._jax_device)
-        ends = self._ends
+        ends = None if rows.all() else self._ends
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
         self._go_on(self._reset_rows(self._live, rows), ends)
@@ -367,9 +367,11 @@ class JaxEnv(BaseEnv):
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
         self._assert_tensordict_shape(tensordict)
-        is_plain = "_step" in tensordict or self._post_step_mdp_hooks is not None
-        if is_plain or self._waits_for_reset():
+        is_partial = "_step" in tensordict
+        if is_partial or self._post_step_mdp_hooks is not None or self._waits_for_reset():
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
+            if not is_partial:
+                self.__dict__["_ends"] = None  # whatever had ended has begun anew
             return stock
         action = validation.tensor(tensordict, "action")
         live, after, outcome = self._step_fused(self._live, self._argument(action))

@@ -124,3 +124,4 @@ def test_a_jax_env_at_its_end_waits_while_others_go_on_and_then_begins_anew():
     step, root = env.step_and_maybe_reset(root.set("action", action))
     assert step["next", "done"].all() and (step["next", "step_count"] == 5).all()
     assert not root["done"].any() and not root["step_count"].any()
+    assert not env.get_extra_state()["ends"].any()
