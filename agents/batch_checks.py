@@ -151,8 +151,8 @@ def check_order(batch: TensorDictBase, cut: Tensor, mask: Tensor | None, has_mem
         if has_memory and not bool((begins | same).all()):
             raise ValueError(
                 "is_init must be true where an episode begins; got false behind an end, where "
-                f"{name} jumps: InitTracker() goes behind transforms that step in a reset "
-                "(NoopResetEnv)"
+                f"{name} jumps: put InitTracker() behind NoopResetEnv, and leave "
+                "break_when_all_done out of rollout, which repeats last steps"
             )
 
 
