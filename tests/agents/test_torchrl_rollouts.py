@@ -23,6 +23,7 @@ def rolled_out(*transforms, num_envs=1, **options):
     return network, policy, primed.rollout(80, policy, break_when_any_done=False, **options)
 
 
+@pytest.mark.filterwarnings("error:Converting a tensor")
 def test_steps_in_a_reset_need_an_init_tracker_behind_them():
     network, _, batch = rolled_out(NoopResetEnv(5, random=False))
     assert batch["next", "done"].any()
