@@ -117,15 +117,24 @@ def check_state_keys(network: TensorDictModuleBase) -> None:
                 )
 
 
-def check_order(batch: TensorDictBase, cut: Tensor) -> None:
-    """Refuse a stock batch of shuffled steps (ValueError).
+def check_order(batch: TensorDictBase, cut: Tensor, mask: Tensor | None, has_memory: bool) -> None:
+    """Refuse a stock batch of shuffled steps, or one in which a memory would read on from one
+    episode into the next (ValueError).
 
     Args:
         batch: [N] with entries [N, L, ...].
-        cut: bool [N, L], steps behind which an episode or its record ends, and padding.
+        cut: bool [N, L], steps behind which an episode or its record ends.
+        mask: bool [N, L], steps that are no padding.
+        has_memory: whether the networks have one.
     """
     if "final_index" in batch:
         return
+    ends = cut[:, :-1]
+    begins = flat(batch, "is_init")[:, 1:]
+    if mask is not None:
+        padding = ~mask
+        ends = ends | padding[:, :-1]
+        begins = begins | padding[:, :-1] | padding[:, 1:]
     follows = {}
     if "step_count" in batch and ("next", "step_count") in batch:
         after = flat(batch, ("next", "step_count"))
@@ -135,9 +144,15 @@ def check_order(batch: TensorDictBase, cut: Tensor) -> None:
         numbers = flat(batch, trajectory)
         follows["('collector', 'traj_ids')"] = numbers[:, :-1] == numbers[:, 1:]
     for name, same in follows.items():
-        if not bool((cut[:, :-1] | same).all()):
+        if not bool((ends | same).all()):
             raise ValueError(
                 f"{name} must be that of whole sequences, never shuffled; got a jump within a row"
+            )
+        if has_memory and not bool((begins | same).all()):
+            raise ValueError(
+                "is_init must be true where an episode begins; got false behind an end, where "
+                f"{name} jumps: put InitTracker() behind NoopResetEnv, and leave "
+                "break_when_all_done out of rollout, which repeats last steps"
             )
 
 

@@ -94,7 +94,7 @@ def insert_final_observations(
     batch = _as_sequences(_rename(batch, names), inputs, burn_in)
     mask = step_mask(batch, flat(batch, "is_init").shape)
     terminated, cut = _ends(batch, mask, time_limit)
-    check_order(batch, cut if mask is None else cut | ~mask)
+    check_order(batch, cut, mask, has_memory=bool(inputs.state_keys))
 
     # The true next observation is needed where the record stops but the task goes on.
     final_steps, used = _final_places(batch, needed=cut & ~terminated)

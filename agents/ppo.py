@@ -1,12 +1,11 @@
 """PPO with a memory in actor and critic, or in neither."""
 
-import copy
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams, unravel_key
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
@@ -16,7 +15,7 @@ from tensordict.nn import (
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.modules import PopArtValueNorm
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
 from arcade_torch.agents.acting import make_actor
@@ -32,6 +31,7 @@ from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, as_steps, written
 from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.network_loss import NetworkLoss
 from arcade_torch.agents.returns import SequenceGAE
 
 
@@ -99,7 +99,7 @@ def normalize(advantage: Tensor, mask: Tensor | None = None) -> Tensor:
     return centred / ((centred.square().sum() / count).sqrt() + 1e-8)
 
 
-class PPOLoss(LossModule):
+class PPOLoss(NetworkLoss):
     """:func:`ppo_objective` and an entropy bonus over whole sequences of a recurrent actor and
     critic.
 
@@ -154,7 +154,7 @@ class PPOLoss(LossModule):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.GAE
-    functional = True  # see the argument
+    network_names = ("actor_network", "critic_network")
 
     actor_network: ProbabilisticTensorDictSequential
     critic_network: TensorDictModuleBase | None
@@ -363,21 +363,6 @@ class PPOLoss(LossModule):
         if not self.normalize_advantage:
             return advantage
         return normalize(advantage, None if mask is None else mask.unsqueeze(-1))
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "PPOLoss":
-        """A copy whose networks hold its own parameters, as those of this loss do.
-
-        TensorDicts copy themselves by ``clone``, which takes no part in this: the estimator of a
-        copy would read a critic that nobody trains.
-        """
-        for params in self.children():
-            if isinstance(params, TensorDictParams):
-                leaves = params._param_td.apply(lambda leaf: copy.deepcopy(leaf, memo))
-                memo[id(params)] = TensorDictParams(leaves, no_convert=True)
-        copied = type(self).__new__(type(self))
-        memo[id(self)] = copied
-        copied.__dict__.update(copy.deepcopy(self.__dict__, memo))
-        return copied
 
 
 def _fitting(action: Tensor, policy: Distribution) -> Tensor:

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
@@ -26,10 +26,11 @@ from arcade_torch.agents.layout import (
     unroll,
 )
 from arcade_torch.agents.learner import Learner, Training
+from arcade_torch.agents.network_loss import NetworkLoss
 from arcade_torch.agents.returns import QLambdaEstimator
 
 
-class PQNLoss(LossModule):
+class PQNLoss(NetworkLoss):
     """Half the squared distance of Q(s, a) to its Q(lambda) return, whose values come from the very
     same pass.
 
@@ -80,7 +81,7 @@ class PQNLoss(LossModule):
     default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TDLambda
     out_keys = ["loss", "q_mean", "target_mean", "td_error"]  # noqa: RUF012 (TorchRL's convention)
-    functional = True  # see the argument
+    network_names = ("value_network",)
 
     value_network: TensorDictModuleBase
     value_network_params: TensorDictParams
@@ -146,7 +147,7 @@ class PQNLoss(LossModule):
             self._value_estimator = QLambdaEstimator(**hyperparams)
             self._forward_value_estimator_keys()
         elif isinstance(value_type, ValueEstimatorBase):
-            LossModule.make_value_estimator(self, value_type, **hyperparams)
+            super().make_value_estimator(value_type, **hyperparams)
         else:
             supported = (ValueEstimators.TD0, ValueEstimators.TD1, ValueEstimators.TDLambda)
             dispatch_value_estimator(self, value_type, supported=supported, **hyperparams)

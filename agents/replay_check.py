@@ -85,7 +85,7 @@ def _compared(policy: TensorDictModuleBase, outputs: list[Key], key: Key | None)
 
 def _largest_difference(replayed: Tensor, acted: Tensor, steps: TensorDictBase) -> float:
     """The largest absolute difference; equal infinities do not differ."""
-    difference = (replayed - acted).abs()
+    difference = (replayed - acted).detach().abs()  # a rollout may have been made with gradients
     difference = difference.masked_fill(replayed == acted, 0.0)
     for key in MASKS:
         mask = steps.get(key, None)

@@ -57,7 +57,8 @@ class JaxEnv(BaseEnv):
     random keys of its own, so that it walks the same path whatever N is. ``step_and_maybe_reset``,
     which ``rollout`` and TorchRL's ``Collector`` use, is one compiled call, and gives the bits of
     ``step`` and ``reset``. Envs that an entry ``_step`` (bool [N]) leaves out stay where they are:
-    their ``"next"`` repeats the root, with the reward 0.
+    their ``"next"`` repeats the root, with the reward 0. One that has ended stays at its end until
+    it is reset: a step gives its flags again, and the reward 0.
     """
 
     batch_locked = True
@@ -235,6 +236,21 @@ class JaxEnv(BaseEnv):
             return self._ends.clone()
         return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
 
+    def _waits_for_reset(self) -> bool:
+        """Whether an episode may have ended that was not reset; on a GPU nobody waits to see."""
+        return self._ends is not None and (not is_host(self.device) or bool(self._ends.any()))
+
+    def _stay_at_ends(self, after: Episodes, outcome: Outcome) -> tuple[Episodes, Outcome]:
+        """Take a step back where an episode had ended before it: there the flags are those of the
+        end, and the reward is 0.
+        """
+        ends = self._ended()
+        ended = jax.device_put(ends.any(1).cpu().numpy(), self._jax_device)
+        terminated, truncated = jax.device_put(ends.T.cpu().numpy(), self._jax_device)
+        at_end = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated)
+        stays: tuple[Episodes, Outcome] = choose_rows(ended, (self._live, at_end), (after, outcome))
+        return stays
+
     def _flag(self) -> Categorical:
         return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
 
@@ -324,7 +340,7 @@ class JaxEnv(BaseEnv):
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
         wait_for_torch(self.device, self._jax_device)
-        ends = self._ends
+        ends = None if rows.all() else self._ends
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
         self._go_on(self._reset_rows(self._live, rows), ends)
@@ -333,6 +349,8 @@ class JaxEnv(BaseEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
         after, outcome = self._step_alone(self._live, self._argument(action))
+        if self._waits_for_reset():
+            after, outcome = self._stay_at_ends(after, outcome)
         following: TensorDictBase = self._next(after, outcome, action)
         ends = torch.cat([following["terminated"], following["truncated"]], dim=1)
         if "_step" in tensordict:
@@ -349,8 +367,11 @@ class JaxEnv(BaseEnv):
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
         self._assert_tensordict_shape(tensordict)
-        if "_step" in tensordict or self._post_step_mdp_hooks is not None:
+        is_partial = "_step" in tensordict
+        if is_partial or self._post_step_mdp_hooks is not None or self._waits_for_reset():
             stock: tuple[TensorDictBase, TensorDictBase] = super()._step_and_maybe_reset(tensordict)
+            if not is_partial:
+                self.__dict__["_ends"] = None  # whatever had ended has begun anew
             return stock
         action = validation.tensor(tensordict, "action")
         live, after, outcome = self._step_fused(self._live, self._argument(action))

@@ -159,6 +159,36 @@ def test_steps_of_two_envs_that_count_on_are_refused():
             read(batch.clone())
 
 
+@pytest.mark.parametrize("counted", ["step_count", "traj_ids"])
+def test_an_episode_that_begins_unmarked_is_refused_where_a_memory_would_read_on(counted):
+    """``NoopResetEnv`` steps in a reset: the first observation of an episode is none of the env's
+    own starts.
+    """
+    batch = numbered(stream(3, 8, 0))
+    if counted == "step_count":
+        del batch["collector"]
+    else:
+        del batch["step_count"]
+    make_loss(toy_network(0))(batch.clone())
+    starts = batch["is_init"].squeeze(-1).clone()
+    starts[:, 0] = False
+    row, step = (int(x) for x in starts.nonzero()[0])
+    assert batch["next", "done"][row, step - 1]
+    batch["is_init"][row, step] = False
+    with pytest.raises(ValueError, match=r"is_init must be true .* InitTracker"):
+        make_loss(toy_network(0))(batch.clone())
+    with pytest.raises(ValueError, match="is_init must be true"):
+        SequenceGAE(toy_actor_critic(0).critic)(batch.clone())
+
+
+def test_an_end_that_is_none_of_the_env_needs_no_start():
+    """The end of a life: values end, while the episode and the memory go on."""
+    batch = numbered(stream(3, 8, 0, ends=0.0))
+    batch["next", "terminated"][:, 3] = True
+    batch["next", "done"][:, 3] = True
+    make_loss(toy_network(0))(batch)
+
+
 def test_slices_that_begin_within_episodes_are_refused_where_their_states_would_be_dropped():
     batch = numbered(stream(4, 12, seed=3, ends=0.1))
     torch.manual_seed(0)

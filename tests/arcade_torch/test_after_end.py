@@ -1,9 +1,13 @@
-"""An ``ArcadeEnv`` that is stepped on after an end, without a reset, stays at that end."""
+"""An env that is stepped on after an end, without a reset, stays at that end."""
 
+import jax.numpy as jnp
 import pytest
 import torch
+from torchrl.data import Categorical
+from torchrl.envs import FrameSkipTransform, TransformedEnv
 
 import arcade_torch
+from arcade_torch import from_jax
 from arcade_torch.env import ArcadeEnv
 
 from .stub import StubGame
@@ -77,3 +81,47 @@ def test_a_snapshot_knows_what_has_ended_and_one_from_before_is_loaded():
     root = env.set_state(older)
     root["action"] = torch.ones(ENVS, dtype=torch.int64)
     assert (env.step(root)["next", "step_count"] == 4).all()
+
+
+class Passing:
+    """A JAX env of somebody else that says ``done`` at its fifth step, and at no other."""
+
+    def reset(self, key):
+        return jnp.zeros(1), jnp.int32(0)
+
+    def step(self, key, state, action):
+        return jnp.ones(1) * (state + 1), state + 1, jnp.float32(1.0), state == 4, {}
+
+
+@pytest.mark.parametrize("skip", [2, 3])
+def test_a_frame_skip_over_an_end_of_a_jax_env_ends_the_episode(skip):
+    env = from_jax(Passing(), num_envs=2, action_spec=Categorical(2, shape=(2,)))
+    skipping = TransformedEnv(env, FrameSkipTransform(skip))
+    data = skipping.rollout(6, break_when_any_done=False)
+    steps = -(-5 // skip)  # of an episode
+    ends = torch.arange(6) % steps == steps - 1
+    assert torch.equal(data["next", "done"][0].squeeze(-1), ends)
+    assert (data["next", "observation"][:, ends] == 5).all()
+    assert (data["next", "step_count"][:, ends] == 5).all()
+    assert (data["next", "reward"][:, :steps].sum(1) == 5).all()
+    assert (data["next", "episode_reward"][:, ends] == 5).all()
+    assert torch.equal(data["is_init"][0, 1:].squeeze(-1), ends[:-1])
+
+
+def test_a_jax_env_at_its_end_waits_while_others_go_on_and_then_begins_anew():
+    env = from_jax(Passing(), num_envs=2, action_spec=Categorical(2, shape=(2,)))
+    action = torch.zeros(2, dtype=torch.int64)
+    root = env.reset()
+    for _ in range(2):
+        root = env.step(root.set("action", action))["next"].exclude("reward").clone()
+    root = env.reset(root.set("_reset", torch.tensor([[False], [True]])))
+    for _ in range(4):
+        following = env.step(root.exclude("_reset").set("action", action))["next"]
+        root = following.exclude("reward").clone()
+    assert root["done"].flatten().tolist() == [True, False]
+    assert root["step_count"].flatten().tolist() == [5, 4]
+    assert following["reward"].flatten().tolist() == [0, 1]
+    step, root = env.step_and_maybe_reset(root.set("action", action))
+    assert step["next", "done"].all() and (step["next", "step_count"] == 5).all()
+    assert not root["done"].any() and not root["step_count"].any()
+    assert not env.get_extra_state()["ends"].any()
