@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.settings import fixed, raw_key
+from arcade_torch.envs_jax.settings import fixed, may_be_nan, raw_key
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
@@ -158,7 +158,7 @@ def _wrap_facts(facts: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(self: Any, state: Any) -> Any:
         return facts(self, state)
 
-    return fixed(wrapped)
+    return may_be_nan(fixed(wrapped))
 
 
 _WRAPPERS = {
