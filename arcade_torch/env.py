@@ -411,7 +411,10 @@ class ArcadeEnv(BaseEnv):
             return self._batched.with_ends(batch, *ended)
 
     def _integers(self, action: torch.Tensor) -> torch.Tensor:
-        """The actions as integers [N]; raises if they are not what the spec says."""
+        """The actions as integers [N]; raises if they are not what the spec says, or in a process
+        that cannot step.
+        """
+        check_process()
         num_actions = self.game.num_actions
         if self.one_hot:
             validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
@@ -425,6 +428,7 @@ class ArcadeEnv(BaseEnv):
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
     ) -> TensorDictBase:
+        check_process()
         if set_state and tensordict is not None and "state" in tensordict:
             return self.set_state(tensordict["state"])
         if not self._begun:

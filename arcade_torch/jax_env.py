@@ -336,6 +336,7 @@ class JaxEnv(BaseEnv):
         return Episodes(key, reset_key, state, obs, action, counts, counts.astype(jnp.float32))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
+        check_process()
         rows = np.ones(self.num_envs, np.bool_)
         if tensordict is not None and "_reset" in tensordict:
             rows = validation.mask(tensordict, "_reset", self.num_envs).cpu().numpy()
@@ -387,7 +388,8 @@ class JaxEnv(BaseEnv):
         validation.check_tensordict(tensordict, self.num_envs)
 
     def _argument(self, action: torch.Tensor) -> np.ndarray | jax.Array:
-        """A private copy of the actions for a compiled function, checked."""
+        """A private copy of the actions for a compiled function, checked; the process too."""
+        check_process()
         suite_actions.check_action(action, self.action_spec, self._check_actions)
         dtype = torch.int32 if self._action_dtype == np.int32 else torch.float32
         if is_host(self._jax_device):

@@ -13,8 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.checks import check_foreign
-from arcade_torch.envs_jax.game import ENDS, UNSET, Array, Game, as_actions, keeps_ends
-from arcade_torch.envs_jax.settings import compiled, fixed, is_key, raw_key
+from arcade_torch.envs_jax.game import (
+    ENDS,
+    UNSET,
+    Array,
+    Game,
+    as_actions,
+    keeps_ends,
+    laid_out_as,
+)
+from arcade_torch.envs_jax.settings import compiled, fixed, is_key, may_be_nan, raw_key
 from arcade_torch.envs_jax.validation import format_value, plain
 
 State = TypeVar("State")
@@ -117,7 +125,7 @@ class BatchedGame(Generic[State]):
         self.init = compiled(self._init)
         self.step = compiled(self._step)
         self.render = compiled(self._render)
-        self.facts = compiled(self._facts)
+        self.facts = may_be_nan(compiled(self._facts))
         self.reset_where = compiled(self._reset_where)
         self.reset_render = compiled(self._reset_render)
         self.step_autoreset = compiled(self._step_autoreset)
@@ -129,9 +137,10 @@ class BatchedGame(Generic[State]):
         key, first = _split(raw_key(keys, ndim=2))
         state = jax.vmap(self.game.reset)(first)
         zeros = jnp.zeros(keys.shape[0], jnp.int32)
-        return with_flags(
-            Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
-        )
+        batch = Batch(key, state, jnp.asarray(partial), zeros, zeros, zeros.astype(jnp.float32))
+        batch = with_flags(batch)
+        laid_out: Batch = laid_out_as(key[:, 0], batch)
+        return laid_out
 
     def blank(self, keys: Array, partial: Array) -> Batch:
         """N envs in which nothing has begun: zeros in the shapes of ``init``, without flags of an

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 
-from arcade_torch.envs_jax.settings import fixed, raw_key
+from arcade_torch.envs_jax.settings import fixed, may_be_nan, raw_key
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
@@ -76,13 +76,32 @@ def _apart(state: Any) -> Any:
     return jax.tree.map(alone, state)
 
 
+def laid_out_as(guide: Array, tree: Any) -> Any:
+    """The tree, of which every leaf may differ from device to device if ``guide`` may, a constant
+    too.
+
+    Under ``shard_map`` JAX keeps that in the type of an array, and a loop over states needs equal
+    types. Elsewhere the tree is as it was.
+
+    Args:
+        guide: [], or [N] for leaves [N, ...].
+        tree: Arrays.
+    """
+    if not jax.sharding.get_abstract_mesh().manual_axes:
+        return tree
+    never = guide != guide  # which compilers know
+    return stay(never, tree, tree)
+
+
 def _wrap_reset(reset: Callable[..., Any]) -> Callable[..., Any]:
     """A game's ``reset`` under fixed settings; see :class:`Game`."""
 
     @functools.wraps(reset)
     def wrapped(self: Any, key: Any) -> Any:
-        state = reset(self, raw_key(key))
-        return _apart(_with_flags(state) if keeps_ends(state) else state)
+        key = raw_key(key)
+        state = reset(self, key)
+        state = _with_flags(state) if keeps_ends(state) else state
+        return _apart(laid_out_as(key[0], state))
 
     return fixed(wrapped)
 
@@ -107,7 +126,8 @@ def _wrap_step(step: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(self: Any, key: Any, state: Any, action: Any) -> Any:
         action = as_actions(action, ())
         if not keeps_ends(state):
-            return step(self, raw_key(key), state, action)
+            key = raw_key(key)
+            return laid_out_as(key[0], step(self, key, state, action))
         runs = state.terminated is UNSET and state.truncated is UNSET
         state = _with_flags(state)
         after, reward, terminated, truncated = step(self, raw_key(key), state, action)
@@ -138,7 +158,7 @@ def _wrap_facts(facts: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(self: Any, state: Any) -> Any:
         return facts(self, state)
 
-    return fixed(wrapped)
+    return may_be_nan(fixed(wrapped))
 
 
 _WRAPPERS = {

@@ -89,6 +89,17 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
     return jitted
 
 
+def may_be_nan(function: Function) -> Function:
+    """Let a function give NaN where JAX_DEBUG_NANS looks for it: there it says something."""
+
+    @functools.wraps(function)
+    def inner(*args: Any, **kwargs: Any) -> Any:
+        with jax.debug_nans(False):
+            return function(*args, **kwargs)
+
+    return inner  # type: ignore[return-value]
+
+
 def is_key(leaf: Any) -> bool:
     """Whether an array is one of keys of ``jax.random.key``."""
     return bool(jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key))

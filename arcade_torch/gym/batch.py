@@ -18,7 +18,7 @@ from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
 from arcade_torch.envs_jax.settings import as_numpy, is_key
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory
-from arcade_torch.process import check_process
+from arcade_torch.process import check_process, missing_platform
 
 Bools = npt.NDArray[np.bool_]
 Frames = npt.NDArray[np.uint8]
@@ -68,10 +68,17 @@ class NumpyBatch:
     Args:
         compiled: The game.
         flags: bool [N], true where the env shows its POMDP twin.
+
+    Raises:
+        RuntimeError: This process was forked after JAX had started; so do all methods that compute.
+        ValueError: JAX has no device of JAX_PLATFORMS.
     """
 
     def __init__(self, compiled: CompiledGame, flags: Bools) -> None:
         check_process()
+        problem = missing_platform()
+        if problem:
+            raise ValueError(problem)
         self._compiled = compiled
         self._batched = compiled.batched
         self.num_envs = len(flags)
@@ -130,6 +137,7 @@ class NumpyBatch:
         Returns:
             uint8 [N, S, S, 3].
         """
+        check_process()
         batch = self._batch if flags is None else self._batch._replace(partial=jnp.asarray(flags))
         return np.array(self._batched.render(batch), copy=copy or None)
 
@@ -137,6 +145,7 @@ class NumpyBatch:
         """Begin a new episode where ``mask`` (bool [N]) is true, from ``keys`` (uint32 [N, 2]) if
         they are given.
         """
+        check_process()
         if keys is not None:
             keys = jnp.where(jnp.asarray(mask)[:, None], keys, self._batch.key)
             self._batch = self._batch._replace(key=keys)
@@ -144,6 +153,7 @@ class NumpyBatch:
 
     def step(self, action: npt.NDArray[np.int32]) -> Stepped:
         """Take one action in every env, int32 [N] in 0..4; nothing is drawn."""
+        check_process()
         stepped, outcome = self._batched.step(self._batch, action)
         outcome.done.block_until_ready()
         self._batch = stepped
@@ -155,6 +165,7 @@ class NumpyBatch:
 
         Rows that begin anew ignore their action; their reward is 0 and no flag is set.
         """
+        check_process()
         running = self._batched.without_ends(self._batch)
         stepped, outcome = self._compiled.reset_or_step(running, action, ended)
         outcome.done.block_until_ready()
@@ -175,6 +186,7 @@ class NumpyBatch:
             What the step gave before anything was begun anew; frames uint8 [N, S, S, 3] after that;
             the n envs that ended, int64 [n]; and their final frames, uint8 [n, S, S, 3].
         """
+        check_process()
         step = self._compiled.step(
             self._batched.without_ends(self._batch), action, self._memory.spare()
         )

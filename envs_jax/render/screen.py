@@ -171,6 +171,10 @@ class Layers:
         self.places = places
         self._tables = functools.cache(self._make_tables)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is made anew, its tables too."""
+        return type(self), (self.background, *self.places)
+
     def draw(self, *codes: Array | int) -> Array:
         """Show pictures by code.
 

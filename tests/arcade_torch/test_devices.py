@@ -368,6 +368,55 @@ def test_a_forked_process_is_refused_in_one_line() -> None:
     ] == [1, 1]
 
 
+INHERITED = """
+import arcade_torch, gymnasium, jax, jax.numpy as jnp, os, signal, torch, warnings
+from torchrl.data import Categorical
+warnings.simplefilter("ignore")
+
+class Counter:
+    def reset(self, key):
+        return jnp.zeros(1), jnp.int32(0)
+
+    def step(self, key, state, action):
+        return jnp.ones(1), state + action, jnp.float32(0), state > 3, {}
+
+env = arcade_torch.make("SignpostEasy", num_envs=2)
+other = arcade_torch.from_jax(Counter(), num_envs=2, action_spec=Categorical(2, shape=(2,)))
+alone = gymnasium.make("arcade_torch/CartPoleEasy-v0").unwrapped
+several = gymnasium.make_vec("arcade_torch/CartPoleEasy-v0", num_envs=2, render_mode="rgb_array")
+actions = torch.zeros(2, dtype=torch.int64)
+alone._running = several._started = True  # as if reset in the parent
+if os.fork():
+    os.wait()
+    os._exit(0)
+signal.alarm(50)
+for call in (
+    env.reset, lambda: env.step_raw(actions), other.reset, lambda: other.step_raw(actions),
+    alone.reset, lambda: alone.step(0), several.reset, lambda: several.step([0, 0]), several.render,
+):
+    try:
+        call()
+        print("nothing was raised", flush=True)
+    except RuntimeError as error:
+        print(error, flush=True)
+os._exit(0)
+"""
+
+
+def test_an_env_that_a_forked_process_inherits_is_refused_in_one_line() -> None:
+    """Only making one was refused: the first reset or step hung for ever."""
+    result = subprocess.run(
+        [sys.executable, "-c", INHERITED],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=110,
+        check=False,
+    )
+    lines = result.stdout.splitlines()
+    assert [line.count("where JAX hangs: start workers") for line in lines] == [1] * 9, lines
+
+
 FORKED = """
 import arcade_torch, gymnasium, jax
 if __name__ == "__main__":

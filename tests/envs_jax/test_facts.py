@@ -210,3 +210,23 @@ def test_facts_that_no_measure_can_read_are_refused(facts: Any, complaint: str) 
     game: Game[Any] = Wrong()
     with pytest.raises(ValueError, match=complaint):
         check_game(game)
+
+
+class Forgetful(StubGame):
+    """A fact that has no value."""
+
+    def facts(self, state: Any) -> dict[str, jax.Array]:
+        return {"answer": jnp.where(state.clock.count < 0, state.total, jnp.nan)}
+
+
+def test_a_fact_without_a_value_is_no_error_where_jax_looks_for_nan():
+    """JAX_DEBUG_NANS=1 raised FloatingPointError, and NaN is what says that there is no value."""
+    game = Forgetful()
+    batched = BatchedGame(game)
+    batch = batched.init(env_keys(0, 2), np.zeros(2, bool))
+    with jax.debug_nans(True):
+        assert np.isnan(batched.facts(batch)["answer"]).all()
+        alone = game.facts(game.reset(jax.random.PRNGKey(0)))
+        assert np.isnan(alone["answer"])
+        with pytest.raises(FloatingPointError):
+            jnp.zeros(1) / jnp.zeros(1)

@@ -1,5 +1,9 @@
 """The registry says clearly what it does not know."""
 
+import pickle
+
+import jax
+import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import make, option_names, register, registered_ids, resolve_id
@@ -144,3 +148,18 @@ def test_no_name_of_a_game_can_be_given_to_another(monkeypatch, taken):
     for version in (0, 1):
         register(f"FooEasy-v{version}", factory, ["Foo"])
     assert resolve_id("Foo") == "FooEasy-v1"
+
+
+@pytest.mark.parametrize("id", [id for id in registered_ids() if "Easy" in id])
+def test_a_game_goes_to_another_process(id):
+    """By pickle, as workers and Ray send it; a copy draws the same."""
+    game = make(id)
+    copy = pickle.loads(pickle.dumps(game))
+    assert repr(copy) == repr(game) and copy.max_steps == game.max_steps
+
+
+def test_a_game_that_went_to_another_process_draws_the_same():
+    game = make("SignpostEasy")
+    copy = pickle.loads(pickle.dumps(game))
+    state = game.reset(jax.random.PRNGKey(0))
+    assert np.array_equal(copy.render(state, False), game.render(state, False))

@@ -137,9 +137,17 @@ def test_a_platform_that_jax_has_not_is_one_line(platform: str, words: str, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_make_says_in_one_line_that_jax_has_no_such_platform(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "program",
+    [
+        'import arcade_torch; arcade_torch.make("CartPoleEasy")',
+        "import arcade_torch, gymnasium; "
+        'gymnasium.make_vec("arcade_torch/CartPoleEasy-v0", num_envs=2)',
+    ],
+)
+def test_make_says_in_one_line_that_jax_has_no_such_platform(program: str, tmp_path: Path) -> None:
     result = shell(
-        "python -c 'import arcade_torch; arcade_torch.make(\"CartPoleEasy\")'",
+        f"python -c '{program}'",
         tmp_path,
         JAX_PLATFORMS="cuda",
     )
