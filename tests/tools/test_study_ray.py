@@ -2,8 +2,11 @@
 thing.
 """
 
+import _thread
 import io
 import os
+import signal
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -138,6 +141,28 @@ def _small_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(Job, "train", train)
     monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path / "far"))
+
+
+def test_a_worker_that_was_started_deaf_to_interrupts_hears_that_its_run_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind ``&`` in a script SIGINT is ignored: a stopped study waited a minute, and what its
+    runs had done since their last checkpoints was lost.
+    """
+
+    def train(job: Job) -> None:
+        _thread.interrupt_main()  # as Ray's cancel does
+        time.sleep(1)
+
+    monkeypatch.setattr(Job, "train", train)
+    (job,) = some_jobs(tmp_path, 1)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            carry_out(job, job.config.read_bytes())
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("_small_training")

@@ -13,6 +13,7 @@ import os
 import shutil
 import signal
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -287,7 +288,8 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         folder = disk / f"{job.name}-{key}"
         file = write_atomic(folder / "config.json", config)
         job = job._replace(folder=folder / "run", config=file)
-    error, trace = job.attempt()
+    with _hearing_cancel():
+        error, trace = job.attempt()
     if not shared:
         kept = _NOT_SENT | ({"checkpoints"} if error else set())
         for path in job.folder.rglob("*"):
@@ -297,6 +299,23 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         if not error:
             shutil.rmtree(job.config.parent)
     return error, trace, files
+
+
+@contextlib.contextmanager
+def _hearing_cancel() -> Iterator[None]:
+    """Let SIGINT, by which Ray cancels a task, be heard.
+
+    A study that a script started in the background ignores it, and its workers inherit that.
+    """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if not ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _result(ray: Any, reference: Any, job: Job) -> JobResult:
