@@ -31,7 +31,7 @@ from arcade_torch.agents.runs.files import (
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
-from arcade_torch.tools.imports import VARIABLE, imports_of, load_extensions
+from arcade_torch.tools.imports import for_workers, imports_of, load_extensions
 from arcade_torch.tools.machine import available_cores, keep_freed_memory
 
 GRACE_S = 60.0
@@ -201,7 +201,7 @@ class Ray(RayOptions):
                 "num_gpus": self.gpus_per_run,
                 "max_retries": self.retries,
             }
-            environment = {"env_vars": {VARIABLE: os.environ.get(VARIABLE, "")}}
+            environment = {"env_vars": for_workers()}
             task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
             waiting = list(jobs)
             flying = dict[Any, Job]()
