@@ -6,6 +6,7 @@ import _thread
 import io
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -141,6 +142,17 @@ def _small_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(Job, "train", train)
     monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path / "far"))
+
+
+def test_a_run_notes_the_command_that_repeats_it_and_not_that_of_rays_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted: list[str] = []
+    monkeypatch.setattr(Job, "train", lambda job: noted.extend(sys.argv))
+    monkeypatch.setattr(sys, "argv", ["default_worker.py", "--gcs-address=10.0.0.7:38725"])
+    (job,) = some_jobs(tmp_path, 1)
+    assert carry_out(job, job.config.read_bytes())[0] == ""
+    assert noted == ["arcade-torch", "train", *job.words] and len(sys.argv) == 2
 
 
 def test_a_worker_that_was_started_deaf_to_interrupts_hears_that_its_run_is_cancelled(

@@ -12,6 +12,7 @@ import importlib
 import os
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import traceback
@@ -279,6 +280,7 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """
     shared = False
     files = dict[str, bytes]()
+    command = ["arcade-torch", "train", *job.words]
     with contextlib.suppress(OSError, ValueError):
         shared = read_bytes(job.config, MOST_JSON) == config
     if not shared:
@@ -288,7 +290,7 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         folder = disk / f"{job.name}-{key}"
         file = write_atomic(folder / "config.json", config)
         job = job._replace(folder=folder / "run", config=file)
-    with _hearing_cancel():
+    with _hearing_cancel(), _called(command):
         error, trace = job.attempt()
     if not shared:
         kept = _NOT_SENT | ({"checkpoints"} if error else set())
@@ -299,6 +301,19 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         if not error:
             shutil.rmtree(job.config.parent)
     return error, trace, files
+
+
+@contextlib.contextmanager
+def _called(command: list[str]) -> Iterator[None]:
+    """Let a run note this command as its beginning: that of Ray's worker says how to reach the
+    cluster, and not how to repeat the run.
+    """
+    before = sys.argv
+    sys.argv = command
+    try:
+        yield
+    finally:
+        sys.argv = before
 
 
 @contextlib.contextmanager
