@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 
 FLAG = "--import"
 VARIABLE = "ARCADE_TORCH_IMPORT"
-"""Environment variable that hands what was imported on to worker processes; entries separated like
-those of PATH.
-"""
+"""Environment variable that hands what was imported on to worker processes, an entry a line."""
 HASHES_VARIABLE = "ARCADE_TORCH_IMPORT_SHA256"
 """The same for the SHA-256 of the files, in JSON: a worker imports what its study began with."""
 MOST_SOURCE = 16 * 2**20
@@ -82,7 +80,7 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
             rest.append(word)
             continue
         name = value if equals else next(pending, "")
-        if not name or "\0" in name:
+        if not name or "\0" in name or "\n" in name:
             raise ValueError(
                 f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
                 "something"
@@ -121,7 +119,7 @@ def load_extensions(names: Sequence[str] = ()) -> None:
 
 def _hand_on(names: Iterable[str]) -> None:
     """Tell worker processes what to import."""
-    os.environ[VARIABLE] = os.pathsep.join(names)
+    os.environ[VARIABLE] = "\n".join(names)
     os.environ[HASHES_VARIABLE] = json.dumps(_hashes)
 
 
@@ -132,7 +130,7 @@ def for_workers() -> dict[str, str]:
 
 def imported() -> list[str]:
     """What is imported in this process and its workers."""
-    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+    return [name for name in os.environ.get(VARIABLE, "").split("\n") if name]
 
 
 def imports_of(config: "TrainConfig") -> list[Import]:

@@ -6,6 +6,7 @@ import _thread
 import io
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -116,6 +117,19 @@ def test_a_run_that_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         run_all(FakeRay(fine), some_jobs(tmp_path), cpus_per_run=4)
     with pytest.raises(ValueError, match="cpus-per-run must be above 0"):
         Ray(module=FakeRay(fine), cpus_per_run=0)
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_at_which_nothing_listens_is_refused_at_once(
+    tmp_path: Path, scheme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray tried for more than nine minutes, without a word."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    ray = FakeRay(fine)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(ValueError, match=f"no Ray cluster answers at '{scheme}127.0.0.1:{port}'"):
+        run_all(ray, some_jobs(tmp_path), address=f"{scheme}127.0.0.1:{port}")
 
 
 def test_a_cluster_that_is_gone_is_said_to_be_gone_and_results_are_kept(tmp_path: Path) -> None:

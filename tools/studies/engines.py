@@ -12,6 +12,7 @@ import importlib
 import os
 import shutil
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -20,6 +21,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
+from urllib.parse import urlsplit
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import (
@@ -37,6 +39,9 @@ from arcade_torch.tools.machine import available_cores, keep_freed_memory
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
+
+CONNECT_S = 30.0
+"""How long a Ray cluster may take to answer."""
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {
@@ -257,6 +262,7 @@ class Ray(RayOptions):
                 "include_dashboard": False,
             }
             options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": 128 << 20}
+        _check_answers(self.address)
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             ray.init(**options)
@@ -269,6 +275,17 @@ class Ray(RayOptions):
             yield ray
         finally:
             ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    """Refuse an address at which nothing listens: Ray tries for many minutes, without a word."""
+    url = urlsplit(address if "://" in address else f"//{address}")
+    if url.port is None:  # auto, or none
+        return
+    try:
+        socket.create_connection((url.hostname or "", url.port), CONNECT_S).close()
+    except OSError as error:
+        raise ValueError(f"no Ray cluster answers at {address!r}: {error}") from error
 
 
 def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
