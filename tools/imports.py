@@ -10,11 +10,12 @@ holds the same path with the same hash.
 import contextlib
 import hashlib
 import importlib.util
+import json
 import os
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,9 +30,9 @@ if TYPE_CHECKING:
 
 FLAG = "--import"
 VARIABLE = "ARCADE_TORCH_IMPORT"
-"""Environment variable that hands what was imported on to worker processes; entries separated like
-those of PATH.
-"""
+"""Environment variable that hands what was imported on to worker processes, an entry a line."""
+HASHES_VARIABLE = "ARCADE_TORCH_IMPORT_SHA256"
+"""The same for the SHA-256 of the files, in JSON: a worker imports what its study began with."""
 MOST_SOURCE = 16 * 2**20
 """Bytes of the largest file that is imported."""
 MOST_REMEMBERED = 100
@@ -48,6 +49,18 @@ _again: set[str] = set()  # what was imported in this process because a run reme
 
 class ImportRefusedError(RuntimeError):
     """What a run remembers may not be imported again, or is not there as it was."""
+
+
+def _of_parent() -> dict[str, str]:
+    """File -> SHA-256 of its text in the process that this one works for."""
+    with contextlib.suppress(ValueError):
+        hashes = json.loads(os.environ.get(HASHES_VARIABLE, ""))
+        if isinstance(hashes, dict):
+            return hashes
+    return {}
+
+
+_parents = _of_parent()
 
 
 def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -67,7 +80,7 @@ def take_imports(words: Sequence[str]) -> tuple[list[str], list[str]]:
             rest.append(word)
             continue
         name = value if equals else next(pending, "")
-        if not name or "\0" in name:
+        if not name or "\0" in name or "\n" in name:
             raise ValueError(
                 f"{FLAG} needs a file (games.py) or a module (package.games) that registers "
                 "something"
@@ -100,13 +113,24 @@ def load_extensions(names: Sequence[str] = ()) -> None:
     """
     if wanted := list(dict.fromkeys([*imported(), *names])):
         for name in wanted:
-            _load(name)
-        os.environ[VARIABLE] = os.pathsep.join(wanted)
+            _load(name, expected="" if name in names else _parents.get(name, ""))
+        _hand_on(wanted)
+
+
+def _hand_on(names: Iterable[str]) -> None:
+    """Tell worker processes what to import."""
+    os.environ[VARIABLE] = "\n".join(names)
+    os.environ[HASHES_VARIABLE] = json.dumps(_hashes)
+
+
+def for_workers() -> dict[str, str]:
+    """The environment variables that tell worker processes on other machines what to import."""
+    return {name: os.environ.get(name, "") for name in (VARIABLE, HASHES_VARIABLE)}
 
 
 def imported() -> list[str]:
     """What is imported in this process and its workers."""
-    return [name for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+    return [name for name in os.environ.get(VARIABLE, "").split("\n") if name]
 
 
 def imports_of(config: "TrainConfig") -> list[Import]:
@@ -225,7 +249,7 @@ def _import_again(run: Path, name: str, sha256: str) -> None:
         raise changed
     _load(name, text)
     _again.add(name)
-    os.environ[VARIABLE] = os.pathsep.join(dict.fromkeys([*imported(), name]))
+    _hand_on(dict.fromkeys([*imported(), name]))
 
 
 def record_file() -> Path:
@@ -264,15 +288,19 @@ class _Source(SourceFileLoader):
         raise OSError("only the text counts")
 
 
-def _load(name: str, text: bytes | None = None) -> None:
-    """Import a module, or a file, of which the text may have been read already."""
+def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
+    """Import a module, or a file: its text may have been read already, or has to have an expected
+    SHA-256.
+    """
     if _is_file(name) and not Path(name).is_file():
         raise FileNotFoundError(f"{FLAG} {name}: there is no such file")
     try:
         if _is_file(name):
-            _run_file(name, text)
+            _run_file(name, text, expected)
         else:
             importlib.import_module(name)
+    except ImportRefusedError:
+        raise
     except Exception as error:
         if not isinstance(error, ModuleNotFoundError):
             why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
@@ -285,13 +313,19 @@ def _load(name: str, text: bytes | None = None) -> None:
         raise ValueError(f"{FLAG} {name}: {why}") from error
 
 
-def _run_file(name: str, text: bytes | None) -> None:
+def _run_file(name: str, text: bytes | None, expected: str) -> None:
     """Import a file under a name of its own, so that two files of one name do not meet."""
     module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     if module in sys.modules:
         return
     if text is None:
         text = read_bytes(Path(name), MOST_SOURCE)
+    sha256 = hashlib.sha256(text).hexdigest()
+    if expected and expected != sha256:
+        raise ImportRefusedError(
+            f"{FLAG} {name}: it has changed since this work began: put it back as it was, or "
+            "start anew"
+        )
     loader = _Source(module, name, text)
     spec: Any = importlib.util.spec_from_file_location(module, name, loader=loader)
     sys.modules[module] = importlib.util.module_from_spec(spec)
@@ -300,4 +334,4 @@ def _run_file(name: str, text: bytes | None) -> None:
     except BaseException:
         del sys.modules[module]
         raise
-    _hashes[name] = hashlib.sha256(text).hexdigest()
+    _hashes[name] = sha256

@@ -38,6 +38,7 @@ def serve(command: Callable[[Sequence[str]], int] = main) -> None:
         with open_append(Path(order["log"])) as log:
             _print_to(log.fileno())
         with warnings.catch_warnings():  # of a run before are given again, into its own log
+            sys.argv = ["arcade-torch", *order["words"]]  # what a run notes of its beginning
             code = command(order["words"])
         if code != EXIT_OK:
             break

@@ -11,6 +11,7 @@ import pytest
 
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.tools import cli
+from arcade_torch.tools.imports import imported
 from arcade_torch.tools.options import VARIABLE, command_line, load_extensions, take_imports
 from tests.own_registry import own_registry  # noqa: F401
 
@@ -38,6 +39,16 @@ def test_a_file_is_imported_once_and_handed_on_to_workers() -> None:
         command_line(["train", "--env", "PairsEasy"])
         == f"arcade-torch train --env PairsEasy --import {OWN_GAME}"
     )
+
+
+@pytest.mark.usefixtures("own_registry")
+def test_a_path_with_a_colon_reaches_workers(tmp_path: Path) -> None:
+    """They took it for two paths, and no run of the study began."""
+    file = tmp_path / "a:b" / "own_game.py"
+    file.parent.mkdir()
+    file.write_text("import math\n")
+    load_extensions([str(file)])
+    assert imported() == [str(file)]
 
 
 @pytest.mark.usefixtures("own_registry")

@@ -66,6 +66,23 @@ def test_any_name_in_a_run_is_drawn_as_it_is_written(tmp_path: Path) -> None:
     assert all(re.sub(r"\s+", " ", printable(name)).strip() in words for name in names)
 
 
+def test_every_name_of_many_stands_inside_the_picture(tmp_path: Path) -> None:
+    """Eight columns of long names were wider than the picture: half of fifty agents were cut off."""
+    for place in range(30):
+        name = f"m{place:02}" + "_with_a_long_name_of_its_own" * (place % 10 == 0)
+        for twin in ("full", "partial"):
+            write(tmp_path / f"{place:02}-{twin}", name, twin, 0, 0.5)
+    with drawing("light"):
+        (picture,) = logs.curves(logs.CurveOptions((tmp_path,)), None).pictures
+        figure = picture.figure
+        figure.draw_without_rendering()
+        for text in figure.legends[0].get_texts():
+            box = text.get_window_extent()
+            assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1, text.get_text()
+            assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1, text.get_text()
+        assert all(axis.get_window_extent().height > 100 for axis in figure.axes)
+
+
 def test_a_line_break_in_a_name_is_written_out(tmp_path: Path) -> None:
     write(tmp_path / "0", "a\nb", "full", 0, 0.5)
     write(tmp_path / "1", "mlp", "full", 0, 0.5, network_options={"note": "x\r\n\x1b"})

@@ -1,5 +1,7 @@
 """Gap and Bias against the paper's aggregates, and the bootstrap against what is known about it."""
 
+import math
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -9,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.tools import gap_and_bias
+from arcade_torch.tools.figures import style
 from arcade_torch.tools.figures.style import drawing
 from arcade_torch.tools.measures.bootstrap import (
+    Interval,
     mean_over_tasks,
     measured_coverage,
     percentile_interval,
@@ -384,6 +388,22 @@ def test_a_bare_name_and_its_version_are_one_game() -> None:
     names = ("TetrisEasy", "TetrisEasy-v9", "TetrisEasy-v10")
     newest = read_scores([Score("mlp", game, "full", seed, 0.5) for seed, game in enumerate(names)])
     assert newest[0].game == "TetrisEasy-v10"
+
+
+def test_agents_without_a_gap_lie_on_one_line() -> None:
+    """The axis of returns that are equal on both twins showed rounding errors, 1e-17."""
+    scores = []
+    for place, agent in enumerate(("mlp", "gru", "lru")):
+        for game, twin in product(("SignpostEasy", "CartPoleEasy"), ("full", "partial")):
+            scores.append(Score(agent, game, twin, 0, 0.2 + 0.01 * place))
+    rows = []
+    for place, row in enumerate(gap_and_bias(scores).rows):
+        rows.append(replace(row, gap=Interval(1e-17 * place, math.nan, math.nan)))
+    with drawing("light"):
+        axis = style.panels(1, 1, (4, 3))[1][0, 0]
+        figure.plot(rows, axis)
+        low, high = axis.get_ylim()
+    assert high - low >= 0.02 and low < 0 < high
 
 
 def test_an_unknown_metric_is_refused() -> None:

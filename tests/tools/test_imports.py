@@ -250,3 +250,36 @@ def test_a_study_does_not_go_on_with_runs_of_an_older_text(folder: Path, tmp_pat
     with pytest.raises(FileExistsError, match=r"trained with .*yours\.py as it was before"):
         study.claim(plan)
     assert any("yours.py has changed" in note for note in find_runs([tmp_path / "s"]).notes)
+    (run / "eval.json").unlink()
+    study.claim(plan)  # it begins anew
+    (run / "checkpoints/frames-000000000001").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match=r"trained with .*yours\.py as it was before"):
+        study.claim(plan)  # it would go on from what another text has learned
+
+
+def test_a_worker_imports_what_its_study_began_with(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that was edited while a study went on: later runs were trained with the new text, and
+    reported as seeds of the same memory.
+    """
+    file = folder / "yours.py"
+    imports.load_extensions([str(file)])
+    handed_on = imports.for_workers()
+
+    def begin_worker() -> None:
+        in_a_new_process(monkeypatch)
+        for name, value in handed_on.items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setattr(imports, "_parents", imports._of_parent())
+
+    begin_worker()
+    imports.load_extensions()
+    assert "yours" in memory_names()
+    file.write_text(SOURCE + "# another\n")
+    begin_worker()
+    with pytest.raises(imports.ImportRefusedError, match=r"yours\.py: it has changed since"):
+        imports.load_extensions()
+    assert "yours" not in memory_names()
+    imports.load_extensions([str(file)])  # the user names it himself
+    assert "yours" in memory_names()

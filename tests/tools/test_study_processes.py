@@ -76,6 +76,12 @@ def test_a_worker_takes_one_run_after_the_other_and_each_has_its_log(tmp_path: P
     assert not is_there(pid_of(tmp_path, 0))
 
 
+def test_a_run_notes_its_own_command_and_not_that_of_its_worker(tmp_path: Path) -> None:
+    (part,) = jobs(tmp_path, "import sys\nprint(sys.argv)")
+    assert [result.error for result in python_engine(1).run([part])] == [""]
+    assert part.log.read_text() == f"{['arcade-torch', *part.order]}\n"
+
+
 def test_a_warning_stands_in_the_log_of_every_run_that_gives_it(tmp_path: Path) -> None:
     """Python gives a warning of one place once a process."""
     warn = "registry = sys.__dict__.setdefault('_of_a_module', {})\n"

@@ -2,8 +2,13 @@
 thing.
 """
 
+import _thread
 import io
 import os
+import signal
+import socket
+import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -114,6 +119,19 @@ def test_a_run_that_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
         Ray(module=FakeRay(fine), cpus_per_run=0)
 
 
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_an_address_at_which_nothing_listens_is_refused_at_once(
+    tmp_path: Path, scheme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ray tried for more than nine minutes, without a word."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    ray = FakeRay(fine)
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    with pytest.raises(ValueError, match=f"no Ray cluster answers at '{scheme}127.0.0.1:{port}'"):
+        run_all(ray, some_jobs(tmp_path), address=f"{scheme}127.0.0.1:{port}")
+
+
 def test_a_cluster_that_is_gone_is_said_to_be_gone_and_results_are_kept(tmp_path: Path) -> None:
     ray = FakeRay(fine, cores=2)
     results = Ray(module=ray).run(some_jobs(tmp_path, 4))
@@ -138,6 +156,39 @@ def _small_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(Job, "train", train)
     monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path / "far"))
+
+
+def test_a_run_notes_the_command_that_repeats_it_and_not_that_of_rays_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted: list[str] = []
+    monkeypatch.setattr(Job, "train", lambda job: noted.extend(sys.argv))
+    monkeypatch.setattr(sys, "argv", ["default_worker.py", "--gcs-address=10.0.0.7:38725"])
+    (job,) = some_jobs(tmp_path, 1)
+    assert carry_out(job, job.config.read_bytes())[0] == ""
+    assert noted == ["arcade-torch", "train", *job.words] and len(sys.argv) == 2
+
+
+def test_a_worker_that_was_started_deaf_to_interrupts_hears_that_its_run_is_cancelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind ``&`` in a script SIGINT is ignored: a stopped study waited a minute, and what its
+    runs had done since their last checkpoints was lost.
+    """
+
+    def train(job: Job) -> None:
+        _thread.interrupt_main()  # as Ray's cancel does
+        time.sleep(1)
+
+    monkeypatch.setattr(Job, "train", train)
+    (job,) = some_jobs(tmp_path, 1)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            carry_out(job, job.config.read_bytes())
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("_small_training")

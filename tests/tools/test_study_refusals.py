@@ -198,3 +198,36 @@ def test_a_report_that_fails_says_how_to_write_it_again(
     skip = ["--skip", "saliency", "recall", "counterfactual", "contamination", "references"]
     assert cli.main(["report", str(root), *skip]) == 0
     assert (root / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("[settings]\nthreads = 'two'", "threads must be a whole number; got 'two'"),
+        ("[settings.pqn]\ngama = 0.9", "unknown field 'pqn.gama'"),
+        ("[settings.env_options]\nzork = 1", "has no option 'zork'"),
+        ("[settings.network_options.memory_options]\nzork = 1", "memory 'mlp' has other options"),
+        ("algorithms = ['pqn', 'zork']", "algorithm must be"),
+    ],
+)
+@pytest.mark.parametrize("dry", [True, False])
+def test_what_a_file_says_is_refused_with_its_name(
+    line: str, message: str, dry: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What only the config of a run refuses did not name the file."""
+    file = tmp_path / "one.toml"
+    file.write_text(TOML + line + "\n")
+    words = ["--dry-run"] if dry else ["--out", str(tmp_path / "s")]
+    assert cli.main(["study", str(file), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"arcade-torch: {file}: ") and message in said and said.count("\n") == 1
+    with pytest.raises(ValueError, match=r"one\.toml: .*" + message.split(" ")[-1]):
+        study(file, tmp_path / "s", Fabricator(small_study()))
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_number_of_seeds_that_is_no_whole_one_is_told_what_may_stand_there(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(ValueError, match=r"seeds must be a list, or the number of them; got 1\.5"):
+        small_study(seeds=1.5)

@@ -130,8 +130,8 @@ class StudyCommand(Resumable):
         warning = definition.overridden_preset()
         if warning:
             print(f"warning: {warning}", file=sys.stderr)
+        plan = planned(definition, self.shard, self.file)
         if self.dry_run:
-            plan = planned(definition, self.shard)
             total = 0
             for run, config in plan.items():
                 frames = config.num_updates * config.learner.frames_per_update

@@ -101,7 +101,7 @@ def _curve_figure(curves: Mapping[tuple[str, str, str], Curve], ylabel: str) -> 
         label = style.legend_name(agent)
         if label in handles:
             in_legend.append(handles[label])
-    figure.legend(handles=in_legend, loc="outside upper center", ncols=min(8, len(in_legend)))
+    style.legend_above(figure, in_legend)
     return figure
 
 

@@ -1,5 +1,6 @@
 """How figures look, and how they are saved: the one place for colours, sizes and files."""
 
+import math
 import os
 import re
 import sys
@@ -156,6 +157,22 @@ def legend_name(name: str) -> str:
     legends.
     """
     return f"\u200b{name}" if name.startswith("_") else name
+
+
+def legend_above(figure: Any, handles: Sequence[Any], most: int = 8) -> None:
+    """Put a legend above the panels, in as many columns as its names leave room for; the figure
+    grows with its lines.
+    """
+    legend = figure.legend(handles=handles, loc="outside upper center", ncols=1)
+    size = legend.prop.get_size_in_points()
+    letters = max([len(handle.get_label()) for handle in handles], default=0)
+    column_pt = 0.6 * size * (letters + 7)  # with the sample of a line
+    room = int(72 * figure.get_figwidth() / column_pt)
+    columns = max(1, min(most, len(handles), room))
+    lines = math.ceil(len(handles) / columns)
+    figure.set_figheight(figure.get_figheight() + 1.6 * size / 72 * max(0, lines - 2))
+    legend.remove()
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns)
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:

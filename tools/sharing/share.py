@@ -28,8 +28,12 @@ EVALUATION = ".eval_results/arcade-torch.yaml"
 FILMS = ("replay.mp4", "replay.gif")
 MOST_STEPS = 500
 """Of the episode in the film."""
-_WORDS_LEFT_OUT = ("--out", "--config")
-"""Options of a training that name places on somebody's machine."""
+_TRAINING = ("train", "study", "demo", "compare")
+"""Commands that train."""
+_WORDS_LEFT_OUT = ("--out", "--wait")
+"""Options of a training that say nothing of its result."""
+_BY_CONFIG = "arcade-torch train --config config.json"
+"""How to repeat the training by the file in the folder itself."""
 
 
 def share(
@@ -97,15 +101,24 @@ def _record_of(run: Path) -> dict[str, Any]:
 
 
 def _command(record: dict[str, Any]) -> str:
-    """How the training was started, without names of places."""
+    """How the training was started, or can be repeated, without names of places.
+
+    A run that a script or a worker of a cluster started, or that was told its config by a file, is
+    repeated by the config that is shared.
+    """
     words = record.get("command", [])
     if isinstance(words, str):
         return words
     if not isinstance(words, list):  # somebody changed the file
         return ""
+    words = [str(word) for word in words[1:]]
+    if not words or words[0] not in _TRAINING:
+        return _BY_CONFIG
+    if any(word.partition("=")[0] == "--config" for word in words):
+        return _BY_CONFIG
     kept = ["arcade-torch"]
     skips = False
-    for word in map(str, words[1:]):
+    for word in words:
         if skips or word.partition("=")[0] in _WORDS_LEFT_OUT:
             skips = not skips and "=" not in word
         else:

@@ -12,12 +12,16 @@ import importlib
 import os
 import shutil
 import signal
+import socket
+import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
+from urllib.parse import urlsplit
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import (
@@ -30,11 +34,14 @@ from arcade_torch.agents.runs.files import (
     write_atomic,
 )
 from arcade_torch.tools.errors import need, one_line, reason
-from arcade_torch.tools.imports import VARIABLE, imports_of, load_extensions
+from arcade_torch.tools.imports import for_workers, imports_of, load_extensions
 from arcade_torch.tools.machine import available_cores, keep_freed_memory
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
+
+CONNECT_S = 30.0
+"""How long a Ray cluster may take to answer."""
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {
@@ -200,7 +207,7 @@ class Ray(RayOptions):
                 "num_gpus": self.gpus_per_run,
                 "max_retries": self.retries,
             }
-            environment = {"env_vars": {VARIABLE: os.environ.get(VARIABLE, "")}}
+            environment = {"env_vars": for_workers()}
             task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
             waiting = list(jobs)
             flying = dict[Any, Job]()
@@ -255,6 +262,7 @@ class Ray(RayOptions):
                 "include_dashboard": False,
             }
             options |= {"_node_ip_address": "127.0.0.1", "object_store_memory": 128 << 20}
+        _check_answers(self.address)
         handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         try:
             ray.init(**options)
@@ -269,6 +277,17 @@ class Ray(RayOptions):
             ray.shutdown()
 
 
+def _check_answers(address: str) -> None:
+    """Refuse an address at which nothing listens: Ray tries for many minutes, without a word."""
+    url = urlsplit(address if "://" in address else f"//{address}")
+    if url.port is None:  # auto, or none
+        return
+    try:
+        socket.create_connection((url.hostname or "", url.port), CONNECT_S).close()
+    except OSError as error:
+        raise ValueError(f"no Ray cluster answers at {address!r}: {error}") from error
+
+
 def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """Carry out a run on a machine of the cluster.
 
@@ -278,6 +297,7 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
     """
     shared = False
     files = dict[str, bytes]()
+    command = ["arcade-torch", "train", *job.words]
     with contextlib.suppress(OSError, ValueError):
         shared = read_bytes(job.config, MOST_JSON) == config
     if not shared:
@@ -287,7 +307,8 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         folder = disk / f"{job.name}-{key}"
         file = write_atomic(folder / "config.json", config)
         job = job._replace(folder=folder / "run", config=file)
-    error, trace = job.attempt()
+    with _hearing_cancel(), _called(command):
+        error, trace = job.attempt()
     if not shared:
         kept = _NOT_SENT | ({"checkpoints"} if error else set())
         for path in job.folder.rglob("*"):
@@ -297,6 +318,36 @@ def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:
         if not error:
             shutil.rmtree(job.config.parent)
     return error, trace, files
+
+
+@contextlib.contextmanager
+def _called(command: list[str]) -> Iterator[None]:
+    """Let a run note this command as its beginning: that of Ray's worker says how to reach the
+    cluster, and not how to repeat the run.
+    """
+    before = sys.argv
+    sys.argv = command
+    try:
+        yield
+    finally:
+        sys.argv = before
+
+
+@contextlib.contextmanager
+def _hearing_cancel() -> Iterator[None]:
+    """Let SIGINT, by which Ray cancels a task, be heard.
+
+    A study that a script started in the background ignores it, and its workers inherit that.
+    """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if not ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _result(ray: Any, reference: Any, job: Job) -> JobResult:

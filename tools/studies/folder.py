@@ -132,6 +132,7 @@ class StudyFolder:
                 f"{self.root} is not empty and holds no study: choose another --out"
             )
         self._check_finished(study)
+        self._check_begun(study)
         new = self._new_record(study, command, old)
         if new != old:
             write_json(file, new)
@@ -164,12 +165,18 @@ class StudyFolder:
                 raise FileExistsError(
                     f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
                 )
-            changed = _changed_imports(run, config)
-            if changed:
-                raise FileExistsError(
-                    f"{run.path} was trained with {changed[0]} as it was before it changed: choose "
-                    "another --out"
-                )
+            _check_imports(run, config)
+
+    def _check_begun(self, study: Study) -> None:
+        """Refuse to go on from the checkpoint of another text of an imported file."""
+        begun = list[RunSpec]()
+        for spec in study.runs():
+            run = self.run(spec)
+            if run.final is None and any(run.path.glob("checkpoints/frames-*")):
+                begun.append(spec)
+        for spec, config in study.configs(begun).items():
+            with contextlib.suppress(ValueError, FileNotFoundError):  # told when it goes on
+                _check_imports(self.run(spec), config)
 
     def _new_record(self, study: Study, command: str, old: dict[str, Any]) -> dict[str, Any]:
         """What ``study.json`` is to hold; the versions of the first runs stay on record."""
@@ -272,10 +279,15 @@ def _final_columns(final: Mapping[str, Any]) -> Row:
     return columns
 
 
-def _changed_imports(run: Run, plan: TrainConfig) -> list[str]:
-    """The files that a run was trained with and that are imported otherwise, or not at all, now."""
+def _check_imports(run: Run, plan: TrainConfig) -> None:
+    """Refuse a run that was trained with a file that is imported otherwise, or not at all, now."""
     now = {entry["sha256"] for entry in imports_of(plan)}
-    return [name for name, sha256 in run.imports.items() if sha256 not in now]
+    for name, sha256 in run.imports.items():
+        if sha256 not in now:
+            raise FileExistsError(
+                f"{run.path} was trained with {name} as it was before it changed: put it back, or "
+                "choose another --out"
+            )
 
 
 def _other_settings(run: Run, plan: TrainConfig) -> list[str]:

@@ -356,8 +356,8 @@ def _axis(axis: str, value: Any) -> tuple[Any, ...]:
         value = range(value)
     if isinstance(value, str):
         value = (value,)
-    if not isinstance(value, Sequence):
-        raise ValueError(f"{axis} must be a list")
+    allowed = "a list, or the number of them" if axis == "seeds" else "a list"
+    require(isinstance(value, Sequence), axis, value, allowed)
     if not value and axis != "sizes":
         raise ValueError(f"{axis} is empty: a study needs at least one")
     values = tuple(coerce(axis, item, _AXES[axis]) for item in value)

@@ -16,6 +16,7 @@ from typing import Any
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import write_json
+from arcade_torch.tools.errors import is_told
 from arcade_torch.tools.machine import available_cores
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.runs import Run
@@ -117,9 +118,10 @@ def study(
             study.
         DiskFullError: there is no space left for results; what is finished is kept.
     """
+    file = None if isinstance(plan_or_file, Study) else plan_or_file
     definition = plan_or_file if isinstance(plan_or_file, Study) else Study.load(plan_or_file)
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
-    plan = planned(definition, shard)
+    plan = planned(definition, shard, file)
     folder = StudyFolder(Path(out))
     try:
         folder.claim(definition, command)
@@ -158,14 +160,21 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes, ray")
 
 
-def planned(plan: Study, shard: str = "") -> dict[RunSpec, TrainConfig]:
+def planned(
+    plan: Study, shard: str = "", file: str | Path | None = None
+) -> dict[RunSpec, TrainConfig]:
     """The runs of a study with their configs, of shard ``3/10`` every tenth run from the third, and
-    all checked.
+    all checked; what is refused names the file that the study stands in, if there is one.
     """
-    _check_names(plan)
     part, parts = part_of(shard)
-    configs = plan.configs(plan.runs()[part - 1 :: parts])
-    _check_options(configs.values())
+    try:
+        _check_names(plan)
+        configs = plan.configs(plan.runs()[part - 1 :: parts])
+        _check_options(configs.values())
+    except (TypeError, ValueError) as error:
+        if file is None or not is_told(error):
+            raise
+        raise ValueError(f"{file}: {error}") from error
     return configs
 
 

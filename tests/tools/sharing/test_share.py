@@ -12,6 +12,8 @@ from arcade_torch.agents.runs.files import checksum
 from arcade_torch.agents.runs.shipped import SHIPPED
 from arcade_torch.tools import cli
 from arcade_torch.tools.commands.share import is_folder
+from arcade_torch.tools.commands.train import _read_config
+from arcade_torch.tools.sharing import share
 from tests.tools.test_cli import one_error
 
 NEEDED = {"config.json", "model.safetensors", "README.md", "results.json", ".eval_results"}
@@ -40,6 +42,43 @@ def test_a_pushed_folder_has_the_files_of_the_hub(pushed: Path) -> None:
     assert results["sha256"]["model.safetensors"] == checksum(pushed / "model.safetensors")
     assert results["n_eval_episodes"] == 8 and results["frames"] == 128
     assert results["training"]["versions"]["arcade_torch"]
+
+
+def test_a_run_that_no_command_line_started_is_repeated_by_its_config(
+    run: Path, pushed: Path
+) -> None:
+    """The page of a run that Ray had trained named the addresses of the cluster, and that of any
+    other run of a study the command ``arcade-torch`` alone.
+    """
+    said = json.loads((pushed / "results.json").read_text())["training"]["command"]
+    assert said == "arcade-torch train --config config.json"
+    assert _read_config(pushed / "config.json") == _read_config(run / "config.json")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["/venv/ray/default_worker.py", "--gcs-address=10.0.0.7:38725"],
+            "arcade-torch train --config config.json",
+        ),
+        (["/venv/tools/worker.py"], "arcade-torch train --config config.json"),
+        (["mine.py", "--memory", "yours"], "arcade-torch train --config config.json"),
+        (
+            ["arcade-torch", "train", "--config", "/home/me/a.json", "--resume"],
+            "arcade-torch train --config config.json",
+        ),
+        (
+            ["x", "train", "--out=/home/me/a", "--wait", "60", "--env", "SignpostEasy"],
+            "arcade-torch train --env SignpostEasy",
+        ),
+        (["x", "study", "/home/me/s.toml", "--out", "a"], "arcade-torch study s.toml"),
+    ],
+)
+def test_a_command_that_is_shared_names_no_place_and_repeats_the_run(
+    words: list[str], said: str
+) -> None:
+    assert share._command({"command": words}) == said
 
 
 def test_the_model_card_is_yaml_that_boards_read(pushed: Path) -> None:

@@ -56,6 +56,8 @@ COLUMNS = {
     "pomdp_raw": "POMDP raw",
 }
 """Numbers of the printed table, and their heads."""
+LEAST_SPAN = 0.02
+"""Of an axis of Gap or Bias."""
 
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
@@ -193,9 +195,17 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     for line in (axis.axhline, axis.axvline):
         line(0.0, color=NEUTRAL, lw=1, ls="--")
     axis.margins(0.15)
+    _widen(axis)
     axis.grid(True, axis="both")
     axis.set_xlabel("Memory Bias\n(MDP - memory-free MDP, normalised return)")
     axis.set_ylabel("Observability Gap\n(MDP - POMDP, normalised return)")
+
+
+def _widen(axis: Any) -> None:
+    """Give both axes `LEAST_SPAN`, so that rounding errors do not look like gaps."""
+    for limits, change in ((axis.get_xlim(), axis.set_xlim), (axis.get_ylim(), axis.set_ylim)):
+        lacking = max(0.0, LEAST_SPAN - (limits[1] - limits[0]))
+        change(limits[0] - lacking / 2, limits[1] + lacking / 2)
 
 
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
