@@ -318,7 +318,7 @@ class TrainConfig(Checked):
     """Torch device of the network and the learner."""
     amp: bool = False
     """Take the encoder in bfloat16, and the rest in float32: other numbers, faster on a GPU and on
-    x86 with AMX, slower on x86 without. Agents act as they were trained."""
+    x86 with AMX, slower on some without. Agents act as they were trained."""
     compile: bool = False
     """Run encoder and memory through ``torch.compile``: half a minute or more at the start, and
     rounding of its own. Meant for GPUs: two cores are no faster with it. What is saved is the same;

@@ -17,6 +17,9 @@ from arcade_torch.tools.options import Command, at_least, command_line, name_and
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
 
+SLOWER = 1.05
+"""Times as long as without: from there on ``train`` says that ``--amp`` costs time."""
+
 
 @dataclass
 class Train(Command):
@@ -89,7 +92,7 @@ class Train(Command):
         from arcade_torch.tools.exploring import stopped_exploring
         from arcade_torch.tools.machine import (
             PARENT_VARIABLE,
-            bfloat16_is_slower,
+            bfloat16_time,
             keep_freed_memory,
             watch_parent,
         )
@@ -113,8 +116,10 @@ class Train(Command):
         if self.check_memory and is_first:
             check_memory_of(run)
         wait_until_free(folder, self.wait)
-        if is_first and run.amp and run.device == "cpu" and bfloat16_is_slower():
-            say("this processor multiplies float32 faster than bfloat16: --amp costs time here")
+        if is_first and run.amp and run.device == "cpu":
+            share = bfloat16_time(run)
+            if share > SLOWER:
+                say(f"--amp costs time here: the encoder takes {share:.2f} times as long with it")
         with Bars(unit="frames", first_line_s=0.0) as bars:
 
             def show(row: Any) -> None:
