@@ -47,20 +47,20 @@ class RecurrentMemory(Memory):
     Args:
         module: What it carries on is in its state: tensors, alone or in tuples, lists and
             dictionaries, whose shape does not depend on the steps that were read, each with an axis
-            for the batch. None or an empty tuple: it carries nothing on. A copy of it is tried out.
+            for the batch. None, or an empty tuple, is no state. It is tried out as a copy.
         input_size: D, features of an input step.
         hidden_size: H, features of an output step.
         run: How the module reads a chunk: ``(module, x [B, T, D], state) -> (y [B, T, H], state)``.
             None: ``module(x, state)``, with time as the first axis where ``module.batch_first`` is
             false.
         start: The state at the start of an episode, as the module has it: ``(module, batch size)
-            -> state``. None: zeros, if that is what the module begins with when it is given None,
-            whatever it will learn.
+            -> state``. None: zeros, where the module begins with them when it is given None, and
+            does not learn what it begins with.
 
     Raises:
         TypeError: The module cannot be run so, or its state holds something that is no tensor.
         ValueError: Outputs of another size; a state that grows with the steps, has no axis for the
-            batch, or begins with something else than zeros.
+            batch, or begins with something else than zeros, or than ``start`` gives.
 
     Example:
         >>> from arcade_torch.models import check_memory, register_memory
