@@ -257,6 +257,12 @@ def test_a_network_without_data_is_whole_when_its_weights_are_loaded(make):
         assert torch.equal(reads[1][key], value), key
 
 
+def test_a_network_made_in_inference_mode_is_moved_outside_of_it():
+    with torch.inference_mode():
+        network = make_network("small", "gru", hidden_size=16)
+    assert next(network.to(torch.float64).parameters()).dtype == torch.float64
+
+
 def test_dtype_follows_the_parameters():
     network = make_network("small", "lru").double()
     pixels, last_action, is_init = inputs()
