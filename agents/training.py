@@ -59,7 +59,8 @@ def train(
     SIGINT, SIGTERM and SIGHUP (a dropped connection) end the run at the next update with a
     checkpoint and status ``"interrupted"``; a second SIGINT ends it at once. A killed run goes on
     from its last checkpoint, to the bit on one machine. Torch's global generator is seeded for the
-    run and put back afterwards.
+    run and put back afterwards: two runs in threads of one process draw from it by turns, and
+    neither can be repeated. Take processes, as a study does.
 
     Args:
         config: what to train.

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-__all__ = ["MemoryLawError", "Subject", "held_by", "leaves", "pairs_of", "subject_of"]
+__all__ = ["MemoryLawError", "Subject", "copy_of", "held_by", "leaves", "pairs_of", "subject_of"]
 
 # Largest difference allowed between two ways to compute the same thing; see ``_difference``.
 TOLERANCES = {
@@ -68,7 +68,7 @@ class Subject:
 
     def copied(self) -> "Subject":
         """The same, with a copy of the module, for calls that may leave something in it."""
-        return replace(self, module=_copy_of(self.module))
+        return replace(self, module=copy_of(self.module))
 
     def initial(self, batch: int) -> TensorDict:
         """The state at the start of an episode, TensorDict [batch]."""
@@ -114,12 +114,12 @@ def subject_of(
         tolerance = TOLERANCES[dtype]
     # not ``.to(dtype)``, which takes the imaginary part away from complex weights
     convert = partial(_in_precision, dtype=dtype)
-    checked = _copy_of(module, convert).eval()
+    checked = copy_of(module, convert).eval()
     checked._apply(convert)
     return Subject(checked, size, dtype, tolerance)
 
 
-def _copy_of(module: nn.Module, convert: Callable[[Tensor], Tensor] = torch.detach) -> nn.Module:
+def copy_of(module: nn.Module, convert: Callable[[Tensor], Tensor] = torch.detach) -> nn.Module:
     """A copy of a module that has been at work: what it keeps of a call, its attention for a
     picture or the weight of ``weight_norm``, is converted without the graph, which nobody can copy.
     """

@@ -1,5 +1,7 @@
 """The law of the weights of a memory model: registered, made early, and taken by name."""
 
+from contextlib import suppress
+from types import FunctionType
 from typing import Any
 
 import torch
@@ -34,12 +36,21 @@ def weights_are_registered(s: Subject, law: str) -> float:
         for name, value in vars(part).items():
             if all(id(weight) in registered for weight in _weights_in(value)):
                 continue
+            cause = (
+                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
+                "nn.ParameterList or nn.Parameter"
+            )
+            if isinstance(value, FunctionType):
+                cause = (
+                    "a function that names a module itself: a copy of the memory, such as a target "
+                    "network, would still read the first one's weights; take the module that the "
+                    "function is given"
+                )
             raise MemoryLawError(
                 law,
                 f"parameters() does not list what is in {name} of {type(part).__name__}, a "
                 f"{type(value).__name__}",
-                "it would not be trained, saved or moved: take nn.ModuleList, nn.ModuleDict, "
-                "nn.ParameterList or nn.Parameter",
+                cause,
             )
     module = s.copied().module
     before = set(module.state_dict())
@@ -60,12 +71,24 @@ def _weights_in(value: Any) -> list[Tensor]:
     if isinstance(value, Tensor):
         return [value] if value.requires_grad and value.is_leaf else []
     weights = list[Tensor]()
-    for thing in held_by(value):
-        if isinstance(thing, nn.Module) and thing is not value:
-            weights += thing.parameters()
-        elif isinstance(thing, nn.Parameter):
-            weights.append(thing)
+    for held in held_by(value):
+        for thing in _named_by(held) if isinstance(held, FunctionType) else [held]:
+            if isinstance(thing, nn.Module) and thing is not value:
+                weights += thing.parameters()
+            elif isinstance(thing, nn.Parameter):
+                weights.append(thing)
     return weights
+
+
+def _named_by(function: FunctionType) -> list[Any]:
+    """What a function names that is not given to it."""
+    things = []
+    for cell in function.__closure__ or ():
+        with suppress(ValueError):  # of a name that has no value yet
+            things.append(cell.cell_contents)
+    for name in function.__code__.co_names:
+        things.append(function.__globals__.get(name))
+    return things
 
 
 def _check_taken_by_name(s: Subject, law: str, x: Tensor) -> None:

@@ -364,6 +364,13 @@ class MemoryNetwork(TensorDictModuleBase):
         """
         return self.block.initial_state(batch_size)  # type: ignore[operator]
 
+    def _apply(self, *args: Any, **options: Any) -> "MemoryNetwork":
+        """Fill in what no checkpoint holds: behind ``to_empty`` it is any numbers."""
+        super()._apply(*args, **options)
+        if torch.is_inference_mode_enabled() or not self.actions.is_inference():
+            self.actions.copy_(torch.arange(self.num_actions, device=self.actions.device))
+        return self
+
     def _append(self, features: Tensor, last_action: Tensor, is_init: Tensor) -> Tensor:
         """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool
         [...].

@@ -237,6 +237,32 @@ def test_calibration_goes_through_the_network_and_is_saved_with_it():
     make_network("paper", "mlp").calibrate(pixels)  # nothing to do, but allowed
 
 
+@pytest.mark.parametrize("make", [make_network, make_actor_critic])
+def test_a_network_without_data_is_whole_when_its_weights_are_loaded(make):
+    network = make("small", "gru", hidden_size=16)
+    with torch.device("meta"):
+        loaded = make("small", "gru", hidden_size=16)
+    loaded.to_empty(device="cpu").load_state_dict(network.state_dict())
+    data = TensorDict(
+        {
+            "pixels": torch.randint(256, (2, 128, 128, 3), dtype=torch.uint8),
+            "last_action": torch.tensor([1, 4]),
+            "is_init": torch.zeros(2, 1, dtype=torch.bool),
+        },
+        batch_size=[2],
+    )
+    data["memory"] = network.initial_state(2)
+    reads = [one(data.clone()) for one in (network, loaded)]
+    for key, value in reads[0].items(True, True):
+        assert torch.equal(reads[1][key], value), key
+
+
+def test_a_network_made_in_inference_mode_is_moved_outside_of_it():
+    with torch.inference_mode():
+        network = make_network("small", "gru", hidden_size=16)
+    assert next(network.to(torch.float64).parameters()).dtype == torch.float64
+
+
 def test_dtype_follows_the_parameters():
     network = make_network("small", "lru").double()
     pixels, last_action, is_init = inputs()

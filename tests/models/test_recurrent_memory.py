@@ -1,6 +1,7 @@
 """``RecurrentMemory``: modules of other libraries, of every layout that is about, keep the laws."""
 
 import copy
+from collections import OrderedDict
 from typing import Any, NamedTuple
 
 import pytest
@@ -88,6 +89,44 @@ def learned_start() -> RecurrentMemory:
     return RecurrentMemory(LearnedStart(), D, H, run=run_steps, start=start_learned)
 
 
+class Carries(nn.Module):
+    """A GRU whose state is put into a container."""
+
+    def __init__(self, put: Any, take: Any) -> None:
+        super().__init__()
+        self.gru = nn.GRU(D, H, batch_first=True)
+        self.put = put
+        self.take = take
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Any]:
+        y, h = self.gru(x, None if state is None else self.take(state)[None])
+        return y, self.put(h[0])
+
+
+def in_order(state: Any) -> Tensor:
+    """The tensor of an OrderedDict."""
+    state.move_to_end("h")
+    return state["h"]  # type: ignore[no-any-return]
+
+
+def in_batch(state: Any) -> Tensor:
+    """The tensor of a TensorDict [B], from one inside of it."""
+    assert state.batch_size == state["deep"].batch_size == state["deep", "h"].shape[:1]
+    return state["deep", "h"]  # type: ignore[no-any-return]
+
+
+def ordered() -> nn.Module:
+    return Carries(lambda h: OrderedDict(h=h), in_order)
+
+
+def in_tensordict() -> nn.Module:
+    return Carries(lambda h: TensorDict({"deep": {"h": h}}, batch_size=[len(h)]), in_batch)
+
+
+def with_nothing() -> nn.Module:
+    return Carries(lambda h: (None, [h, ()]), lambda state: state[1][0])
+
+
 MODULES = {
     "RNN": lambda: nn.RNN(D, H, batch_first=True),
     "GRU, time first": lambda: nn.GRU(D, H),
@@ -96,6 +135,9 @@ MODULES = {
     "LSTM of TorchRL": lambda: TorchRLLSTM(D, H, batch_first=True),
     "GRU of TorchRL": lambda: TorchRLGRU(D, H),
     "all containers": ManyLeaves,
+    "OrderedDict": ordered,
+    "TensorDict": in_tensordict,
+    "None beside a tensor": with_nothing,
 }
 
 
@@ -142,6 +184,152 @@ def test_a_start_of_its_own_is_where_every_episode_begins_and_is_trained() -> No
     torch.testing.assert_close(y[:1, 2:], expected)
     y[0, 2:].sum().backward()
     assert memory.module.begins_with.grad.abs().min() > 0
+
+
+class Swaps(nn.Module):
+    """Returns its dictionary in another order than that in which it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lstm = nn.LSTM(D, H, batch_first=True)
+
+    def forward(self, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+        y, (h, c) = self.lstm(x, (state["h"][None], state["c"][None]))
+        return y, {"c": c[0], "h": h[0]}
+
+
+def test_tensors_of_a_dictionary_go_by_their_keys() -> None:
+    def start(module: nn.Module, batch_size: int) -> Any:
+        return {"h": torch.ones(batch_size, H), "c": torch.zeros(batch_size, H)}
+
+    memory = RecurrentMemory(Swaps(), D, H, start=start)
+    assert memory.initial_state(1)["0"].sum() == H
+    x = torch.randn(1, 6, D)
+    flags = torch.tensor([[True, False, False, True, False, False]])
+    y, _ = memory(x, memory.initial_state(1), flags)
+    begin = (torch.ones(1, 1, H), torch.zeros(1, 1, H))
+    expected = [memory.module.lstm(part, begin)[0] for part in x.split(3, dim=1)]
+    torch.testing.assert_close(y, torch.cat(expected, dim=1))
+    check_memory(memory)
+
+
+@pytest.mark.parametrize("nothing", [None, (), {}, [(), None]], ids=str)
+@pytest.mark.parametrize("begins", [False, True], ids=["", "with a start"])
+def test_a_module_without_a_state_is_a_memory(nothing: Any, begins: bool) -> None:
+    calls = []
+
+    def run(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+        calls.append(x.shape[1])
+        return module(x), nothing
+
+    start = (lambda module, batch_size: nothing) if begins else None
+    memory = RecurrentMemory(nn.Linear(D, H), D, H, run=run, start=start)
+    check_memory(memory)
+    calls.clear()
+    y, state = memory(torch.ones(2, 5, D), memory.initial_state(2), torch.ones(2, 5).bool())
+    assert calls == [5]
+    assert y.shape == (2, 5, H) and state.batch_size == (2,) and state.is_empty()
+
+
+class StartsAtParameter(nn.Module):
+    """Begins with a parameter, and multiplies its output with another."""
+
+    def __init__(self, start: float, factor: float) -> None:
+        super().__init__()
+        self.gru = nn.GRU(D, H, batch_first=True)
+        self.start = nn.Parameter(torch.full((1, 1, H), start))
+        self.factor = nn.Parameter(torch.tensor(factor))
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
+        if state is None:
+            state = self.start.expand(1, len(x), H).contiguous()
+        y, h = self.gru(x, state)
+        return self.factor * y, h
+
+
+@pytest.mark.parametrize(("start", "factor"), [(0.0, 1.0), (1.0, 0.0)])
+def test_a_start_that_is_learned_from_zeros_on_or_hidden_by_a_zero_is_asked_for(
+    start: float, factor: float
+) -> None:
+    module = StartsAtParameter(start, factor)
+    with pytest.raises(ValueError, match=r"or learns what it begins with.*start=lambda"):
+        RecurrentMemory(module, D, H)
+    torch.testing.assert_close(module.start.data, torch.full((1, 1, H), start))
+    fixed = StartsAtParameter(0.0, 1.0)
+    fixed.start.requires_grad_(False)
+    check_memory(RecurrentMemory(fixed, D, H))
+
+
+class Counted(nn.Module):
+    """Counts its calls and drops out, its last part in evaluation mode."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gru = nn.GRU(D, H, batch_first=True)
+        self.frozen = nn.Dropout(0.5).eval()
+        self.register_buffer("calls", torch.zeros(()))
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
+        self.calls += 1
+        y, h = self.gru(x, state)
+        return self.frozen(y), h
+
+
+def test_to_make_one_leaves_parts_and_buffers_as_they_are() -> None:
+    module = Counted()
+    RecurrentMemory(module, D, H)
+    assert [part.training for part in module.children()] == [True, False]
+    assert module.calls == 0
+
+
+OUTSIDE = nn.GRU(D, H, batch_first=True)
+
+
+def run_outside(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+    return OUTSIDE(x, state)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("is_global", [True, False])
+def test_a_run_that_names_the_module_itself_breaks_a_law(is_global: bool) -> None:
+    inside = nn.GRU(D, H, batch_first=True)
+    run = run_outside if is_global else lambda module, x, state: inside(x, state)
+    memory = RecurrentMemory(OUTSIDE if is_global else inside, D, H, run=run)
+    # copied, it would go on with the weights of the first; here in the type that both have
+    with pytest.raises(MemoryLawError, match=r"what is in _read .*take the module that") as info:
+        check_memory(memory, dtype=torch.float32)
+    assert info.value.law == "weights are registered"
+
+
+class Stepwise(nn.Module):
+    """Plain operators, which ``vmap`` knows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(D, H)
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
+        h = x.new_zeros(len(x), H) if state is None else state
+        outputs = []
+        for inputs in self.linear(x).unbind(1):
+            h = torch.tanh(inputs + 0.9 * h)
+            outputs.append(h)
+        return torch.stack(outputs, 1), h
+
+
+def test_several_read_at_once_with_their_own_starts() -> None:
+    memories = [RecurrentMemory(Stepwise(), D, H) for _ in range(3)]
+    stacked = torch.func.stack_module_state(memories)
+    x = torch.randn(3, 2, 7, D)
+    flags = torch.rand(3, 2, 7) < 0.4
+
+    def one(weights: Any, buffers: Any, x: Tensor, flags: Tensor) -> Tensor:
+        inputs = (x, memories[0].initial_state(2), flags)
+        return torch.func.functional_call(memories[0], (weights, buffers), inputs)[0]
+
+    together = torch.func.vmap(one)(*stacked, x, flags)
+    for number, memory in enumerate(memories):
+        y, _ = memory(x[number], memory.initial_state(2), flags[number])
+        torch.testing.assert_close(together[number], y)
 
 
 def test_to_make_one_changes_neither_the_module_nor_random_numbers() -> None:
@@ -191,6 +379,18 @@ class Grows(nn.Module):
         return x, read
 
 
+class Cell(nn.Module):
+    """Reads one step; three axes are no error."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.linear = nn.Linear(D, H)
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
+        h = torch.tanh(self.linear(x) if state is None else self.linear(x) + state)
+        return h, h
+
+
 class OneForAll(nn.Module):
     """One state for the whole batch."""
 
@@ -211,6 +411,25 @@ class BeginsWithOnes(nn.Module):
     def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
         h = torch.ones_like(x[:, 0]) if state is None else state
         return x + h[:, None], h
+
+
+class Inside(nn.Module):
+    """Does not say that time is the first axis of what is in it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lstm = nn.LSTM(D, H)
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Any]:
+        return self.lstm(x, state)  # type: ignore[no-any-return]
+
+
+def run_by_rows(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+    return x, tuple(x.sum(1) for _ in x)
+
+
+def run_with_more(module: nn.Module, x: Tensor, state: Any) -> Any:
+    return x, state, {}
 
 
 def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
@@ -243,6 +462,36 @@ def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
             "the state of start.*what it begins with by start=",
         ),
         (lambda: RecurrentMemory(nn.GRU(D, H), 0, H), ValueError, "sizes must be positive"),
+        (lambda: RecurrentMemory(nn.GRU, D, H), TypeError, "the class GRU: make one of it"),
+        (lambda: RecurrentMemory(nn.LazyLinear(H), D, H), TypeError, "no shape before the first"),
+        (lambda: RecurrentMemory(nn.GRUCell(D, H), D, H), TypeError, r"run= with a loop over x\."),
+        (lambda: RecurrentMemory(Cell(), D, H), ValueError, r"run= with a loop over x\.unbind"),
+        (lambda: RecurrentMemory(Inside(), D, H), ValueError, "whatever the batch.*time for its"),
+        (
+            lambda: RecurrentMemory(nn.GRU(D, H), D, H, start=torch.zeros),
+            TypeError,
+            r"start of GRU fails.*called as start\(module, batch_size\)",
+        ),
+        (
+            lambda: RecurrentMemory(nn.GRU(D, H), D, H, start=lambda module, batch_size: None),
+            ValueError,
+            r"start gives a state of no tensor, and GRU returns one of \[1, 2, 4\]",
+        ),
+        (
+            lambda: RecurrentMemory(nn.Linear(D, D), D, D, run=run_with_more),
+            TypeError,
+            r"gives a \(Tensor, NoneType, dict\) and not \(y, state\)",
+        ),
+        (
+            lambda: RecurrentMemory(nn.Linear(D, D), D, D, run=run_by_rows),
+            ValueError,
+            "1: .* for a batch of two and .*2: .* for one of three",
+        ),
+        (
+            lambda: RecurrentMemory(Carries(lambda h: {"h": h}, lambda s: s.h), D, H),
+            TypeError,
+            "a state of zeros .*no attribute 'h'.*run=lambda",
+        ),
     ],
 )
 def test_what_does_not_fit_is_said_in_one_line(make: Any, error: Any, said: str) -> None:

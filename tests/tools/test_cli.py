@@ -305,6 +305,18 @@ def test_the_hint_after_an_interruption_keeps_every_option(
     assert said.endswith(f": arcade-torch {' '.join(words)} --import {own_game}\n")
 
 
+def test_a_resume_without_a_run_says_that_one_begins(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "--preset", "smoke", "--total-frames", "128", "--out", str(tmp_path / "run")]
+    said = []
+    for _ in range(2):
+        assert cli.main([*words, "--resume"]) == 0
+        said.append(capsys.readouterr().out)
+    assert "/run to go on with: this one begins" in said[0]
+    assert "this one begins" not in said[1]
+
+
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
     words = [
         "--preset",

@@ -109,6 +109,8 @@ class Train(Command):
             from arcade_torch.tools.play.recording import EvaluationVideos
 
             film = EvaluationVideos(folder / "videos", f".{self.videos}")
+        if self.resume and not (folder / "config.json").exists():
+            say(f"no run in {folder} to go on with: this one begins")
         if self.resume:
             import_again(folder)
         # a study has checked what its workers train, and a run that was begun what it goes on with
