@@ -428,6 +428,20 @@ def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -
     assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 1/4 runs\n"
 
 
+def test_the_display_counts_no_frames_that_a_failed_run_did_not_train(tmp_path: Path) -> None:
+    """A study all of whose runs had failed was at 100 %."""
+    what = small_study(seeds=1)
+    folder = StudyFolder(tmp_path / "s")
+    runs = what.runs()
+    write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
+    write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
+    stream = io.StringIO()
+    with Bars(stream, "frames") as bars:
+        of_run = {run.name: folder.run(run) for run in runs}
+        show_progress(bars, "toy", of_run, {run.name for run in runs})
+    assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 4/4 runs\n"
+
+
 def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
     with progress_bars("toy", {}, set(), stream) as note:
