@@ -106,11 +106,10 @@ def import_for_command(names: Sequence[str]) -> None:
 
 def _note(chosen: Sequence[list[str]]) -> None:
     """Add files with their hashes to the user's record, one process after the other."""
-    from filelock import FileLock
+    from arcade_torch.agents.runs.lock import locked
 
     file = record_file()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(file.with_suffix(".lock"), timeout=LOCK_LIMIT_S):
+    with locked(file, LOCK_LIMIT_S):
         entries = [entry for entry in _trusted() if entry not in chosen]
         write_json(file, [*entries, *chosen][-MOST_TRUSTED:])
 

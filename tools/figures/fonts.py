@@ -65,9 +65,9 @@ def _fonts_with(letters: str) -> list[str]:
     names = list[str]()
     while wanted and covered:
         best = max(covered, key=lambda name: len(covered[name] & wanted))
-        found = covered.pop(best) & wanted
-        if not found:
+        letters_of_best = covered.pop(best) & wanted
+        if not letters_of_best:
             break
         names.append(best)
-        wanted -= found
+        wanted -= letters_of_best
     return names
