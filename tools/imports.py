@@ -39,6 +39,8 @@ MOST_REMEMBERED = 100
 """Imports of one run."""
 MOST_TRUSTED = 1_000
 """Entries in the user's record; the oldest are forgotten."""
+LOCK_LIMIT_S = 10.0
+"""So long another process may write that record; after that, nothing is noted."""
 Import = dict[str, str]
 """``name``, of a file its absolute path, and ``sha256``, which is empty for a module."""
 
@@ -97,10 +99,19 @@ def import_for_command(names: Sequence[str]) -> None:
     chosen = [[name, _hashes[name]] for name in names if name in _hashes]
     if not chosen:
         return
-    entries = [entry for entry in _trusted() if entry not in chosen]
     # without a home, or on a disk that takes no files, --import has to be given every time
     with contextlib.suppress(OSError, RuntimeError):
-        write_json(record_file(), [*entries, *chosen][-MOST_TRUSTED:])
+        _note(chosen)
+
+
+def _note(chosen: Sequence[list[str]]) -> None:
+    """Add files with their hashes to the user's record, one process after the other."""
+    from arcade_torch.agents.runs.lock import locked
+
+    file = record_file()
+    with locked(file, LOCK_LIMIT_S):
+        entries = [entry for entry in _trusted() if entry not in chosen]
+        write_json(file, [*entries, *chosen][-MOST_TRUSTED:])
 
 
 def load_extensions(names: Sequence[str] = ()) -> None:

@@ -169,11 +169,11 @@ def open_run(path: Path) -> Run | None:
     if run.final is None:
         check_mean(path)
         return None
-    _check_unchanged(run)
+    check_unchanged(run)
     return run
 
 
-def _check_unchanged(run: Run) -> None:
+def check_unchanged(run: Run) -> None:
     """Refuse settings that are not those of the run's newest checkpoint, where it keeps one: they
     were changed since.
     """

@@ -1,7 +1,11 @@
 """Names in figures are text: never mathematics, never markup, and never missing from a legend."""
 
 import re
+import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from io import BytesIO
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,10 @@ from arcade_torch.tools import cli, saliency_figure
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import logs
 from arcade_torch.tools.figures.catalogue import FIGURES
+from arcade_torch.tools.figures.fonts import save_figure
 from arcade_torch.tools.figures.style import drawing, new_figure, svg
+from arcade_torch.tools.measures.gap_bias import ScoreOptions
+from arcade_torch.tools.measures.gap_bias.figure import gap_bias, returns
 from arcade_torch.tools.names import printable
 from tests.tools.test_runs import write
 
@@ -154,3 +161,81 @@ def test_every_maker_of_figures_is_covered_here_or_has_no_names() -> None:
         "contamination",
     }  # fixed names, or by the style alone
     assert set(FIGURES) == drawn_here | others
+
+
+def scores_of(folder: Path, agents: Sequence[str]) -> Path:
+    """A table of scores of some agents, near each other, and of one without memory."""
+    lines = ["agent,game,observability,seed,score"]
+    for place, agent in enumerate(("mlp", *agents)):
+        for game, twin in product(("TetrisEasy", "SignpostEasy"), ("full", "partial")):
+            value = 0.3 + 0.01 * (7 * place % 11) + 0.02 * (place % 5) * (twin == "full")
+            lines.append(f"{agent},{game},{twin},0,{value}")
+    file = folder / "scores.csv"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return file
+
+
+def overlapping(boxes: Sequence[Any]) -> int:
+    """How many pairs of boxes lie over each other."""
+    return sum(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+@pytest.mark.parametrize("count", [11, 49])
+def test_many_agents_are_numbered_in_gap_bias_and_named_beside_it(
+    count: int, tmp_path: Path
+) -> None:
+    """Fifty names were drawn over each other and beyond the picture."""
+    agents = [f"pqn-memory{place:02} 2x128" for place in range(count)]
+    options = ScoreOptions(runs=(scores_of(tmp_path, agents),), draws=10)
+    with drawing("light"):
+        (picture,) = gap_bias(options, None).pictures
+        picture.figure.draw_without_rendering()
+        axis = picture.figure.axes[0]
+        assert [text.get_text() for text in axis.texts] == [str(n) for n in range(1, count + 2)]
+        boxes = [text.get_window_extent() for text in axis.texts]
+        assert overlapping(boxes) <= count // 10
+        named = axis.get_legend().get_texts()
+        assert [text.get_text() for text in named][1:] == [
+            f"{number}  {agent}" for number, agent in enumerate(agents, 2)
+        ]
+        right = picture.figure.bbox.x1
+        assert all(text.get_window_extent().x1 <= right for text in named)
+    looks = {(bar.lines[0].get_marker(), bar.lines[0].get_color()) for bar in axis.containers}
+    assert len(looks) == count + 1
+
+
+def test_bars_and_legends_of_many_agents_stand_inside_the_picture(tmp_path: Path) -> None:
+    agents = [f"pqn-memory{place:02} 2x128" for place in range(30)]
+    options = ScoreOptions(runs=(scores_of(tmp_path, agents),), draws=10)
+    with drawing("light"):
+        bars, without = returns(options, None).pictures
+        for figure in (bars.figure, without.figure):
+            figure.draw_without_rendering()
+        for axis in bars.figure.axes:
+            names = axis.get_xticklabels()
+            step = names[1].get_window_extent().x1 - names[0].get_window_extent().x1
+            assert step > names[0].get_fontsize()
+        (legend,) = without.figure.legends
+        for text in legend.get_texts():
+            box = text.get_window_extent()
+            assert box.x0 >= 0 and box.x1 <= without.figure.bbox.x1
+
+
+def test_letters_of_other_fonts_are_drawn_and_those_of_none_are_told_in_a_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Chinese names and emoji were boxes, each with a warning of matplotlib. U+24B6 is in STIX,
+    which comes with matplotlib; no font has U+E0F0 of the private area.
+    """
+    words = ["figure", "gap-bias", "--runs", str(scores_of(tmp_path, ["\u24b6", "\ue0f0"]))]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cli.main([*words, "--out", str(tmp_path / "f.png")]) == 0
+    out, err = capfd.readouterr()
+    assert "drawn as boxes, no installed font has them: \ue0f0; " in out
+    assert "Glyph" not in out + err
+    with drawing("light"):
+        figure = new_figure()
+        text = figure.text(0.5, 0.5, "a\u24b6")
+        assert save_figure(figure, BytesIO(), format="png") == ""
+    assert "STIXGeneral" in text.get_fontfamily()

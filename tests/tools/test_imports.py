@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -109,6 +111,35 @@ def test_other_commands_on_a_run_need_none_either(folder: Path, tmp_path: Path) 
     assert cli.main([*words, "--out", str(tmp_path / "film.gif")]) == cli.EXIT_OK
     words = ["analyze", "recall-density", run, "--episodes", "1", "--out", str(tmp_path)]
     assert cli.main(words) == cli.EXIT_OK
+
+
+def test_commands_at_once_all_note_what_they_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each read the record, and wrote it without what the others had added."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv(imports.VARIABLE, "")
+    monkeypatch.setenv(imports.HASHES_VARIABLE, "")
+    trusted = imports._trusted
+
+    def slowly() -> list[Any]:
+        entries = trusted()
+        time.sleep(0.05)
+        return entries
+
+    in_a_new_process(monkeypatch)
+    monkeypatch.setattr(imports, "_trusted", slowly)
+    files = [tmp_path / f"games_{place}.py" for place in range(4)]
+    threads = []
+    for file in files:
+        file.write_text("")
+        imports.load_extensions([str(file)])
+        threads.append(threading.Thread(target=imports.import_for_command, args=([str(file)],)))
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {name for name, _ in trusted()} == set(map(str, files))
 
 
 def test_a_run_remembers_nothing_that_it_does_not_need(folder: Path, tmp_path: Path) -> None:

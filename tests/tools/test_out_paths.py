@@ -12,6 +12,7 @@ import pytest
 from arcade_torch.agents.runs.files import check_writable, write_atomic
 from arcade_torch.tools import cli
 from tests.tools.fabricated import small_study, write_study
+from tests.tools.test_cli import one_error
 
 AGENT = "signpost-partial-lru"
 COMMANDS = {
@@ -133,3 +134,16 @@ def test_a_run_folder_is_no_agent_to_pull(
     assert cli.main(["pull", str(run), "--out", "agent"]) == 2
     assert "no agent that was shared" in capsys.readouterr().err
     assert not Path("agent").exists()
+
+
+def test_a_table_of_settings_may_be_a_page_and_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``--out h.md`` made a folder of that name."""
+    page = tmp_path / "h.v2.md"
+    assert cli.main(["figure", "hyperparameters", "--paper", "--out", str(page)]) == 0
+    assert page.read_text().startswith("|")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["h.v2.csv", "h.v2.md"]
+    capsys.readouterr()
+    words = ["figure", "gap-bias", "--paper", "--out", str(tmp_path / "g.md")]
+    assert "a folder, or a file that ends in .pdf, .png, .svg, .csv" in one_error(capsys, words)

@@ -428,6 +428,20 @@ def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -
     assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 1/4 runs\n"
 
 
+def test_the_display_counts_no_frames_that_a_failed_run_did_not_train(tmp_path: Path) -> None:
+    """A study all of whose runs had failed was at 100 %."""
+    what = small_study(seeds=1)
+    folder = StudyFolder(tmp_path / "s")
+    runs = what.runs()
+    write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
+    write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
+    stream = io.StringIO()
+    with Bars(stream, "frames") as bars:
+        of_run = {run.name: folder.run(run) for run in runs}
+        show_progress(bars, "toy", of_run, {run.name for run in runs})
+    assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 4/4 runs\n"
+
+
 def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
     with progress_bars("toy", {}, set(), stream) as note:
@@ -537,3 +551,29 @@ def test_the_presets_are_studies() -> None:
     assert sizes == {"demo": 24, "paper-easy": 800, "paper": 2400, "size-sweep": 192}
     with pytest.raises(ValueError, match=r"preset of a study must be one of .*; got 'papers'"):
         study_preset("papers")
+
+
+def test_options_of_one_memory_stand_under_its_name(tmp_path: Path) -> None:
+    """Those of ``[settings]`` go to every memory, and ``mlp`` beside yours refused them."""
+    file = tmp_path / "s.toml"
+    text = (
+        'games = "SignpostEasy"\nmemories = ["frame_stack", "mlp"]\nseeds = 1\npreset = "small"\n'
+    )
+    file.write_text(f"{text}[memory_options.frame_stack]\nframes = 7\n")
+    what = Study.load(file)
+    for run, config in planned(what).items():
+        options = config.network_options.get("memory_options", {})
+        assert options == ({"frames": 7} if run.memory == "frame_stack" else {})
+    assert Study.from_dict(json.loads(json.dumps(what.to_dict()))) == what
+    other = replace(what, memory_options={"frame_stack": {"frames": 8}})
+    study(what, tmp_path / "s", Fabricator(what), stream=io.StringIO())
+    with pytest.raises(FileExistsError, match="memory_options"):
+        study(other, tmp_path / "s", Fabricator(what), stream=io.StringIO())
+    for options, said in (
+        ("[memory_options.gru]\nx = 1", "memory_options names 'gru'"),
+        ("[memory_options]\nframe_stack = 7", "memory_options.frame_stack"),
+        ("[memory_options.frame_stack]\nnope = 7", "nope"),
+    ):
+        file.write_text(f"{text}{options}\n")
+        with pytest.raises((ValueError, TypeError), match=said):
+            planned(Study.load(file))

@@ -7,7 +7,7 @@ from pathlib import Path
 import tyro
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.runs.files import check_writable_folder, read_bytes, write_atomic
+from arcade_torch.agents.runs.files import check_writable_folder, read_bytes
 from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import existing_agent, import_again
 from arcade_torch.tools.options import Command, at_least
@@ -96,7 +96,8 @@ class Pull(Command):
             is_bundle,
         )
         from arcade_torch.agents.runs.files import checksum
-        from arcade_torch.tools.sharing.share import EVALUATION, FILMS, README, RESULTS
+        from arcade_torch.tools.sharing.place import FILMS, put_files
+        from arcade_torch.tools.sharing.share import EVALUATION, README, RESULTS
 
         if self.sha256 is not None:
             check_hash(self.sha256)
@@ -119,9 +120,11 @@ class Pull(Command):
         if out.exists():
             raise FileExistsError(f"{out} exists: choose another folder with --out")
         check_writable_folder(out)
+        files = dict[str, bytes]()
         for name in (CONFIG, WEIGHTS, *extras):
             if (source / name).is_file():
-                write_atomic(out / name, read_bytes(source / name, sizes[name]))
+                files[name] = read_bytes(source / name, sizes[name])
+        put_files(files, out)
         config = agent.config
         say(f"{config.algorithm}-{config.memory} on {config.env} ({config.observability})")
         say(f"sha256 {checksum(out / WEIGHTS)}")

@@ -5,7 +5,7 @@ folder below `arcade_torch.tools.measures`, their table in `catalogue`, their lo
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from arcade_torch.tools.files import Table
 
@@ -16,6 +16,7 @@ Part = Literal[
 ]  # fmt: skip
 PICTURES = (".pdf", ".png", ".svg")
 NUMBERS = (".csv",)
+MARKDOWN = ".md"
 
 # The comment behind an option is its help.
 
@@ -31,11 +32,12 @@ class Options:
     """
     style: Literal["light", "print"] = "light"  # For a screen, or for a page.
     csv: bool = False  # Print the numbers as CSV in the place of tables, and nothing else.
+    kinds: ClassVar[tuple[str, ...]] = (*PICTURES, *NUMBERS)  # of the files that ``out`` can be
 
     def path(self, name: str) -> tuple[Path, tuple[str, ...]]:
         """Path without ending, and the endings, of the files of a figure."""
         out = self.out or Path("figures")
-        if out.suffix in (*PICTURES, *NUMBERS):
+        if out.suffix in self.kinds:
             return out.with_suffix(""), (out.suffix,)
         return out / name, (".pdf", ".png", *NUMBERS)
 
@@ -45,6 +47,13 @@ class PaperOptions(Options):
     """Options of figures that the paper's own numbers can be drawn in."""
 
     paper: bool = False  # The paper's published numbers in the place of runs.
+
+
+@dataclass
+class TableOptions(PaperOptions):
+    """Options of figures that are a table, which Markdown has too."""
+
+    kinds: ClassVar[tuple[str, ...]] = (*PICTURES, *NUMBERS, MARKDOWN)
 
 
 @dataclass
@@ -69,6 +78,7 @@ class Picture:
     note: str = ""
     rows: Sequence[Mapping[str, Any]] = ()
     arrays: Mapping[str, Any] = field(default_factory=dict)
+    missing: str = ""  # letters that no font has, known when it was saved
 
 
 @dataclass

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable, check_writable_folder
 from arcade_torch.tools.figures import (
+    MARKDOWN,
     NUMBERS,
     PICTURES,
     CurveOptions,
@@ -13,6 +14,7 @@ from arcade_torch.tools.figures import (
     Options,
     PaperOptions,
     Progress,
+    TableOptions,
 )
 from arcade_torch.tools.measures import EpisodeOptions
 from arcade_torch.tools.measures.beliefs import BeliefsOptions
@@ -22,7 +24,10 @@ from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
 from arcade_torch.tools.measures.recall_density import DensityOptions
 from arcade_torch.tools.measures.saliency import SaliencyOptions
 
-OF_FILES = (*PICTURES, *NUMBERS, ".jpg", ".jpeg", ".gif", ".webp", ".tif", ".tiff", ".eps", ".ps")
+OF_FILES = (
+    *PICTURES, *NUMBERS, ".jpg", ".jpeg", ".gif", ".webp", ".tif", ".tiff", ".eps", ".ps",
+    MARKDOWN, ".txt", ".html", ".json", ".npz",
+)  # fmt: skip
 """Endings that no folder has, in capitals either: somebody means a file."""
 
 
@@ -116,7 +121,7 @@ FIGURES = {
         "--out figures",
     ),
     "hyperparameters": Entry(
-        PaperOptions,
+        TableOptions,
         "figures.logs.hyperparameters",
         "table of the settings of runs, or of the paper's preset",
         "--paper",
@@ -151,6 +156,12 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
         result: Made = make(options, progress)
         for picture in result.pictures:
             result.files += save(options, picture)
+    missing = "".join(sorted({letter for picture in result.pictures for letter in picture.missing}))
+    if missing:
+        result.notes.append(
+            f"drawn as boxes, no installed font has them: {missing}; install one that does, or "
+            "take --out NAME.svg"
+        )
     return result
 
 
@@ -161,6 +172,6 @@ def _check_out(options: Options) -> None:
         check_writable(base.with_name(base.name + endings[0]))
         return
     is_folder = base.parent.suffix.lower() not in OF_FILES
-    allowed = f"a folder, or a file that ends in {', '.join((*PICTURES, *NUMBERS))}"
+    allowed = f"a folder, or a file that ends in {', '.join(options.kinds)}"
     require(is_folder, "--out", str(base.parent), allowed)
     check_writable_folder(base.parent)

@@ -18,9 +18,9 @@ from arcade_torch.tools.figures import (
     CurveOptions,
     Made,
     Options,
-    PaperOptions,
     Picture,
     Progress,
+    TableOptions,
     style,
 )
 from arcade_torch.tools.files import markdown_table, read_csv, read_rows
@@ -114,17 +114,16 @@ def plot(
     """Draw the curves of one task; ``levels`` are dashed lines with a name."""
     longest = max(float(curve.frames[-1]) for curve in curves.values())
     unit, name = (1e6, "million frames") if longest >= 2e6 else (1e3, "thousand frames")
+    colours = style.agent_colours(agents)
+    markers = style.agent_markers(agents, colours)
     for agent, (frames, returns) in curves.items():
         place = agents.index(agent)
-        colour = style.agent_colours(agents)[agent]
         x = frames / unit
         if np.isfinite(returns.low).any():
-            axis.fill_between(x, returns.low, returns.high, color=colour, alpha=0.18, lw=0)
-        marker = style.MARKERS[place % len(style.MARKERS)] if x.size <= 12 else None
-        line = style.DASHES[place % len(style.DASHES)]
-        axis.plot(
-            x, returns.mean, color=colour, label=style.legend_name(agent), marker=marker, ls=line
-        )
+            axis.fill_between(x, returns.low, returns.high, color=colours[agent], alpha=0.18, lw=0)
+        look = {"color": colours[agent], "marker": markers[agent] if x.size <= 12 else None}
+        line = style.DASHES[(place + place // len(style.SPARE_COLOURS)) % len(style.DASHES)]
+        axis.plot(x, returns.mean, label=style.legend_name(agent), ls=line, **look)
     for level, value in (levels or {}).items():
         axis.axhline(value, color=style.NEUTRAL, lw=1, ls="--")
         axis.annotate(
@@ -363,7 +362,7 @@ def _line(axis: Any, rates: Mapping[int, float], **look: Any) -> None:
         axis.plot(list(rates), list(rates.values()), **look)
 
 
-def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
+def hyperparameters(options: TableOptions, progress: Progress | None) -> Made:
     """``hyperparameters``: CSV and Markdown, and the table as a picture; one column an algorithm.
 
     Generated from the configs themselves, so that it cannot go stale.
@@ -393,8 +392,9 @@ def hyperparameters(options: PaperOptions, progress: Progress | None) -> Made:
         table.append([name, *values])
     base, endings = options.path("hyperparameters")
     files = []
-    if len(endings) > 1:
-        files.append(write_atomic(base.with_suffix(".md"), markdown_table(head, table) + "\n"))
+    if len(endings) > 1 or ".md" in endings:
+        file = base.with_name(f"{base.name}.md")
+        files.append(write_atomic(file, markdown_table(head, table) + "\n"))
     rows = [dict(zip(head, line, strict=True)) for line in table]
     picture = Picture("hyperparameters", _table_figure(head, table), rows=rows)
     return Made([picture], notes, files=files)

@@ -5,7 +5,8 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
 from io import BytesIO, StringIO
@@ -18,6 +19,7 @@ import numpy as np
 from arcade_torch.agents.runs.files import write_atomic
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import NUMBERS, PICTURES, Options, Picture
+from arcade_torch.tools.figures.fonts import save_figure
 from arcade_torch.tools.files import write_csv, write_npz
 from arcade_torch.tools.measures.bootstrap import Array, measured_coverage
 from arcade_torch.tools.text import printable
@@ -159,20 +161,37 @@ def legend_name(name: str) -> str:
     return f"\u200b{name}" if name.startswith("_") else name
 
 
-def legend_above(figure: Any, handles: Sequence[Any], most: int = 8) -> None:
+def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str, str]:
+    """A marker for every agent: two that share a colour have different ones, up to 64 agents."""
+    markers: dict[str, str] = {}
+    taken = set[tuple[str, str]]()
+    for place, agent in enumerate(agents):
+        colour = colours[agent]
+        turned = [MARKERS[(place + step) % len(MARKERS)] for step in range(len(MARKERS))]
+        free = [marker for marker in turned if (marker, colour) not in taken]
+        markers[agent] = free[0] if free else turned[0]
+        taken.add((markers[agent], colour))
+    return markers
+
+
+def legend_above(
+    figure: Any, handles: Sequence[Any], most: int = 8, loc: str = "outside upper center"
+) -> None:
     """Put a legend above the panels, in as many columns as its names leave room for; the figure
     grows with its lines.
     """
-    legend = figure.legend(handles=handles, loc="outside upper center", ncols=1)
+    legend = figure.legend(handles=handles, loc=loc, ncols=1)
     size = legend.prop.get_size_in_points()
-    letters = max([len(handle.get_label()) for handle in handles], default=0)
-    column_pt = 0.6 * size * (letters + 7)  # with the sample of a line
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of letters that the font lacks, see `save_figure`
+        widths = [text.get_window_extent().width for text in legend.get_texts()]
+    column_pt = 72 / figure.dpi * max(widths, default=0.0) + 5 * size  # with the sample of a line
     room = int(72 * figure.get_figwidth() / column_pt)
     columns = max(1, min(most, len(handles), room))
     lines = math.ceil(len(handles) / columns)
     figure.set_figheight(figure.get_figheight() + 1.6 * size / 72 * max(0, lines - 2))
     legend.remove()
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns)
+    figure.legend(handles=handles, loc=loc, ncols=columns)
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
@@ -265,7 +284,9 @@ def save(options: Options, picture: Picture) -> list[Path]:
     for ending in endings:
         if ending in PICTURES:
             buffer = BytesIO()
-            figure.savefig(buffer, format=ending[1:])
+            missing = save_figure(figure, buffer, format=ending[1:])
+            if missing and not picture.missing:
+                picture.missing = missing
             written.append(write_atomic(base.with_name(base.name + ending), buffer.getvalue()))
     if picture.rows:
         written.append(write_csv(base.with_name(base.name + ".csv"), picture.rows))
@@ -277,7 +298,10 @@ def save(options: Options, picture: Picture) -> list[Path]:
 def svg(figure: Any, name: str) -> str:
     """A figure as an SVG element that can stand in a page beside others."""
     buffer = StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    # letters are text there: a browser has fonts of its own
+    save_figure(
+        figure, buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
+    )
     text = buffer.getvalue()
     text = re.sub(
         r"<metadata>.*?</metadata>|<!--.*?-->", "", text[text.index("<svg") :], flags=re.DOTALL
@@ -296,7 +320,7 @@ def png(figure: Any, colours: int = 128) -> bytes:
     """A figure as a small PNG file, its colours counted."""
     buffer = BytesIO()
     packed = BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
+    save_figure(figure, buffer, format="png", dpi=150)
     need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(
         packed, "PNG", optimize=True
     )

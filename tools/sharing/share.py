@@ -20,12 +20,13 @@ from arcade_torch.agents.runs.files import checksum, read_json, write_atomic, wr
 from arcade_torch.tools.errors import MissingPackage
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.machine import versions
+from arcade_torch.tools.runs import Run, check_unchanged
 from arcade_torch.tools.sharing import card
+from arcade_torch.tools.sharing.place import FILMS, put_files, read_folder
 
 RESULTS = "results.json"
 README = "README.md"
 EVALUATION = ".eval_results/arcade-torch.yaml"
-FILMS = ("replay.mp4", "replay.gif")
 MOST_STEPS = 500
 """Of the episode in the film."""
 _TRAINING = ("train", "study", "demo", "compare")
@@ -46,6 +47,8 @@ def share(
 ) -> dict[str, Any]:
     """Write the agent of a run into a folder, and evaluate what was written.
 
+    The folder is written when all of it is there: until then an agent that it holds stays.
+
     Args:
         run: run folder, checkpoint, or an agent that was shared.
         folder: where to; made if it is missing.
@@ -60,8 +63,20 @@ def share(
     Raises:
         CheckpointError: there is no agent at ``run``.
         FileExistsError: the folder holds something else.
+        ValueError: the settings in the run folder are not those of its checkpoint.
     """
     _check_free(folder)
+    with tempfile.TemporaryDirectory() as scratch:
+        draft = Path(scratch) / folder.resolve().name
+        results = _write(run, draft, repo, episodes, half, film)
+        put_files(read_folder(draft), folder)
+    return results
+
+
+def _write(
+    run: Path, folder: Path, repo: str, episodes: int, half: bool, film: bool
+) -> dict[str, Any]:
+    """Write all files into a new folder, for `share`."""
     checkpoint = find_checkpoint(run)
     record = _record_of(run)
     packages = record.get("versions")
@@ -69,7 +84,7 @@ def share(
     training = {"versions": made_by, "command": _command(record)}
     needs = [Path(name).name for name in remembered_imports(record, run / CONFIG)]
     write_bundle(folder, checkpoint, training | {"needs": needs}, half)
-    stored = load_bundle(folder)
+    stored = replace(load_bundle(folder), path=run)  # errors name what the user named
     result = _evaluated(stored, episodes)
     results = _results(stored, result)
     if half:
@@ -96,6 +111,8 @@ def _record_of(run: Path) -> dict[str, Any]:
     for place in (run, run.parent, run.parent.parent):
         if (place / CONFIG).is_file():
             record = read_json(place / CONFIG)
+            if isinstance(record, dict):
+                check_unchanged(Run(place))
             return record if isinstance(record, dict) else {}
     return {}
 

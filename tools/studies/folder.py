@@ -131,8 +131,9 @@ class StudyFolder:
             raise FileExistsError(
                 f"{self.root} is not empty and holds no study: choose another --out"
             )
-        self._check_finished(study)
-        self._check_begun(study)
+        runs = {spec: self.run(spec) for spec in study.runs()}  # each is read once
+        _check_finished(study, runs)
+        _check_begun(study, runs)
         new = self._new_record(study, command, old)
         if new != old:
             write_json(file, new)
@@ -154,29 +155,6 @@ class StudyFolder:
                     f"{self.root} holds run {run.name}, which this study lacks: choose another "
                     "--out"
                 )
-
-    def _check_finished(self, study: Study) -> None:
-        """Refuse a finished run that has other settings than the study says."""
-        finished = [spec for spec in study.runs() if self.run(spec).final is not None]
-        for spec, config in study.configs(finished).items():
-            run = self.run(spec)
-            fields = _other_settings(run, config)
-            if fields:
-                raise FileExistsError(
-                    f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
-                )
-            _check_imports(run, config)
-
-    def _check_begun(self, study: Study) -> None:
-        """Refuse to go on from the checkpoint of another text of an imported file."""
-        begun = list[RunSpec]()
-        for spec in study.runs():
-            run = self.run(spec)
-            if run.final is None and any(run.path.glob("checkpoints/frames-*")):
-                begun.append(spec)
-        for spec, config in study.configs(begun).items():
-            with contextlib.suppress(ValueError, FileNotFoundError):  # told when it goes on
-                _check_imports(self.run(spec), config)
 
     def _new_record(self, study: Study, command: str, old: dict[str, Any]) -> dict[str, Any]:
         """What ``study.json`` is to hold; the versions of the first runs stay on record."""
@@ -246,6 +224,30 @@ class StudyFolder:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
         return ""
+
+
+def _check_finished(study: Study, runs: Mapping[RunSpec, Run]) -> None:
+    """Refuse a finished run that has other settings than the study says."""
+    finished = [spec for spec, run in runs.items() if run.final is not None]
+    for spec, config in study.configs(finished).items():
+        run = runs[spec]
+        fields = _other_settings(run, config)
+        if fields:
+            raise FileExistsError(
+                f"{run.path} has other settings, {', '.join(fields)}: choose another --out"
+            )
+        _check_imports(run, config)
+
+
+def _check_begun(study: Study, runs: Mapping[RunSpec, Run]) -> None:
+    """Refuse to go on from the checkpoint of another text of an imported file."""
+    begun = list[RunSpec]()
+    for spec, run in runs.items():
+        if run.final is None and any(run.path.glob("checkpoints/frames-*")):
+            begun.append(spec)
+    for spec, config in study.configs(begun).items():
+        with contextlib.suppress(ValueError, FileNotFoundError):  # told when it goes on
+            _check_imports(runs[spec], config)
 
 
 def _check_cell(run: Run, spec: RunSpec) -> None:

@@ -43,6 +43,7 @@ _AXES: dict[str, Any] = {
 _OTHERS = {
     "name": _text("made of letters, digits, dots and dashes", _FOLDER),
     "settings": Options,
+    "memory_options": Options,
     "preset": str,
     "baseline": str,
     "question": str,
@@ -110,6 +111,8 @@ class Study:
     question: str = ""  # what the study asks, a sentence for its report
     # the memory, or the agent, that the report is about: it is compared with every other
     subject: str = ""
+    # options of one memory, by its name: ``{"frame_stack": {"frames": 7}}``
+    memory_options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, kind in _OTHERS.items():
@@ -126,6 +129,13 @@ class Study:
                 )
         for name in ("env_options", "network_options"):
             coerce(f"settings: {name}", self.settings.get(name, {}), Options)
+        for memory, options in self.memory_options.items():
+            coerce(f"memory_options.{memory}", options, Options)
+            if memory not in self.memories:
+                raise ValueError(
+                    f"memory_options names {memory!r}, which is none of memories, "
+                    f"{', '.join(self.memories)}"
+                )
         for name in ("layers", "hidden_size"):
             if self.sizes and name in self.settings.get("network_options", {}):
                 raise ValueError(
@@ -227,6 +237,7 @@ class Study:
             "preset": self.preset,
             "total_frames": self.total_frames,
             "settings": flatten(self.settings),
+            "memory_options": flatten(self.memory_options),
         }
 
     def runs(self) -> list[RunSpec]:
@@ -272,6 +283,9 @@ class Study:
             changes["total_frames"] = self.total_frames
         for name in ("env_options", "network_options"):
             changes[name] = dict(getattr(base, name)) | dict(changes.get(name, {}))
+        if of_memory := self.memory_options.get(run.memory):
+            common = changes["network_options"].get("memory_options") or {}
+            changes["network_options"]["memory_options"] = {**common, **of_memory}
         if run.size:
             layers, hidden_size = map(int, run.size.split("x"))
             changes["network_options"] |= {"layers": layers, "hidden_size": hidden_size}

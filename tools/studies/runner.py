@@ -362,7 +362,7 @@ def show_progress(
     all_frames = 0
     for name, (done, total, status) in seen.items():
         total = total or usual
-        done = total if name in ended else min(done, total)
+        done = total if status == "finished" else min(done, total)
         all_done += done
         all_frames += total
         bar = f"  {name.replace('__', ' ')}"

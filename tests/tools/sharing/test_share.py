@@ -1,6 +1,7 @@
 """``arcade-torch push`` and ``pull`` with a folder in place of the hub."""
 
 import json
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.agents import evaluate, from_pretrained, preset, train
-from arcade_torch.agents.runs.files import checksum
+from arcade_torch.agents.runs.files import checksum, read_json, write_json
 from arcade_torch.agents.runs.shipped import SHIPPED
 from arcade_torch.tools import cli
 from arcade_torch.tools.commands.share import is_folder
@@ -138,6 +139,74 @@ def test_a_film_is_pushed_where_an_extra_writes_one(run: Path, tmp_path: Path) -
     assert cli.main(["push", str(run), str(folder), "--episodes", "4"]) == 0
     films = [path.name for path in folder.glob("replay.*")]
     assert len(films) == 1 and films[0] in (folder / "README.md").read_text()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_a_push_that_is_stopped_leaves_the_agent_that_was_there(
+    run: Path, pushed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The weights were new, and the page, the hash and the return those of the agent before."""
+    before = contents(pushed)
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(share, "_evaluated", stopped)
+    words = ["--half", "--episodes", "8", "--no-film"]
+    assert cli.main(["push", "signpost-full-lru", str(pushed), *words]) == cli.EXIT_INTERRUPTED
+    assert contents(pushed) == before
+    assert cli.main(["push", str(run), str(tmp_path / "new"), *words]) == cli.EXIT_INTERRUPTED
+    assert [path.name for path in tmp_path.iterdir()] == [pushed.name]
+
+
+def test_a_film_of_the_agent_before_does_not_stay(pushed: Path) -> None:
+    (pushed / "replay.gif").write_bytes(b"GIF89a")
+    (pushed / "mine.txt").touch()
+    words = ["--episodes", "8", "--no-film"]
+    assert cli.main(["push", "signpost-full-lru", str(pushed), *words]) == 0
+    assert {path.name for path in pushed.iterdir()} == NEEDED | {"mine.txt"}
+    sha256 = read_json(pushed / "results.json")["sha256"]["model.safetensors"]
+    assert from_pretrained(pushed, sha256=sha256).config.observability == "full"
+
+
+def test_what_could_not_be_pulled_whole_can_be_pulled_again(
+    pushed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder with a part of the files was left, and refused from then on."""
+    out = tmp_path / "pulled"
+    words = ["pull", str(pushed), "--out", str(out)]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        said = one_error(capsys, words, cli.EXIT_FAILED)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(out) in said and "ulimit -f" in said
+    assert [path.name for path in tmp_path.iterdir()] == [pushed.name]
+    assert cli.main(words) == 0
+    assert contents(out) == contents(pushed)
+
+
+def test_settings_that_are_not_those_of_the_weights_are_not_pushed(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page named the command of one run beside the weights of another."""
+    mixed = tmp_path / "mixed"
+    (mixed / "checkpoints").mkdir(parents=True)
+    for file in run.glob("checkpoints/*/*"):
+        (mixed / file.relative_to(run)).parent.mkdir(exist_ok=True)
+        (mixed / file.relative_to(run)).write_bytes(file.read_bytes())
+    record = read_json(run / "config.json")
+    record["config"]["env"] = "CartPoleEasy-v0"
+    write_json(mixed / "config.json", record)
+    said = one_error(capsys, ["push", str(mixed), str(tmp_path / "out"), "--episodes", "4"])
+    assert "env ('CartPoleEasy-v0' != 'SignpostEasy-v0')" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_agent_of_the_package_is_named_like_a_run(

@@ -174,7 +174,7 @@ def _picture(
     for fact, axis in zip(facts, axes[0, 1:], strict=True):
         plot_steps(scores, fact, axis, colours)
     figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
-    figure.legend(*_legend(scores, colours), loc="outside upper right", ncols=6)
+    style.legend_above(figure, _legend(scores, colours), 6, "outside upper right")
     rows = list[dict[str, Any]]()
     for agent, of_agent in scores.items():
         rows += _rows(agent, game, twin, len(agents[agent]), of_agent)
@@ -233,8 +233,8 @@ def plot_steps(
     scores: Mapping[str, OfAgent], fact: str, axis: Any, colours: Mapping[str, str]
 ) -> None:
     """Draw the score of one fact over the steps: full lines of states, broken ones of frames."""
+    markers = style.agent_markers(scores, colours)
     for place, (agent, of_agent) in enumerate(scores.items()):
-        marker = style.MARKERS[place % len(style.MARKERS)]
         for source in measure.SOURCES:
             if (fact, source) not in of_agent:
                 continue
@@ -242,7 +242,7 @@ def plot_steps(
             # beside one another, so that equal lines are all seen
             steps = np.arange(len(of_fact.by_step)) + 0.1 * (place - (len(scores) - 1) / 2)
             dashes = "-" if source == "state" else "--"
-            look = {"color": colours[agent], "marker": marker, "ms": 4, "lw": 1.2}
+            look = {"color": colours[agent], "marker": markers[agent], "ms": 4, "lw": 1.2}
             axis.plot(steps, of_fact.by_step, ls=dashes, **look)
             if source == "state":
                 ends = (of_fact.low, of_fact.high)
@@ -252,21 +252,16 @@ def plot_steps(
     axis.set_title(fact)
 
 
-def _legend(
-    scores: Mapping[str, OfAgent], colours: Mapping[str, str]
-) -> tuple[list[Any], list[str]]:
-    """Handles and labels: a colour an agent, and what full and empty bars are."""
+def _legend(scores: Mapping[str, OfAgent], colours: Mapping[str, str]) -> list[Any]:
+    """Handles with labels: a colour an agent, and what full and empty bars are."""
     from matplotlib.patches import Patch
 
     handles = list[Any]()
-    labels = list[str]()
     for agent in scores:
-        handles.append(Patch(facecolor=colours[agent]))
-        labels.append(style.legend_name(agent))
+        handles.append(Patch(facecolor=colours[agent], label=style.legend_name(agent)))
     for source, name in SOURCES.items():
-        handles.append(Patch(**_look(source, style.NEUTRAL)))
-        labels.append(name)
-    return handles, labels
+        handles.append(Patch(**_look(source, style.NEUTRAL), label=name))
+    return handles
 
 
 def _note(agents: Mapping[str, Sequence[measure.Beliefs]], options: BeliefsOptions) -> str:

@@ -282,7 +282,8 @@ def _figure(
     for sigma, top, bottom in zip(first.sigmas, axes[0], axes[-1], strict=True):
         top.set_title("" if options.shuffle else f"noise sigma = {sigma:g}")
         bottom.set_xlabel(f"steps from the {start}")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
+    handles, _ = axes[0, 0].get_legend_handles_labels()
+    style.legend_above(figure, handles, 6, "outside upper right")
     return figure
 
 
@@ -356,14 +357,16 @@ def plot(
 ) -> None:
     """Draw one measure by delay, a line an agent; the dashed line is an agent without memory."""
     colours = colours or style.agent_colours(list(agents))
+    markers = style.agent_markers(agents, colours)
     for place, (agent, value) in enumerate(agents.items()):
         mean = value[name].mean[column, : len(delays)]
         low = value[name].low[column, : len(delays)]
         high = value[name].high[column, : len(delays)]
         x = np.arange(len(delays)) + 0.1 * (place - (len(agents) - 1) / 2)
         bars = style.whiskers(mean, low, high)
-        marker = style.MARKERS[place % len(style.MARKERS)]
-        axis.plot(x, mean, color=colours[agent], marker=marker, label=style.legend_name(agent))
+        axis.plot(
+            x, mean, color=colours[agent], marker=markers[agent], label=style.legend_name(agent)
+        )
         axis.errorbar(x, mean, bars, fmt="none", ecolor=colours[agent], capsize=2, lw=1)
     axis.axhline(0.0, color=style.NEUTRAL, lw=1, ls="--")
     axis.set_xticks(range(len(delays)), [str(delay) for delay in delays])

@@ -130,8 +130,8 @@ def _picture(
         axes[-1, column].set_xlabel("steps back from the decision")
         for agent, of_agent in profiles.items():
             rows += _rows(agent, game, twin, len(agents[agent]), title, of_agent)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=6)
+    handles, _ = axes[0, 0].get_legend_handles_labels()
+    style.legend_above(figure, handles, 6, "outside upper right")
     figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
     return Picture(f"counterfactual-{game}-{twin}", figure, _note(agents, options), rows)
 
@@ -180,12 +180,12 @@ def plot(
     """Draw one effect by lag, a line an agent, and at the right the effect of the state."""
     lags = max(len(profiles[effect].mean) for profiles in agents.values()) - 1
     state = lags + 0.5
+    markers = style.agent_markers(agents, colours)
     for place, (agent, profiles) in enumerate(agents.items()):
         values = profiles[effect]
         steps = np.arange(len(values.mean) - 1)
         x = np.append(steps, state) + 0.08 * (place - (len(agents) - 1) / 2)
-        marker = style.MARKERS[place % len(style.MARKERS)]
-        look = {"color": colours[agent], "marker": marker, "ms": 4}
+        look = {"color": colours[agent], "marker": markers[agent], "ms": 4}
         axis.plot(x[:-1], values.mean[:-1], label=style.legend_name(agent), **look)
         axis.plot(x[-1:], values.mean[-1:], ls="", **look)
         bars = style.whiskers(values.mean, values.low, values.high)

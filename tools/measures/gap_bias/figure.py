@@ -14,10 +14,11 @@ from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.comparable import Runs, find_runs
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, style
 from arcade_torch.tools.figures.style import (
-    MARKERS,
     NEUTRAL,
     TWIN_COLOURS,
     agent_colours,
+    agent_markers,
+    legend_above,
     legend_name,
     panels,
     seeds_note,
@@ -33,6 +34,7 @@ from arcade_torch.tools.measures.gap_bias.measure import (
     gap_and_bias,
     tasks_out_of_range,
 )
+from arcade_torch.tools.measures.gap_bias.numbered import number_points
 from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.names import agent_names, memory_free
 from arcade_torch.tools.runs import Score
@@ -58,6 +60,10 @@ COLUMNS = {
 """Numbers of the printed table, and their heads."""
 LEAST_SPAN = 0.02
 """Of an axis of Gap or Bias."""
+MOST_NAMED = 8
+"""Agents whose names stand at their points."""
+MOST_BESIDE = 12
+"""Agents whose bars go into panels side by side; more get the whole width."""
 
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
@@ -74,8 +80,12 @@ def returns(options: ScoreOptions, progress: Progress | None) -> Made:
     time).
     """
     result, table, note = _table(options)
-    figure, axes = panels(1, 3, (12.5, 4.2))
-    for axis, name in zip(axes[0], DRAWN, strict=True):
+    agents = len(table.rows)
+    if agents <= MOST_BESIDE:
+        figure, axes = panels(1, 3, (12.5, 4.2))
+    else:
+        figure, axes = panels(3, 1, (1.5 + 0.3 * agents, 11))
+    for axis, name in zip(axes.flat, DRAWN, strict=True):
         plot_bars(table.rows, axis, name)
     result.pictures = [Picture("returns", figure, note, table.table())]
     if table.without:
@@ -182,20 +192,28 @@ def _plot_people(
 
 
 def plot(rows: Sequence[AgentRow], axis: Any) -> None:
-    """Draw a point an agent that has a Bias, with both intervals and the name beside it."""
+    """Draw a point an agent that has a Bias, with both intervals and the name beside it; of many
+    agents a number, and the names in a legend beside the panel.
+    """
     colours = agent_colours([row.agent for row in rows])
-    for place, row in enumerate(filter(_has_bias, rows)):
+    drawn = list(filter(_has_bias, rows))
+    markers = agent_markers([row.agent for row in drawn], colours)
+    is_numbered = len(drawn) > MOST_NAMED
+    bars = list[Any]()
+    for row in drawn:
         point = (row.bias.value, row.gap.value)
-        colour = colours[row.agent]
-        look = {"fmt": MARKERS[place % len(MARKERS)], "color": colour, "capsize": 2, "lw": 1}
-        axis.errorbar(*point, yerr=_whiskers([row.gap]), xerr=_whiskers([row.bias]), **look)
-        axis.annotate(
-            row.agent, point, (6, 5), textcoords="offset points", color=colour, fontsize="small"
-        )
+        look = {"fmt": markers[row.agent], "color": colours[row.agent], "capsize": 2, "lw": 1}
+        whiskers_of = {"yerr": _whiskers([row.gap]), "xerr": _whiskers([row.bias])}
+        bars.append(axis.errorbar(*point, **whiskers_of, **look))
+        if not is_numbered:
+            look_of_name = {"color": colours[row.agent], "fontsize": "small"}
+            axis.annotate(row.agent, point, (6, 5), textcoords="offset points", **look_of_name)
     for line in (axis.axhline, axis.axvline):
         line(0.0, color=NEUTRAL, lw=1, ls="--")
     axis.margins(0.15)
     _widen(axis)
+    if is_numbered:
+        number_points(axis, bars, [row.agent for row in drawn])
     axis.grid(True, axis="both")
     axis.set_xlabel("Memory Bias\n(MDP - memory-free MDP, normalised return)")
     axis.set_ylabel("Observability Gap\n(MDP - POMDP, normalised return)")
@@ -224,7 +242,8 @@ def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
         error_kw={"lw": 1},
         capsize=3,
     )
-    axis.set_xticks(places, agents, rotation=35, ha="right", rotation_mode="anchor")
+    turn = 35 if len(agents) <= MOST_BESIDE else 60
+    axis.set_xticks(places, agents, rotation=turn, ha="right", rotation_mode="anchor")
     axis.set(title=PANELS[name][0], ylabel=PANELS[name][1])
     if name in ("gap", "bias"):
         axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
@@ -243,7 +262,7 @@ def _without_each(table: GapBias) -> Any:
     figure, axes = panels(3, 1, (12.5, 10), sharex=True)
     for axis, name in zip(axes[:, 0], DRAWN, strict=True):
         _plot_columns(list(columns.values()), table, axis, name)
-    axes[0, 0].legend(ncols=len(table.rows), loc="lower center", bbox_to_anchor=(0.5, 1.08))
+    legend_above(figure, axes[0, 0].get_legend_handles_labels()[0])
     axes[-1, 0].set_xticks(range(len(columns)), list(columns), rotation=25, ha="right")
     return figure
 
@@ -254,6 +273,7 @@ def _plot_columns(
     """Draw one number of every agent, one of `PANELS`, in several columns side by side."""
     agents = [row.agent for row in table.rows]
     colours = agent_colours(agents)
+    markers = agent_markers(agents, colours)
     places = np.arange(len(columns))
     offsets = np.linspace(-0.34, 0.34, len(agents))
     for index, row in enumerate(table.rows):
@@ -266,7 +286,7 @@ def _plot_columns(
             [interval.value for interval in intervals],
             _whiskers(intervals),
             label=legend_name(row.agent),
-            fmt=MARKERS[index % len(MARKERS)],
+            fmt=markers[row.agent],
             color=colours[row.agent],
             lw=1,
         )
