@@ -87,8 +87,9 @@ class StudyCommand(Resumable):
     interruption.
 
     The file names games, memories and seeds, and optionally observability, algorithms, preset,
-    total_frames, baseline, sizes, question, subject and a table [settings] with fields of the
-    config that train takes. Where it names no algorithms, the preset's is trained, as train does.
+    total_frames, baseline, sizes, question, subject, a table [settings] with fields of the config
+    that train takes, and tables [memory_options.NAME]. Where it names no algorithms, the preset's
+    is trained, as train does.
 
     Example: arcade-torch study examples/studies/small-short.toml --out runs/mine --workers 4
     """
