@@ -152,7 +152,9 @@ def test_an_environment_that_begins_alone_begins_as_all_do() -> None:
     x = torch.randn(2, 4, 3)
     y, _ = memory(x, memory.initial_state(2), starts((2,), (), length=4))
     alone, _ = memory(x[:1, 2:], memory.initial_state(1), starts((), length=2))
-    assert y.isfinite().all() and torch.equal(y[:1, 2:], alone)
+    assert y.isfinite().all()
+    # a product of two rows may round otherwise than that of one
+    torch.testing.assert_close(y[:1, 2:], alone)
 
 
 def problem() -> list[Tensor]:

@@ -130,7 +130,7 @@ def test_every_locale_meets_every_name(locale: str, name: bytes, tmp_path: Path)
 def test_a_platform_that_jax_has_not_is_one_line(platform: str, words: str, tmp_path: Path) -> None:
     result = shell(f"python -m arcade_torch.tools {words}", tmp_path, JAX_PLATFORMS=platform)
     said = result.stderr.decode()
-    assert result.returncode == 1 and said.count("\n") == 1, said
+    assert result.returncode == 2 and said.count("\n") == 1, said
     assert said.startswith(
         f"arcade-torch: JAX_PLATFORMS is '{platform}', but JAX has no such device here"
     ), said
