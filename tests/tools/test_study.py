@@ -416,20 +416,17 @@ def test_engines_are_made_by_name() -> None:
         make_engine("processes", ray=RayOptions(address="auto"))
 
 
-def test_the_display_adds_up_finished_running_and_waiting_runs(tmp_path: Path) -> None:
-    what = small_study(seeds=1)
-    folder = StudyFolder(tmp_path / "s")
-    runs = what.runs()
-    write_run(folder.run(runs[0]).path, runs[0], 0.5, frames=2048)
-    write_run(folder.run(runs[1]).path, runs[1], 0.5, frames=2048, status="running")
-    stream = io.StringIO()
-    with Bars(stream, "frames") as bars:
-        show_progress(bars, "toy", {run.name: folder.run(run) for run in runs}, {runs[0].name})
-    assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 1/4 runs\n"
-
-
-def test_the_display_counts_no_frames_that_a_failed_run_did_not_train(tmp_path: Path) -> None:
-    """A study all of whose runs had failed was at 100 %."""
+@pytest.mark.parametrize(
+    ("has_ended", "said"),
+    [
+        (1, "toy: 3,072 of 8,192 frames (38 %), 1/4 runs\n"),
+        # all but the first have failed: a study was at 100 % when all had
+        (4, "toy: 3,072 of 8,192 frames (38 %), 4/4 runs\n"),
+    ],
+)
+def test_the_display_adds_up_the_frames_that_runs_have_trained(
+    has_ended: int, said: str, tmp_path: Path
+) -> None:
     what = small_study(seeds=1)
     folder = StudyFolder(tmp_path / "s")
     runs = what.runs()
@@ -438,8 +435,8 @@ def test_the_display_counts_no_frames_that_a_failed_run_did_not_train(tmp_path: 
     stream = io.StringIO()
     with Bars(stream, "frames") as bars:
         of_run = {run.name: folder.run(run) for run in runs}
-        show_progress(bars, "toy", of_run, {run.name for run in runs})
-    assert stream.getvalue() == "toy: 3,072 of 8,192 frames (38 %), 4/4 runs\n"
+        show_progress(bars, "toy", of_run, {run.name for run in runs[:has_ended]})
+    assert stream.getvalue() == said
 
 
 def test_the_display_prints_lines_where_there_is_no_terminal() -> None:
