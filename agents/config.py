@@ -287,8 +287,8 @@ class TrainConfig(Checked):
     """
 
     env: Text = "CartPoleEasy"
-    """Game id, see ``arcade_torch.registered_ids()``; a run pins the version that a bare name
-    means.
+    """Game id, see ``arcade_torch.registered_ids()``, or several that one agent is to learn,
+    ``CartPoleEasy+2*TetrisEasy``; a run pins the version that a bare name means.
     """
     observability: Literal["full", "partial", "mixed"] = "full"
     """Which twin: ``"full"`` is the MDP, ``"partial"`` the POMDP, ``"mixed"`` half the environments

@@ -13,6 +13,7 @@ from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.envs_jax.checks import check_ends
+from arcade_torch.envs_jax.registry import is_mixture, resolve_id
 
 MOST_EPISODES = 2**16
 """Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB
@@ -26,6 +27,17 @@ class EvalResult:
 
     returns: NDArray[np.float32]  # [E], undiscounted return of each episode
     lengths: NDArray[np.int64]  # [E], steps of each episode
+    games: tuple[str, ...] = ()
+    """Of a mixture the game of each episode, by its versioned id; empty where all play one."""
+
+    @property
+    def by_game(self) -> dict[str, "EvalResult"]:
+        """Of a mixture the episodes of each game, in the order of the games; empty of one game."""
+        results = {}
+        for game in dict.fromkeys(self.games):
+            rows = np.array(self.games) == game
+            results[game] = EvalResult(self.returns[rows], self.lengths[rows])
+        return results
 
     @property
     def mean(self) -> float:
@@ -72,11 +84,12 @@ def make_env(
     config: TrainConfig, num_envs: int, seed: int, observability: str | None = None
 ) -> arcade_torch.ArcadeEnv:
     """Environments of a run, of the twin it names (or another); of ``"mixed"`` the first half are
-    MDPs.
+    MDPs, and where several games are played every other one, so that each game has both.
     """
     twin: Any = observability or config.observability
     if twin == "mixed":
-        twin = torch.arange(num_envs, device="cpu") >= num_envs // 2
+        number = torch.arange(num_envs, device="cpu")
+        twin = number % 2 == 1 if is_mixture(config.env) else number >= num_envs // 2
     return arcade_torch.make(
         config.env,
         num_envs=num_envs,
@@ -106,6 +119,7 @@ def evaluate(
     episodes: int = 128,
     seed: int = 0,
     env: Any = None,
+    game: str | None = None,
 ) -> EvalResult:
     """Play greedily; gives returns and lengths of the first finished episode of each of
     ``episodes`` environments.
@@ -122,10 +136,13 @@ def evaluate(
             Disjoint from all training seeds, see :func:`held_out_seed`.
         env: environments from :func:`make_eval_env` to use again (saves compiling); their number
             replaces ``episodes``.
+        game: another game than the agent was trained on, or one of its mixture (without ``env``);
+            it gets the same options.
 
     Raises:
-        ValueError: ``episodes`` is not positive, ``seed`` is out of range, ``observability`` is
-            unknown, or an episode does not end in time.
+        ValueError: ``episodes`` is not positive, ``seed`` is out of range, ``observability`` or
+            ``game`` is unknown, or an episode does not end in time.
+        TypeError: an option that the game does not have.
     """
     require(
         1 <= episodes <= MOST_EPISODES,
@@ -139,10 +156,12 @@ def evaluate(
         observability,
         "'full' or 'partial'",
     )
+    require(env is None or game is None, "game", game, "left out where env is given")
     if env is None:
+        config = agent.config if game is None else replace(agent.config, env=resolve_id(game))
         device = str(next(agent.network.parameters()).device)
         env = make_eval_env(
-            replace(agent.config, device=device, cuda_graphs=False), episodes, observability
+            replace(config, device=device, cuda_graphs=False), episodes, observability
         )
     before = env.observability
     try:
@@ -173,4 +192,11 @@ def _play(agent: Any, env: Any) -> EvalResult:
             returns[ended] = step["next", "episode_reward"].view(-1).cpu().numpy()[ended]
             lengths[ended] = step["next", "step_count"].view(-1).cpu().numpy()[ended]
             playing &= ~ended
-    return EvalResult(returns, lengths)
+    return EvalResult(returns, lengths, _games_played(env))
+
+
+def _games_played(env: Any) -> tuple[str, ...]:
+    """The game of each environment of a mixture, by its id; empty where all play one."""
+    if len(env.games) == 1:
+        return ()
+    return tuple(env.games[task].id for task in env.task.tolist())

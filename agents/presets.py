@@ -6,6 +6,7 @@ from typing import Any
 
 from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.config import GROUPS, TrainConfig
+from arcade_torch.envs_jax.registry import names_in
 
 _SMALL = {
     "num_envs": 64,
@@ -56,6 +57,8 @@ _SMALL_SEARCH = {
 # Every hit of the ball is needed, and whoever still draws actions at random misses some.
 _RALLY = ("Breakout",)
 _SMALL_RALLY = {"entropy_coeff": 0.02}
+# 10 million frames in the paper, where the others have 20
+_HALF_BUDGET = ("AutoEncode", "CartPole", "NoisyCartPole", "NoisyPole")
 _TINY = {"num_envs": 8, "num_steps": 8, "minibatches": 4, "warmup_steps": 8}
 _TINY_REPLAY = {"replay_frames": 192, "batch_sequences": 8, "learning_starts": 16, "burn_in": 2}
 _PRESETS: dict[str, dict[str, Any]] = {
@@ -119,7 +122,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       survived (the CartPoles, Skittles), .99 in the others. In Navigator limits bootstrap, the
       bonus begins at half, and no frame is expected: with the numbers of the others both seeds that
       were tried walked down the clock (results/small.md). In Breakout the bonus begins at .02, a
-      fifth of that of the others.
+      fifth of that of the others. A mixture of games with other numbers has those of none.
     * ``smoke``: ``small`` with PQN, cut down until a run takes seconds; it learns nothing.
 
     Args:
@@ -168,15 +171,24 @@ def _adjusted_to_game(name: str, algorithm: str, env: str) -> dict[str, Any]:
     if name in ("paper", "reference"):
         values |= _paper_budget(_PRESETS[name], env)
     if name == "small":
-        if env.startswith(_AT_ONCE):
-            values["ppo"] = _PRESETS[name]["ppo"] | {"gamma": 0.98}
-        elif env.startswith(_SURVIVAL):
-            values["ppo"] = _PRESETS[name]["ppo"] | {"gamma": 0.995}
-        elif env.startswith(_SEARCH):
-            values["ppo"] = _PRESETS[name]["ppo"] | _SMALL_SEARCH
-        elif env.startswith(_RALLY):
-            values["ppo"] = _PRESETS[name]["ppo"] | _SMALL_RALLY
+        numbers = [_small_ppo_of(game) for game in names_in(env)]
+        # games that differ get the numbers of none
+        of_game = numbers[0] if all(other == numbers[0] for other in numbers) else {}
+        values["ppo"] = _PRESETS[name]["ppo"] | of_game
     return values
+
+
+def _small_ppo_of(game: str) -> dict[str, Any]:
+    """The numbers of PPO that are a game's own in the preset small."""
+    if game.startswith(_AT_ONCE):
+        return {"gamma": 0.98}
+    if game.startswith(_SURVIVAL):
+        return {"gamma": 0.995}
+    if game.startswith(_SEARCH):
+        return _SMALL_SEARCH
+    if game.startswith(_RALLY):
+        return _SMALL_RALLY
+    return {}
 
 
 def _group_changes(group: str, changes: Any, algorithm: str) -> dict[str, Any]:
@@ -192,12 +204,13 @@ def _group_changes(group: str, changes: Any, algorithm: str) -> dict[str, Any]:
 
 def _paper_budget(values: Mapping[str, Any], env: str) -> dict[str, Any]:
     """The published number of frames of a game; AutoEncode explores for twice the usual share of
-    it.
+    it. A mixture has that of its largest.
     """
-    if not env.startswith(("AutoEncode", "CartPole", "NoisyCartPole", "NoisyPole")):
+    games = names_in(env)
+    if not all(game.startswith(_HALF_BUDGET) for game in games):
         return {}
     budget: dict[str, Any] = {"total_frames": 10_000_000}
-    if env.startswith("AutoEncode"):
+    if all(game.startswith("AutoEncode") for game in games):
         shares = {"exploration_fraction": 0.8, "lr_decay_fraction": 0.2}
         budget |= {group: values.get(group, {}) | shares for group in ("pqn", "dqn")}
     return budget

@@ -28,7 +28,7 @@ from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFol
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.agents.trainer import Trainer
-from arcade_torch.envs_jax import resolve_id
+from arcade_torch.envs_jax.registry import games_of, is_mixture, resolve_id
 
 Progress = Callable[[Mapping[str, Any]], None]
 
@@ -136,7 +136,7 @@ class _Run:
                 CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)
             ) as self.metrics,
             closing(
-                CsvLog(path / "eval.csv", EVAL_COLUMNS, keep_frames=frames - self.trainer.done)
+                CsvLog(path / "eval.csv", self._eval_columns(), frames - self.trainer.done)
             ) as self.evals,
             closing(RunLogger(self.config, path, frames)) as self.logger,
         ):
@@ -161,6 +161,12 @@ class _Run:
                 with suppress(OSError):
                     self._report(status, error=f"{type(error).__name__}: {error}")
                 raise
+
+    def _eval_columns(self) -> list[str]:
+        """Columns of ``eval.csv``; of a mixture with the mean of each game, named by its id."""
+        if not is_mixture(self.config.env):
+            return list(EVAL_COLUMNS)
+        return [*EVAL_COLUMNS, *dict.fromkeys(games_of(self.config.env))]
 
     def _not_written(self, error: OSError) -> str:
         """What could not be written, what is safe, and how to go on."""
@@ -213,6 +219,7 @@ class _Run:
             "std": result.std,
             "n": len(result.returns),
         }
+        row |= {game: episodes.mean for game, episodes in result.by_game.items()}
         self.evals.append(row)
         self.logger.log("eval", row)
         self.last_eval = result.mean
@@ -253,6 +260,8 @@ class _Run:
             "returns": result.returns.tolist(),
             "lengths": result.lengths.tolist(),
         }
+        if result.games:
+            final["games"] = list(result.games)
         write_json(self.folder.path / "eval.json", final)
         self._report("finished", mean=result.mean)
         return result_from(self.folder.path, final)
@@ -264,7 +273,9 @@ class _Run:
 def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
     """How a finished run ended, from its ``eval.json``."""
     evaluation = EvalResult(
-        np.array(final["returns"], np.float32), np.array(final["lengths"], np.int64)
+        np.array(final["returns"], np.float32),
+        np.array(final["lengths"], np.int64),
+        tuple(final.get("games", ())),
     )
     return TrainResult(
         path, "finished", final["frames"], final["seconds"], evaluation, final["train_max_ewm"]

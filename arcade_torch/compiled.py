@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from arcade_torch.envs_jax import Game, MixedGames, resolve_id
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
+from arcade_torch.envs_jax.registry import games_of, is_mixture
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.validation import format_value, plain
 from arcade_torch.frame_memory import Canvas, Spare
@@ -207,8 +209,8 @@ def compiled_game(
     """Make a game with its compiled functions; equal arguments share them, so a second env compiles
     nothing.
 
-    Several ids are a mixture, in which an id that stands there k times gets k shares, and every
-    game gets the options.
+    Several ids, in a list or joined by ``+``, are a mixture, in which an id that stands there k
+    times gets k shares, and every game gets the options.
 
     Raises:
         ValueError: Unknown id, size, rules or option value, or no id at all.
@@ -216,7 +218,8 @@ def compiled_game(
             nor a list.
     """
     # what a bare name means may change
-    ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))
+    is_one = isinstance(id, str) and not is_mixture(id)
+    ids = resolve_id(id) if is_one else _checked(id)  # type: ignore[arg-type]
     obs_size = plain(obs_size)
     options = {name: plain(options[name]) for name in sorted(options)}
     try:
@@ -229,8 +232,10 @@ def compiled_game(
     return compiled
 
 
-def _checked(ids: Any) -> Sequence[str]:
-    """Refuse what is no list of ids."""
+def _checked(ids: Any) -> tuple[str, ...]:
+    """The games of a mixture, each as often as it has shares; refuses what is no list of ids."""
+    if isinstance(ids, str):
+        return games_of(ids)
     if not isinstance(ids, Sequence) or isinstance(ids, bytes):
         raise TypeError(
             f"the env id is {format_value(ids)}, expected a string such as 'CartPoleEasy', or a "
@@ -238,7 +243,7 @@ def _checked(ids: Any) -> Sequence[str]:
         )
     if not ids:
         raise ValueError("the list of env ids is empty: name at least one game")
-    return [resolve_id(id) for id in ids]
+    return tuple(chain.from_iterable(map(games_of, ids)))
 
 
 @lru_cache(maxsize=64, typed=True)  # 1 == True, but means another

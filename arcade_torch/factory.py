@@ -36,7 +36,8 @@ def make(
     longest time limit of all and the widest range of returns: report each game's own.
 
     Args:
-        id: ``"CartPoleEasy-v0"``, or ``"CartPoleEasy"`` for its newest version; or a list of ids.
+        id: ``"CartPoleEasy-v0"``, or ``"CartPoleEasy"`` for its newest version; or several, as a
+            list or as the command line has them, ``"CartPoleEasy+2*TetrisEasy"``.
         num_envs: Number of envs in the batch.
         observability: ``"full"`` (the default), ``"partial"``, or bool [num_envs], true = partial.
         obs_size: Side of the frames, 128 or 256 pixels.

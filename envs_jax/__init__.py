@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from arcade_torch.envs_jax.registry import (
     OBS_SIZES,
+    games_of,
     make,
     option_names,
     probe_ids,
@@ -41,6 +42,7 @@ __all__ = [
     "Outcome",
     "check_game",
     "env_keys",
+    "games_of",
     "make",
     "option_names",
     "probe_ids",

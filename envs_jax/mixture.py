@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, with_flags
 from arcade_torch.envs_jax.game import NUM_ACTIONS, UNSET, Array, Game
+from arcade_torch.envs_jax.registry import mixture_id
 from arcade_torch.envs_jax.render.screen import WORD
 from arcade_torch.envs_jax.settings import compiled, raw_key
 
@@ -40,10 +41,8 @@ class Mixture:
     @property
     def id(self) -> str:
         """The versioned ids in order, such as ``"2*BattleShipEasy-v0+TetrisEasy-v0"``."""
-        return "+".join(
-            f"{weight}*{game.id}" if weight > 1 else game.id
-            for game, weight in zip(self.games, self.weights, strict=True)
-        )
+        ids = [game.id for game in self.games]
+        return mixture_id(dict(zip(ids, self.weights, strict=True)))
 
     @property
     def obs_size(self) -> int:

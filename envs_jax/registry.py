@@ -5,7 +5,8 @@ is made.
 import difflib
 import inspect
 import re
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,6 +45,7 @@ _ENTRIES: dict[str, _Entry] = {}  # by versioned id
 _ALIASES: dict[str, str] = {}  # bare names and aliases: which bare name each means
 _LISTENERS: list[Callable[[str], object]] = []
 _VERSIONED = re.compile(r"(?P<name>[A-Za-z][A-Za-z0-9]*)-v(?P<version>0|[1-9][0-9]*)")
+_SHARES = re.compile(r"(?P<shares>[1-9][0-9]?)\*(?P<name>.+)")
 
 
 def register(
@@ -134,7 +136,7 @@ def resolve_id(id: str) -> str:
     """Turn a bare name, an alias or a versioned id into the versioned id.
 
     Args:
-        id: What the user wrote.
+        id: What the user wrote; of a mixture the names of its games, see :func:`games_of`.
 
     Returns:
         The versioned id.
@@ -146,7 +148,68 @@ def resolve_id(id: str) -> str:
     Example:
         >>> resolve_id("NoisyPoleEasy")
         'NoisyCartPoleEasy-v0'
+        >>> resolve_id("CartPoleEasy+TetrisEasy")
+        'CartPoleEasy-v0+TetrisEasy-v0'
     """
+    if is_mixture(id):
+        return mixture_id(Counter(games_of(id)))
+    return _resolve_one(id)
+
+
+def is_mixture(id: str) -> bool:
+    """Whether an id names several games, ``"CartPoleEasy+TetrisEasy"``; none of one has a plus."""
+    return isinstance(id, str) and "+" in id
+
+
+def names_in(id: str) -> list[str]:
+    """The names that an id is written with, each as often as it has shares; nothing is looked up.
+
+    Example:
+        >>> names_in("CartPoleEasy+2*TetrisEasy")
+        ['CartPoleEasy', 'TetrisEasy', 'TetrisEasy']
+    """
+    if not is_mixture(id):
+        return [id]
+    names: list[str] = []
+    for part in id.split("+"):
+        match = _SHARES.fullmatch(part)
+        names += [match["name"]] * int(match["shares"]) if match else [part]
+    return names
+
+
+def games_of(id: str) -> tuple[str, ...]:
+    """The versioned ids of the games that an id names: one, or those of a mixture.
+
+    Args:
+        id: ``"CartPoleEasy"``, or of a mixture ``"CartPoleEasy+2*TetrisEasy"``.
+
+    Returns:
+        The ids, each as often as the game has shares of the envs.
+
+    Raises:
+        TypeError: ``id`` is not a string.
+        ValueError: No such game; the message names the nearest one.
+
+    Example:
+        >>> games_of("CartPoleEasy+2*TetrisEasy")
+        ('CartPoleEasy-v0', 'TetrisEasy-v0', 'TetrisEasy-v0')
+    """
+    return tuple(_resolve_one(name) for name in names_in(id))
+
+
+def mixture_id(shares: Mapping[str, int]) -> str:
+    """The id of a mixture, from the versioned ids of its games and their shares of the envs.
+
+    Example:
+        >>> mixture_id({"CartPoleEasy-v0": 1, "TetrisEasy-v0": 2})
+        'CartPoleEasy-v0+2*TetrisEasy-v0'
+    """
+    parts = [f"{count}*{id}" if count > 1 else id for id, count in shares.items()]
+    return "+".join(parts)
+
+
+def _resolve_one(id: str) -> str:
+    """See :func:`resolve_id`, of one game."""
     if not isinstance(id, str):
         raise TypeError(
             f"the env id is {format_value(id)}, expected a string such as 'CartPoleEasy'"
@@ -173,13 +236,14 @@ def resolve_id(id: str) -> str:
 
 
 def is_built_in(id: str) -> bool:
-    """Whether a registered id, bare name or alias means a game of this package, not one of yours.
+    """Whether a registered id, bare name or alias means a game of this package, not one of yours;
+    of a mixture whether all its games are.
 
     Example:
         >>> is_built_in("TetrisEasy")
         True
     """
-    return isinstance(_ENTRIES[resolve_id(id)].factory, str)
+    return all(isinstance(_ENTRIES[game].factory, str) for game in games_of(id))
 
 
 def _newest() -> dict[str, str]:
@@ -213,6 +277,11 @@ def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any
         >>> make("MineSweeperHard").max_steps
         128
     """
+    if is_mixture(id):
+        raise ValueError(
+            f"{format_value(id)} names several games, expected one: a mixture is a batch of envs, "
+            "arcade_torch.make(...) or MixedGames(...)"
+        )
     full_id = resolve_id(id)
     obs_size = plain(obs_size)
     options = {name: plain(value) for name, value in options.items()}
@@ -261,9 +330,16 @@ def option_names(id: str) -> list[str]:
         id: A registered id, bare name or alias.
 
     Returns:
-        The names, in the order of the game's documentation.
+        The names, in the order of the game's documentation; of a mixture those that all its games
+        have.
     """
-    parameters = inspect.signature(_factory(resolve_id(id))).parameters.values()
+    first, *others = map(_options_of_one, games_of(id))
+    return [name for name in first if all(name in names for names in others)]
+
+
+def _options_of_one(id: str) -> list[str]:
+    """See :func:`option_names`."""
+    parameters = inspect.signature(_factory(id)).parameters.values()
     named = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     return [name for name in named if name not in ("id", "obs_size", "rules")]
 

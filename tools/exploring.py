@@ -5,7 +5,7 @@ return stays where it began.
 import math
 from collections.abc import Mapping, Sequence
 
-from arcade_torch.envs_jax import make
+from arcade_torch.envs_jax import games_of, make
 from arcade_torch.tools.runs import Run
 
 CERTAIN = 0.1
@@ -34,11 +34,11 @@ def stopped_exploring(run: Run) -> str:
     if entropy is None or first is None or last is None:
         return ""
     try:
-        game = make(run.game)
+        games = [make(id) for id in games_of(run.game)]
     except ValueError:
         return ""
-    certain = CERTAIN * math.log(game.num_actions)
-    highest = game.return_range[1]
+    certain = CERTAIN * math.log(games[0].num_actions)
+    highest = sum(game.return_range[1] for game in games) / len(games)
     if entropy > certain or last - first > LITTLE * (highest - first):
         return ""
     return (

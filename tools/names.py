@@ -9,7 +9,7 @@ from arcade_torch.agents.differences import flatten
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.text import printable
 
-_VERSION = re.compile(r"-v\d+$")
+_VERSION = re.compile(r"-v\d+(?=$|\+)")
 
 
 @dataclass(frozen=True)

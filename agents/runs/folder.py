@@ -32,6 +32,7 @@ in the rollout (empty if none), ``train_return_ewm`` its running average, and ``
 the last finished return of every environment averaged over the rollout, which is what the paper's
 score reads."""
 EVAL_COLUMNS = ("frames", "mean", "std", "n")
+"""Columns of ``eval.csv``; behind them, of a mixture, the mean return in each of its games."""
 LOCK = "lock"
 """File in a run folder that the process which trains there holds locked. The file itself stays; a
 killed process loses the lock at once."""

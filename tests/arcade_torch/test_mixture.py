@@ -65,6 +65,16 @@ def test_an_id_that_stands_twice_gets_two_shares() -> None:
     assert make(["TetrisEasy", "CartPoleEasy"], num_envs=5).task.tolist() == [0] * 3 + [1] * 2
 
 
+def test_an_id_with_plus_is_the_list_of_its_games() -> None:
+    listed = make(["TetrisEasy", "BattleShipEasy", "BattleShipEasy"], num_envs=6)
+    named = make("TetrisEasy+2*BattleShipEasy", num_envs=6)
+    assert named.game.id == listed.game.id == "TetrisEasy-v0+2*BattleShipEasy-v0"
+    assert named._compiled is listed._compiled
+    assert named.task.tolist() == [0, 0, 1, 1, 1, 1]
+    again = make(named.game.id, num_envs=6)
+    assert again._compiled is named._compiled, "the id of a mixture makes the mixture"
+
+
 def test_a_single_game_has_a_task_if_asked() -> None:
     assert "task" not in ArcadeEnv(GAME, N).reset()
     root = ArcadeEnv(GAME, N, task_in_td=True).reset()

@@ -6,7 +6,15 @@ import jax
 import numpy as np
 import pytest
 
-from arcade_torch.envs_jax import make, option_names, register, registered_ids, resolve_id
+from arcade_torch.envs_jax import (
+    games_of,
+    make,
+    option_names,
+    register,
+    registered_ids,
+    resolve_id,
+)
+from arcade_torch.envs_jax.registry import is_built_in
 from tests.own_registry import forget_games
 
 
@@ -88,6 +96,43 @@ def test_a_penalty_that_is_no_number_is_refused(id, option, wrong):
 def test_options_are_listed():
     assert option_names("CartPoleEasy") == ["arrow"]
     assert option_names("MineSweeperHard") == ["mine_reward"]
+
+
+def test_an_id_may_name_several_games():
+    assert games_of("CartPoleEasy") == ("CartPoleEasy-v0",)
+    assert games_of("NoisyPoleEasy+2*TetrisEasy-v0") == (
+        "NoisyCartPoleEasy-v0",
+        "TetrisEasy-v0",
+        "TetrisEasy-v0",
+    )
+    mixture = "NoisyCartPoleEasy-v0+2*TetrisEasy-v0"
+    assert resolve_id("NoisyPoleEasy+2*TetrisEasy") == mixture
+    assert resolve_id(mixture) == mixture
+    assert resolve_id("TetrisEasy+CartPoleEasy+TetrisEasy") == "2*TetrisEasy-v0+CartPoleEasy-v0"
+    assert is_built_in(mixture)
+    assert option_names("CartPoleEasy+NoisyCartPoleEasy") == ["arrow"]
+    assert option_names("CartPoleEasy+MineSweeperEasy") == []
+
+
+def test_a_game_that_a_mixture_names_wrongly_is_told_by_its_name():
+    with pytest.raises(ValueError, match="unknown env id 'TetrisEsy': did you mean 'TetrisEasy'"):
+        resolve_id("CartPoleEasy+2*TetrisEsy")
+    with pytest.raises(ValueError, match="unknown env id ''"):
+        resolve_id("CartPoleEasy+")
+    for shares in ("0", "-1", "100", "2.5"):
+        with pytest.raises(ValueError, match="unknown env id"):
+            resolve_id(f"CartPoleEasy+{shares}*TetrisEasy")
+
+
+def test_a_mixture_is_no_game():
+    with pytest.raises(ValueError, match=r"names several games, expected one: .*arcade_torch.make"):
+        make("CartPoleEasy+TetrisEasy")
+
+
+def test_a_mixture_with_a_game_of_ones_own_is_not_built_in(monkeypatch):
+    forget_games(monkeypatch)
+    register("PairsEasy-v0", lambda id, obs_size, rules: None)
+    assert not is_built_in("CartPoleEasy+PairsEasy")
 
 
 def test_options_of_a_game_of_ones_own_need_not_be_keyword_only(monkeypatch):

@@ -263,13 +263,13 @@ def scene_of_agent(game: str, folder: Path, options: dict[str, Any]) -> Scene:
         ValueError: there is no such game or folder.
     """
     from arcade_torch.agents.runs.shipped import pretrained_names
-    from arcade_torch.envs_jax import resolve_id
+    from arcade_torch.envs_jax import games_of, resolve_id
 
     names = ", ".join(pretrained_names())
     require(folder.is_dir(), "the agent", str(folder), f"a run folder, or one of {names}")
     agent = load_agent(folder)
     config = agent.config
-    if resolve_id(config.env) == resolve_id(game):
+    if resolve_id(game) in games_of(config.env):
         options = dict(config.env_options) | options
     else:
         say(f"note: this agent was trained on {config.env}")

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,6 +16,9 @@ from arcade_torch.tools.memory_files import check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
+
+if TYPE_CHECKING:
+    from arcade_torch.agents.evaluation import EvalResult
 
 SLOWER = 1.05
 """Times as long as without: from there on ``train`` says that ``--amp`` costs time."""
@@ -136,6 +139,7 @@ class Train(Command):
             f"greedy return {result.evaluation.mean:.3f} over {len(result.evaluation.returns)} "
             "episodes"
         )
+        _say_each_game(result.evaluation)
         if reason := stopped_exploring(Run(result.run_dir)):
             say(f"this run {reason}")
         say(f"finished: {result.run_dir}")
@@ -159,6 +163,8 @@ class Evaluate(Command):
     episodes: int = 128  # Number of episodes, each in an environment of its own.
     # Another twin than the agent was trained on.
     observability: Literal["full", "partial"] | None = None
+    # Another game than the agent was trained on, or one of its several.
+    game: str | None = None
     json: Path | None = None  # File for the numbers; not overwritten.
 
     def run(self) -> int:
@@ -171,17 +177,30 @@ class Evaluate(Command):
         if self.json is not None:
             check_writable(self.json)
         agent = load_agent(self.run_folder)
-        result = evaluate(agent, self.observability, self.episodes)
+        result = evaluate(agent, self.observability, self.episodes, game=self.game)
         config = agent.config
         twin = self.observability or agent.config.observability
-        which = f"{config.algorithm}-{config.memory} on {config.env} ({twin}), seed {config.seed}"
+        game = self.game or config.env
+        which = f"{config.algorithm}-{config.memory} on {game} ({twin}), seed {config.seed}"
         say(f"{which}, {agent.frames:,} frames of training: {result.text}")
+        _say_each_game(result)
         if self.json is not None:
-            episodes = {"returns": result.returns.tolist(), "lengths": result.lengths.tolist()}
+            episodes: dict[str, Any] = {
+                "returns": result.returns.tolist(),
+                "lengths": result.lengths.tolist(),
+            }
+            if result.games:
+                episodes["games"] = list(result.games)
             write_json(
                 self.json, episodes | {"mean": result.mean, "half_width_95": result.half_width}
             )
         return 0
+
+
+def _say_each_game(result: "EvalResult") -> None:
+    """Of a mixture, print the return in each game."""
+    for game, episodes in result.by_game.items():
+        say(f"  {game}: {episodes.text}")
 
 
 def _run_folder(run: TrainConfig) -> Path:

@@ -20,6 +20,8 @@ class EpisodeOptions(Options):
 
     # Another twin than the agents were trained on.
     observability: Literal["full", "partial"] | None = None
+    # Another game than the agents were trained on, or one of their several.
+    game: str | None = None
     seed: int = 0  # Of the episodes, and of what is drawn in them.
 
 

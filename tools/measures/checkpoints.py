@@ -14,6 +14,7 @@ import numpy as np
 
 import arcade_torch
 from arcade_torch.agents.runs.files import list_checkpoints
+from arcade_torch.envs_jax.registry import resolve_id
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.files import cached_arrays
 from arcade_torch.tools.imports import load_agent
@@ -95,9 +96,11 @@ def measure_run(
 
     ``measure`` takes an agent and returns a dataclass of arrays, numbers and words. Of ``options``
     it gets those that it has arguments for; ``observability`` is another twin than the one trained
-    on.
+    on, ``game`` another game.
     """
     agent = load_agent(path)
+    if options.get("game"):
+        agent.config = replace(agent.config, env=resolve_id(options["game"]))
     config = agent.config
     twin = options.get("observability") or config.observability
     key = AgentKey.of(config.to_dict())

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.envs import EpisodeBatch
@@ -294,6 +295,11 @@ def resolve_agent(
     if twin not in get_args(Twin):
         raise ValueError(
             f"this agent was trained on {twin} twins: name one of them, full or partial"
+        )
+    if is_mixture(agent.config.env):
+        raise ValueError(
+            f"this agent was trained on several games, {agent.config.env}: name one of them, "
+            "--game on the command line, env=arcade_torch.make(...) in Python"
         )
     from arcade_torch.agents.evaluation import make_eval_env
 

@@ -17,7 +17,7 @@ import numpy as np
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable, write_atomic
 from arcade_torch.compiled import compiled_game
-from arcade_torch.envs_jax import ACTION_NAMES, make
+from arcade_torch.envs_jax import ACTION_NAMES, games_of, make
 from arcade_torch.envs_jax.oracles import RandomPlayer, make_oracle
 from arcade_torch.gym.window import enlarge
 from arcade_torch.tools.errors import need
@@ -236,13 +236,18 @@ class EvaluationVideos:
         """Film an agent."""
         if self._failed:
             return
-        path = self.folder / f"frames-{agent.frames:09d}{self.suffix}"
+        games = dict.fromkeys(games_of(agent.config.env))
+        for game in games:
+            which = f"-{game}" if len(games) > 1 else ""
+            self._film(agent, game, f"frames-{agent.frames:09d}{which}{self.suffix}")
+
+    def _film(self, agent: Any, game_id: str, name: str) -> None:
+        """Film one game of an agent."""
+        path = self.folder / name
         try:
             config = agent.config
             partial = agent.config.observability != "full"
-            game = compiled_game(
-                config.env, config.obs_size, config.rules, dict(config.env_options)
-            )
+            game = compiled_game(game_id, config.obs_size, config.rules, dict(config.env_options))
             session = Session(
                 game,
                 seed=FILM_SEED,

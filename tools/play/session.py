@@ -15,6 +15,7 @@ import numpy.typing as npt
 from arcade_torch.agents.checked import require
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax import ACTION_NAMES, Game
+from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.gym.batch import NumpyBatch, seed_keys
 from arcade_torch.tools.play.captions import captioned
 
@@ -68,7 +69,7 @@ class Session:
         on_attempt: called with every episode that ended or was abandoned after its first step.
 
     Raises:
-        ValueError: a negative number of episodes, or a seed out of range.
+        ValueError: several games, a negative number of episodes, or a seed out of range.
 
     Example:
         >>> from arcade_torch.compiled import compiled_game
@@ -92,6 +93,8 @@ class Session:
         on_attempt: Callable[[Attempt], None] = lambda attempt: None,
     ) -> None:
         require(episodes >= 0, "episodes", episodes, "0 (no end) or more")
+        played = game.batched.game.id
+        require(not is_mixture(played), "the game", played, "one game, not several")
         self._batch = NumpyBatch(game, np.zeros(1, bool))
         self.partial = partial
         self.both = both

@@ -17,6 +17,7 @@ from arcade_torch.agents.runs.bundle import (
     write_bundle,
 )
 from arcade_torch.agents.runs.files import checksum, read_json, write_atomic, write_json
+from arcade_torch.envs_jax.registry import games_of
 from arcade_torch.tools.errors import MissingPackage
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.machine import versions
@@ -175,7 +176,8 @@ def _film(checkpoint: Any, folder: Path) -> str:
     from arcade_torch.tools.play.session import Session
 
     config = checkpoint.config
-    game = compiled_game(config.env, config.obs_size, config.rules, dict(config.env_options))
+    first = games_of(config.env)[0]
+    game = compiled_game(first, config.obs_size, config.rules, dict(config.env_options))
     for name in FILMS:
         try:
             write = recording.writer_for(folder / name)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from arcade_torch.agents.checked import require
-from arcade_torch.envs_jax.registry import DIFFICULTIES
+from arcade_torch.envs_jax.registry import DIFFICULTIES, is_mixture
 from arcade_torch.tools.measures import bootstrap
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval
 from arcade_torch.tools.names import find_baselines
@@ -61,6 +61,11 @@ def normalise(env_id: str, value: Any) -> Any:
         >>> normalise("TetrisEasy-v0", -0.5), normalise("CartPoleEasy-v0", 0.5)
         (0.25, 0.5)
     """
+    if is_mixture(env_id):
+        raise ValueError(
+            f"{env_id} is several games, whose returns have no scale in common: evaluate each by "
+            "itself (evaluate --game)"
+        )
     return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value
 
 
