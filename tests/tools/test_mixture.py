@@ -45,6 +45,18 @@ def test_a_measure_asks_for_one_game(
         assert f"{game}-v0" in capsys.readouterr().out
 
 
+def test_agents_of_two_games_are_no_seeds_of_one(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    words = ["train", "--preset", "smoke", "--env", "CartPoleEasy", "--algorithm", "ppo"]
+    assert cli.main([*words, "--seed", "1", "--out", str(other)]) == 0
+    words = ["analyze", "saliency", str(run), str(other), "--game", "CartPoleEasy"]
+    assert cli.main([*words, "--max-steps", "6", "--out", str(tmp_path / "figure")]) == 2
+    said = capsys.readouterr().err
+    assert "learned CartPoleEasy-v0+SkittlesEasy-v0 (full) and CartPoleEasy-v0 (full)" in said
+
+
 def test_one_game_at_a_time_is_played(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     film = str(run.parent / "film.gif")
     assert cli.main(["record", MIXTURE, "--player", str(run), "--out", film]) == 2

@@ -37,7 +37,7 @@ class Label:
     seed: int  # of the training
     path: Path  # run folder or checkpoint
     agent: str  # its name among those it is compared with; that of its memory until then
-    trained_on: str = ""  # the twin that it learned
+    learned: str = ""  # the game and the twin that it was trained on
 
     @property
     def task(self) -> tuple[str, str, str]:
@@ -99,12 +99,13 @@ def measure_run(
     on, ``game`` another game.
     """
     agent = load_agent(path)
+    learned = f"{agent.config.env} ({agent.config.observability})"
     if options.get("game"):
         agent.config = replace(agent.config, env=resolve_id(options["game"]))
     config = agent.config
     twin = options.get("observability") or config.observability
     key = AgentKey.of(config.to_dict())
-    label = Label(key, config.env, twin, config.seed, path, key.memory, config.observability)
+    label = Label(key, config.env, twin, config.seed, path, key.memory, learned)
     arguments = _arguments(measure, dict(options) | {"progress": progress})
 
     def compute() -> dict[str, Any]:
@@ -169,16 +170,17 @@ def measure_runs(
 
 
 def _check_seeds(labels: Sequence[Label]) -> None:
-    """Refuse a seed that is there twice, and seeds of one task that learned different twins."""
-    twins = dict[tuple[str, str, str], str]()
+    """Refuse a seed that is there twice, and seeds of one task that learned different games or
+    twins.
+    """
+    first = dict[tuple[str, str, str], str]()
     paths = dict[tuple[tuple[str, str, str], int], Path]()
     for label in labels:
-        learned = twins.setdefault(label.task, label.trained_on)
-        if learned != label.trained_on:
+        learned = first.setdefault(label.task, label.learned)
+        if learned != label.learned:
             task = f"{label.agent} on {label.game}"
             raise ValueError(
-                f"seeds of {task} learned the twins {learned} and {label.trained_on}: give runs of "
-                "one"
+                f"seeds of {task} learned {learned} and {label.learned}: give runs of one"
             )
         cell = (label.task, label.seed)
         if cell in paths:

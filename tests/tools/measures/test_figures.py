@@ -905,7 +905,7 @@ def test_seeds_that_learned_different_twins_are_not_pooled_when_one_twin_is_look
         "--episodes",
         "2",
     ]
-    assert "learned the twins" in refused(capsys, *words)
+    assert "(full) and " in refused(capsys, *words)
 
 
 def test_saliency_of_runs_has_a_row_for_every_agent(
