@@ -1,9 +1,11 @@
 """Long short-term memory, the same function as torch's."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -11,6 +13,7 @@ from arcade_torch.models.memory import Memory
 from arcade_torch.models.sequential import (
     Loads,
     in_time_order,
+    later_starts,
     linear_backward,
     one_by_one,
     start_and_stored,
@@ -18,6 +21,11 @@ from arcade_torch.models.sequential import (
 )
 
 __all__ = ["LSTM", "lstm_loop", "lstm_scan", "lstm_scan_backward"]
+
+STEPS_PER_START = 8  # with fewer, torch's LSTM, once between any two starts, is no faster
+OPTIONS = (True, 1, 0.0, True, False, True)
+"""Of torch's LSTM: biases, one layer, no dropout, fit for a backward pass, one direction, batch
+first."""
 
 
 class LSTM(Memory):
@@ -30,6 +38,8 @@ class LSTM(Memory):
 
     The state ``"h"`` is h and c in one tensor [2, H]. The loop over time is one operator, so a
     graph that ``torch.compile`` makes does not depend on the length. It has first derivatives only.
+    On a CPU, in float32, with few starts, torch's own operator takes its place, which knows of no
+    starts: it is called once between any two of them.
 
     Args:
         input_size: D.
@@ -51,6 +61,33 @@ class LSTM(Memory):
         for parameter in self.parameters():
             nn.init.uniform_(parameter, -bound, bound)
 
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        """See :class:`MemoryContract`."""
+        self._check(x, state, is_init)
+        h0 = state["h"]
+        starts = later_starts(is_init) if _has_fused(x) else None
+        if starts is not None and len(starts) * STEPS_PER_START <= x.shape[1]:
+            y, last = self._run_torchs(x, h0, is_init, starts)
+        else:
+            y, states = self.run(x, h0, is_init)
+            last = states[:, -1].clone()  # y may be the same memory
+        return y, TensorDict({"h": last}, batch_size=[len(x)])
+
+    def _run_torchs(
+        self, x: Tensor, h0: Tensor, is_init: Tensor, starts: list[int]
+    ) -> tuple[Tensor, Tensor]:
+        """y [B, T, H] and the last state [B, 2, H] by ``torch.lstm``, which keeps no other c."""
+        bias = self.from_input.bias
+        weights = (self.from_input.weight, self.from_state.weight, bias, torch.zeros_like(bias))
+        state = h0.to(x.dtype).transpose(0, 1)
+        outputs = []
+        for begin, end in pairwise([0, *starts, x.shape[1]]):
+            h, c = torch.where(is_init[:, begin, None], 0, state).split(1)
+            y, *after = torch.lstm(x[:, begin:end], (h, c), weights, *OPTIONS)
+            state = torch.cat(after)
+            outputs.append(y)
+        return torch.cat(outputs, dim=1), state.transpose(0, 1)
+
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 2, H]."""
         start, stored = start_and_stored(h0, is_init, 2, x.dtype)
@@ -58,6 +95,21 @@ class LSTM(Memory):
         weights = (self.from_input.weight, self.from_input.bias, self.from_state.weight)
         states = scan(x, *weights, start, stored)[0]
         return states[:, :, 0], states
+
+
+def _has_fused(x: Tensor) -> bool:
+    """Whether torch's LSTM is one fused operator here, and flags may be read to cut a sequence.
+
+    Not on a card, which would be waited for, nor where a graph is made of the calls, nor in
+    transforms such as ``vmap``, for which torch's operator has no rule.
+    """
+    if x.device.type != "cpu" or x.dtype != torch.float32 or x.shape[1] == 1:
+        return False
+    if torch.compiler.is_compiling() or torch._C._is_tracing():
+        return False
+    if torch._C._are_functorch_transforms_active():
+        return False
+    return torch.backends.mkldnn.is_available() and bool(torch.backends.mkldnn.enabled)
 
 
 def lstm_loop(

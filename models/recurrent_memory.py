@@ -13,6 +13,7 @@ from torch.nn.parameter import is_lazy
 from arcade_torch.models.law_subject import copy_of
 from arcade_torch.models.memory import Memory, batch_shape, replay_by_steps
 from arcade_torch.models.module_state import Path, arrange, empty_like, shapes_of, tensors_of
+from arcade_torch.models.sequential import later_starts
 
 __all__ = ["RecurrentMemory"]
 
@@ -125,7 +126,7 @@ class RecurrentMemory(Memory):
             return y, state.clone()
         fresh = self.initial_state(len(x))
         outputs = []
-        for begin, end in pairwise([0, *_later_starts(is_init), x.shape[1]]):
+        for begin, end in pairwise([0, *later_starts(is_init), x.shape[1]]):
             state = fresh.where(is_init[:, begin], state)
             y, after = self._read(self.module, x[:, begin:end], self._to_module(state))
             state = self._from_module(after, len(x))
@@ -292,16 +293,6 @@ def _call(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:
         return module(x, state)  # type: ignore[no-any-return]
     y, state = module(x.transpose(0, 1), state)
     return y.transpose(0, 1), state
-
-
-def _later_starts(is_init: Tensor) -> list[int]:
-    """Steps behind the first at which an episode of the batch begins; all where flags have no
-    values to read (``vmap``).
-    """
-    try:
-        return (is_init[:, 1:].any(dim=0).nonzero().flatten() + 1).tolist()
-    except RuntimeError:
-        return list(range(1, is_init.shape[1]))
 
 
 def _check_module(module: Any) -> None:

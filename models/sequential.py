@@ -10,6 +10,7 @@ from torch import Tensor
 __all__ = [
     "Loads",
     "in_time_order",
+    "later_starts",
     "linear_backward",
     "one_by_one",
     "start_and_stored",
@@ -39,6 +40,16 @@ def start_and_stored(
         begins = is_init[:, 0].reshape(-1, *(1,) * state_ndim)
         stored = torch.where(begins, 0, stored).unsqueeze(1)
     return start, stored
+
+
+def later_starts(is_init: Tensor) -> list[int]:
+    """Steps behind the first at which an episode of the batch begins; all where flags have no
+    values to read (``vmap``).
+    """
+    try:
+        return (is_init[:, 1:].any(dim=0).nonzero().flatten() + 1).tolist()
+    except RuntimeError:
+        return list(range(1, is_init.shape[1]))
 
 
 class Loads:

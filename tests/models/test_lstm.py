@@ -53,6 +53,100 @@ def test_a_start_in_the_middle_is_torchs_lstm_begun_again() -> None:
     torch.testing.assert_close(y, wanted, rtol=0, atol=1e-14)
 
 
+def few_starts(memory: nn.Module) -> list[torch.Tensor]:
+    """x, a state and flags of 40 steps: one start at index 0, three in the middle at two steps."""
+    dtype = memory.like.dtype
+    x = torch.randn(3, 40, 4, dtype=dtype, requires_grad=True)
+    h = torch.randn(3, 2, 6, dtype=dtype, requires_grad=True)
+    is_init = torch.zeros(3, 40, dtype=torch.bool)
+    is_init[0, 0] = is_init[1, 7] = is_init[2, 7] = is_init[1, 33] = True
+    return [x, h, is_init]
+
+
+def read(memory: nn.Module, x: torch.Tensor, h: torch.Tensor, is_init: torch.Tensor) -> list:
+    """y, and the state after the last step."""
+    state = memory.initial_state(len(x)).set("h", h)
+    y, after = memory(x, state, is_init)
+    return [y, after["h"]]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Steps that each call of torch's LSTM reads."""
+    seen = []
+    torchs = torch.lstm
+
+    def counted(x: torch.Tensor, *rest: object) -> object:
+        seen.append(x.shape[1])
+        return torchs(x, *rest)
+
+    monkeypatch.setattr(torch, "lstm", counted)
+    return seen
+
+
+@pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="torch has no oneDNN here")
+def test_few_starts_are_read_by_torchs_own_operator_values_and_gradients(calls: list[int]) -> None:
+    memory = make_memory("lstm", 4, 6)
+    x, h, is_init = few_starts(memory)
+    ours = read(memory, x, h, is_init)
+    assert calls == [7, 26, 7]
+    y, states = memory.run(x, h, is_init)
+    assert calls == [7, 26, 7]
+    plain = [y, states[:, -1]]
+    torch.testing.assert_close(ours, plain, rtol=1e-6, atol=1e-6)
+    leaves = [x, h, *memory.parameters()]
+    directions = [torch.randn_like(out) for out in plain]
+    gradients = torch.autograd.grad(ours, leaves, directions)
+    wanted = torch.autograd.grad(plain, leaves, directions)
+    for got, expected in zip(gradients, wanted, strict=True):
+        scale = float(expected.abs().max())
+        torch.testing.assert_close(got, expected, rtol=0, atol=2e-6 * scale)
+    assert not gradients[1][0].any()  # what the flag at index 0 forgets
+
+
+def test_a_start_hides_what_was_before_from_torchs_operator_too() -> None:
+    memory = make_memory("lstm", 4, 6)
+    x, h, is_init = few_starts(memory)
+    with torch.no_grad():
+        y, after = read(memory, x, h, is_init)
+        h[0] = torch.nan
+        x[2, 6] = torch.nan
+        poisoned, after_poisoned = read(memory, x, h, is_init)
+    assert torch.equal(poisoned[2, 7:], y[2, 7:])
+    assert torch.equal(poisoned[0], y[0])
+    assert torch.equal(after_poisoned, after)
+    assert poisoned[2, 6].isnan().all()
+
+
+def test_many_starts_and_float64_are_read_by_the_loop(calls: list[int]) -> None:
+    memory = make_memory("lstm", 4, 6)
+    x, h, is_init = few_starts(memory)
+    is_init[0, 10:15] = True
+    read(memory, x, h, is_init)
+    read(memory.double(), *few_starts(memory))
+    assert calls == []
+
+
+def test_vmap_is_given_the_loop(calls: list[int]) -> None:
+    memory = make_memory("lstm", 4, 6)
+    x, h, is_init = few_starts(memory)
+    with torch.no_grad():
+        wanted = read(memory, x, h, is_init)
+    calls.clear()
+    weights = dict(memory.named_parameters())
+
+    def outputs(weights: dict, h: torch.Tensor) -> list:
+        state = memory.initial_state(3).set("h", h)
+        y, after = torch.func.functional_call(memory, weights, (x, state, is_init))
+        return [y, after["h"]]
+
+    two = {name: torch.stack([weight, weight]) for name, weight in weights.items()}
+    got = torch.func.vmap(outputs, in_dims=(0, None))(two, h)
+    assert calls == []
+    torch.testing.assert_close([each[1] for each in got], wanted, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(outputs(weights, h), wanted, rtol=0, atol=0)
+
+
 def problem(every: bool = True) -> list[torch.Tensor]:
     """Random arguments of the scan, with a start at index 0, and a state to load for every step or
     for index 0 alone.
