@@ -169,7 +169,16 @@ class Learner:
         # The config decides these; the step size is set before every step, and on CUDA a tensor
         # there.
         self.optimizer.param_groups[0].update(options)
+        self._lay_out_averages()
         self.grad_steps = state["grad_steps"]
+
+    def _lay_out_averages(self) -> None:
+        """Store averages in the order of their weights, which was another in older versions: fused
+        Adam pairs numbers by their place in memory.
+        """
+        for parameter, averages in self.optimizer.state.items():
+            for name in ("exp_avg", "exp_avg_sq"):
+                averages[name] = torch.empty_like(parameter).copy_(averages[name])
 
 
 def _rows(data: TensorDictBase, rows: Tensor) -> TensorDictBase:

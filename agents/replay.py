@@ -85,7 +85,8 @@ class SequenceReplay:
         held = self._segments[-1].data["pixels"].shape[2:] if self._segments else size
         if held != size:
             raise CheckpointError(
-                f"the replay holds frames {tuple(held)}, the network now stores {tuple(size)}"
+                f"the replay in {self._folder} holds frames {tuple(held)}, the network now stores "
+                f"{tuple(size)}: train again, or go on with the version that began the run"
             )
         file = self._folder / f"window-{self._added:09d}.safetensors"
         write_atomic(file, save(tensors))

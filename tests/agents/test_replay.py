@@ -137,7 +137,8 @@ def test_frames_of_another_size_than_those_at_hand_are_refused_in_one_line():
     second["pixels"] = second["pixels"][:, :, :-1]
     with pytest.raises(
         CheckpointError,
-        match=r"replay holds frames \(2, 2, 3\), the network now stores \(1, 2, 3\)",
+        match=r"holds frames \(2, 2, 3\), the network now stores \(1, 2, 3\): train again, or go on "
+        "with the version that began the run",
     ):
         replay.add(second)
     assert len(replay) == ROWS

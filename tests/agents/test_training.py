@@ -281,6 +281,26 @@ def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> 
     assert trainer.learner.optimizer.param_groups[0]["lr"] is rate
 
 
+def test_averages_that_an_older_version_laid_out_otherwise_are_those_of_their_weights() -> None:
+    """Adam's fused kernel pairs numbers by their place in memory, whatever the strides say."""
+    trainer = training.Trainer(CONFIG)
+    trainer.update()
+    saved = trainer.learner.state_dict()["optimizer"]["state"]
+    plain = {index: average["exp_avg"].clone() for index, average in saved.items()}
+    reordered = [index for index, average in plain.items() if average.ndim == 4]
+    assert reordered
+    for index in reordered:
+        for name in ("exp_avg", "exp_avg_sq"):
+            saved[index][name] = saved[index][name].to(memory_format=torch.channels_last)
+    trainer.learner.load_state_dict(trainer.learner.state_dict())
+    trainer.close()
+    averages = trainer.learner.optimizer.state
+    for index, parameter in enumerate(trainer.learner.parameters):
+        for name in ("exp_avg", "exp_avg_sq"):
+            assert averages[parameter][name].stride() == parameter.stride()
+        assert torch.equal(averages[parameter]["exp_avg"], plain[index])
+
+
 def test_a_gpu_that_is_not_there_is_refused_in_one_line_and_leaves_no_folder_behind(
     tmp_path, monkeypatch
 ):
