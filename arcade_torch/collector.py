@@ -18,7 +18,13 @@ from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.jax_env import JaxEnv
-from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner, random_actions
+from arcade_torch.policies import (
+    ROOT_KEYS,
+    Policy,
+    PolicyRunner,
+    copy_weights,
+    random_actions,
+)
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.validation import check_flags, whole
 
@@ -381,15 +387,7 @@ class ArcadeCollector(BaseCollector):
             raise TypeError(
                 f"the policy is a {type(self.policy).__name__}, which has no weights to update"
             )
-        weights = policy_or_weights
-        if isinstance(weights, nn.Module):
-            weights = TensorDict.from_module(weights)
-        elif isinstance(weights, dict):
-            weights = TensorDict(weights, []).unflatten_keys(".")
-        # torch.compile puts a module into another one
-        weights = weights.get("_orig_mod", weights)
-        policy = getattr(self.policy, "_orig_mod", self.policy)
-        TensorDict.from_module(policy).data.update_(weights.data)
+        copy_weights(self.policy, policy_or_weights)
 
     def state_dict(self) -> OrderedDict[str, Any]:
         """Everything that determines the coming batches: env, recurrent state, overlap, counters,
