@@ -322,8 +322,9 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
         value = batch.get(key, None)
     if value is None:
         raise KeyError(
-            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}); take "
-            "collect() or 'all'"
+            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}): "
+            "collect with compact_obs=False, or with final_frames='all'; or take what "
+            "ArcadeCollector.collect() gives"
         )
     return _rows(value, steps)
 

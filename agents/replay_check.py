@@ -48,6 +48,9 @@ def check_replay(
         True
     """
     inputs = NetworkInputs(policy)
+    for flags in inputs.start_keys:
+        if "is_init" not in batch and flags in batch:
+            batch = batch.copy().set("is_init", batch[flags])
     outputs = [output for output in policy.out_keys if output in batch]
     outputs = [output for output in outputs if unravel_key(output)[0] != "next"]
     name = _compared(policy, outputs, key)

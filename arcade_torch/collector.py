@@ -364,7 +364,7 @@ class ArcadeCollector(BaseCollector):
         ids = torch.cat([self._traj_ids.unsqueeze(0), new * done]).cummax(0).values
         self._traj_ids = ids[-1].clone()
         self._next_traj_id += int(done.sum())
-        return ids[:-1].T
+        return ids[:-1].T.contiguous()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed env and random actions, and start over with new episodes.

@@ -250,6 +250,21 @@ def test_a_mask_of_actions_is_none_of_steps() -> None:
     assert check_replay(policy, collected(policy)) < ROUNDING
 
 
+def test_start_flags_may_have_another_name() -> None:
+    memory = MemoryModule(
+        make_memory("lru", 16, 16), "features", "remembered", is_init_key="begins"
+    )
+    policy = policy_of(memory)
+    env = TransformedEnv(
+        GymEnv("CartPole-v1", categorical_action_encoding=True), InitTracker(init_key="begins")
+    ).append_transform(get_primers_from_module(policy, warn=False))
+    batch = env.rollout(STEPS, policy, break_when_any_done=False)
+    assert batch["begins"].sum() > 2 and "is_init" not in batch
+    assert check_replay(policy, batch) < ROUNDING
+    batch["begins"] = torch.zeros_like(batch["begins"])
+    assert check_replay(policy, batch) > WRONG
+
+
 def test_a_batch_that_says_nothing_of_the_policy_is_refused_in_one_line() -> None:
     policy = policy_of(MEMORIES["ours"]())
     batch = collected(policy)

@@ -191,6 +191,20 @@ def test_batches_go_into_a_memory_mapped_replay_buffer(tmp_path: Any) -> None:
     assert_same(buffer[N:], expected)
 
 
+@pytest.mark.parametrize("step", ["step", "step_and_maybe_reset"])
+def test_a_step_can_be_packed_as_a_parallel_env_without_buffers_does(step: str) -> None:
+    env = stub_env()
+    given = getattr(env, step)(env.rand_action(env.reset()))
+    td = given if step == "step" else given[0]
+    assert_same(td.consolidate(), td.clone())
+
+
+def test_a_batch_can_be_packed_and_seen_as_one_row_of_steps() -> None:
+    batch = next(iter(ArcadeCollector(stub_env(), recurrent_policy(), N * T)))
+    assert_same(batch.consolidate(), batch.clone())
+    assert_same(batch.view(-1), batch.reshape(-1))
+
+
 def make_ppo(policy_net: nn.Module) -> tuple[ProbabilisticActor, ValueOperator, ClipPPOLoss]:
     body = TensorDictSequential(encoder(), TensorDictModule(policy_net, ["features"], ["logits"]))
     actor = ProbabilisticActor(
