@@ -25,6 +25,7 @@ from arcade_torch.policies import (
     copy_weights,
     random_actions,
 )
+from arcade_torch.process import warn
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.validation import check_flags, whole
 
@@ -395,8 +396,13 @@ class ArcadeCollector(BaseCollector):
 
         Only tensors, numbers, strings and containers, so that ``torch.load(weights_only=True)``
         reads it. Random numbers that a policy draws from torch's global generator are the caller's
-        to save.
+        to save. After ``shutdown`` the episodes are gone, and a warning says so.
         """
+        if self.closed:
+            warn(
+                "a state_dict behind shutdown() holds no episodes, so that new ones begin where it "
+                "is loaded: take it before"
+            )
         out: OrderedDict[str, Any] = OrderedDict(frames=self._frames, iter=self._iter)
         # by others: see _look
         out["acted"] = self._acted
