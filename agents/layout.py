@@ -193,10 +193,11 @@ def _ends(batch: TensorDictBase, mask: Tensor | None, time_limit: str) -> tuple[
 
 
 def _in_full(reward: Tensor) -> Tensor:
-    """Rewards in single precision at least: discounts in half would be off by a thousandth."""
-    if reward.is_floating_point() and reward.itemsize < torch.float32.itemsize:
-        return reward.float()
-    return reward
+    """Rewards in single precision at least: discounts in half would be off by a thousandth, and
+    those of whole numbers 0.
+    """
+    is_full = reward.is_floating_point() and reward.itemsize >= torch.float32.itemsize
+    return reward if is_full else reward.float()
 
 
 def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor]:
@@ -322,8 +323,9 @@ def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs)
         value = batch.get(key, None)
     if value is None:
         raise KeyError(
-            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}); take "
-            "collect() or 'all'"
+            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}): "
+            "collect with compact_obs=False, or with final_frames='all'; or take what "
+            "ArcadeCollector.collect() gives"
         )
     return _rows(value, steps)
 

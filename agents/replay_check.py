@@ -2,11 +2,11 @@
 
 import torch
 from tensordict import TensorDictBase, is_tensor_collection, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.agents.batch_checks import MASKS, Key
+from arcade_torch.agents.batch_checks import MASKS, Key, step_mask
 from arcade_torch.agents.layout import NetworkInputs, as_steps
 
 __all__ = ["check_replay"]
@@ -48,6 +48,9 @@ def check_replay(
         True
     """
     inputs = NetworkInputs(policy)
+    for flags in inputs.start_keys:
+        if "is_init" not in batch and flags in batch:
+            batch = batch.copy().set("is_init", batch[flags])
     outputs = [output for output in policy.out_keys if output in batch]
     outputs = [output for output in outputs if unravel_key(output)[0] != "next"]
     name = _compared(policy, outputs, key)
@@ -55,25 +58,34 @@ def check_replay(
     acted = as_steps(batch, inputs, *outputs, *masks)
     read = acted.select(*inputs.observation_keys, *inputs.state_keys, strict=False)
 
+    head = _heads(policy).get(name)
     with torch.no_grad(), set_recurrent_mode(True):
-        if name in _log_prob_keys(policy):
+        if head is None:
+            replayed = policy(read)[name]
+        elif hasattr(policy, "log_prob"):
             # of the actions that were taken: the policy would draw others
             replayed = policy.log_prob(read.update(acted.select(*outputs)))
         else:
-            replayed = policy(read)[name]
+            read = policy(read).update(acted.select(*head.dist_sample_keys))
+            replayed = head.log_prob(read)
     if is_tensor_collection(replayed):
         replayed = replayed[name]
     return _largest_difference(replayed, acted[name], acted)
 
 
-def _log_prob_keys(policy: TensorDictModuleBase) -> list[Key]:
-    """Where a policy writes log-probabilities of its actions; empty where it draws none."""
-    return list(getattr(policy, "log_prob_keys", []))
+def _heads(policy: TensorDictModuleBase) -> dict[Key, ProbabilisticTensorDictModule]:
+    """The modules within a policy that draw actions, by where they write log-probabilities."""
+    heads = {}
+    for module in policy.modules():
+        if isinstance(module, ProbabilisticTensorDictModule) and module.return_log_prob:
+            for key in module.log_prob_keys:
+                heads[unravel_key(key)] = module
+    return heads
 
 
 def _compared(policy: TensorDictModuleBase, outputs: list[Key], key: Key | None) -> Key:
     """Which of the outputs that a batch holds is compared."""
-    wanted = [*_log_prob_keys(policy), "action_value"] if key is None else [unravel_key(key)]
+    wanted = [*_heads(policy), "action_value"] if key is None else [unravel_key(key)]
     for name in wanted:
         if name in outputs:
             return name
@@ -87,8 +99,7 @@ def _largest_difference(replayed: Tensor, acted: Tensor, steps: TensorDictBase) 
     """The largest absolute difference; equal infinities do not differ."""
     difference = (replayed - acted).detach().abs()  # a rollout may have been made with gradients
     difference = difference.masked_fill(replayed == acted, 0.0)
-    for key in MASKS:
-        mask = steps.get(key, None)
-        if mask is not None and mask.shape[: steps.ndim] == steps.shape:
-            difference = difference[mask.reshape(steps.shape)]
+    mask = step_mask(steps, steps.shape)
+    if mask is not None:
+        difference = difference[mask]
     return float(difference.max())

@@ -18,7 +18,14 @@ from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.jax_env import JaxEnv
-from arcade_torch.policies import ROOT_KEYS, Policy, PolicyRunner, random_actions
+from arcade_torch.policies import (
+    ROOT_KEYS,
+    Policy,
+    PolicyRunner,
+    copy_weights,
+    random_actions,
+)
+from arcade_torch.process import warn
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.validation import check_flags, whole
 
@@ -358,7 +365,7 @@ class ArcadeCollector(BaseCollector):
         ids = torch.cat([self._traj_ids.unsqueeze(0), new * done]).cummax(0).values
         self._traj_ids = ids[-1].clone()
         self._next_traj_id += int(done.sum())
-        return ids[:-1].T
+        return ids[:-1].T.contiguous()
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed env and random actions, and start over with new episodes.
@@ -381,15 +388,7 @@ class ArcadeCollector(BaseCollector):
             raise TypeError(
                 f"the policy is a {type(self.policy).__name__}, which has no weights to update"
             )
-        weights = policy_or_weights
-        if isinstance(weights, nn.Module):
-            weights = TensorDict.from_module(weights)
-        elif isinstance(weights, dict):
-            weights = TensorDict(weights, []).unflatten_keys(".")
-        # torch.compile puts a module into another one
-        weights = weights.get("_orig_mod", weights)
-        policy = getattr(self.policy, "_orig_mod", self.policy)
-        TensorDict.from_module(policy).data.update_(weights.data)
+        copy_weights(self.policy, policy_or_weights)
 
     def state_dict(self) -> OrderedDict[str, Any]:
         """Everything that determines the coming batches: env, recurrent state, overlap, counters,
@@ -397,8 +396,13 @@ class ArcadeCollector(BaseCollector):
 
         Only tensors, numbers, strings and containers, so that ``torch.load(weights_only=True)``
         reads it. Random numbers that a policy draws from torch's global generator are the caller's
-        to save.
+        to save. After ``shutdown`` the episodes are gone, and a warning says so.
         """
+        if self.closed:
+            warn(
+                "a state_dict behind shutdown() holds no episodes, so that new ones begin where it "
+                "is loaded: take it before"
+            )
         out: OrderedDict[str, Any] = OrderedDict(frames=self._frames, iter=self._iter)
         # by others: see _look
         out["acted"] = self._acted

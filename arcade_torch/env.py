@@ -556,15 +556,15 @@ class ArcadeEnv(BaseEnv):
     def _next(
         self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor
     ) -> TensorDict:
-        """The ``"next"`` tensordict. Frames and numbers are zero copy, since JAX never reads them
-        again.
+        """The ``"next"`` tensordict. Frames are zero copy, since JAX never reads them again.
+        Rewards are copies, for ``consolidate`` of a tensordict takes no columns.
         """
         is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         step_count = numbers[:, STEP_COUNT, None].to(torch.int64)
-        episode_reward = numbers[:, EPISODE_REWARD, None].view(torch.float32)
+        episode_reward = numbers[:, EPISODE_REWARD, None].view(torch.float32).contiguous()
         counts = {"is_init": is_init, "step_count": step_count, "episode_reward": episode_reward}
         following = self._entries(frames, action, counts, numbers[:, TERMINATED:] > 0)
-        following["reward"] = numbers[:, REWARD, None].view(torch.float32)
+        following["reward"] = numbers[:, REWARD, None].view(torch.float32).contiguous()
         return TensorDict._new_unsafe(following, batch_size=self.batch_size, device=self.device)
 
     def _entries(

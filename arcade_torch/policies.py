@@ -2,7 +2,7 @@
 stored of it.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NoReturn
 
 import torch
@@ -182,6 +182,45 @@ def random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor
         low + share * distance if is_float else low + (share * (distance + 1)).to(spec.dtype)
     )
     return action
+
+
+def copy_weights(policy: nn.Module, given: nn.Module | TensorDictBase | Mapping[str, Any]) -> None:
+    """Copy weights into a policy by name.
+
+    TorchRL's trainers hand over those of the actor alone. What is a tensor of the policy already,
+    under whatever name, acts as it is.
+
+    Raises:
+        ValueError: A weight that the policy does not have; nothing is copied.
+    """
+    weights = _weights(policy)
+    acting = {(weight.data_ptr(), weight.shape) for weight in weights.values()}
+    others = {}
+    for name, value in _weights(given).items():
+        if (value.data_ptr(), value.shape) in acting:
+            continue
+        if name not in weights or weights[name].shape != value.shape:
+            raise ValueError(
+                f"the weights have {name} {list(value.shape)}, which the policy does not: give "
+                "those of the whole policy, TensorDict.from_module(policy)"
+            )
+        others[name] = value
+    for name, value in others.items():
+        weights[name].copy_(value)
+
+
+def _weights(given: nn.Module | TensorDictBase | Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Parameters and buffers by name, as ``state_dict`` calls them."""
+    if isinstance(given, nn.Module):
+        given = TensorDict.from_module(given)
+    if isinstance(given, TensorDictBase):
+        given = given.flatten_keys(".")
+    tensors = {}
+    for name, value in given.items():
+        if isinstance(value, torch.Tensor):
+            # torch.compile puts a module into another one
+            tensors[name.removeprefix("_orig_mod.")] = value.data
+    return tensors
 
 
 def path_of(key: NestedKey) -> tuple[str, ...]:

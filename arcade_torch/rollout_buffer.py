@@ -385,6 +385,8 @@ class RolloutBuffer:
     def _entries(self, first: int, batch_size: list[int]) -> TensorDict:
         """Everything but what follows a step's frame, from step ``first`` on."""
         numbers = self._numbers[:, first:]
+        reward = numbers[..., REWARD, None].view(torch.float32)
+        episode_reward = numbers[..., EPISODE_REWARD, None].view(torch.float32)
         out = TensorDict({}, batch_size=batch_size, device=self.device)
         entries: dict[NestedKey, torch.Tensor] = {
             "action": self._action[:, first:],
@@ -392,8 +394,9 @@ class RolloutBuffer:
             "is_init": self._root["is_init"][:, first:, None],
             "step_count": self._root["step_count"][:, first:, None],
             "episode_reward": self._root["episode_reward"][:, first:, None],
-            ("next", "reward"): numbers[..., REWARD, None].view(torch.float32),
-            ("next", "episode_reward"): numbers[..., EPISODE_REWARD, None].view(torch.float32),
+            # view and consolidate of a tensordict take no columns
+            ("next", "reward"): reward.contiguous(),
+            ("next", "episode_reward"): episode_reward.contiguous(),
             ("next", "step_count"): numbers[..., STEP_COUNT, None].to(torch.int64),
             ("next", "terminated"): numbers[..., TERMINATED, None] > 0,
             ("next", "truncated"): numbers[..., TRUNCATED, None] > 0,

@@ -253,11 +253,15 @@ def test_a_misspelt_word_is_refused_when_the_loss_is_made(kind, word):
         kind(toy_network(), **word)
 
 
-def test_rewards_that_are_whole_numbers_are_refused():
+@pytest.mark.parametrize("dtype", [torch.int8, torch.int64])
+def test_rewards_may_be_whole_numbers_as_binarize_reward_gives(dtype):
     s = stream(3, 6, seed=1)
-    s.reward = s.reward.long()
-    with pytest.raises(ValueError, match="the dtype of rewards must be a floating one"):
-        make_loss(toy_network())(s.stock())
+    s.reward = (s.reward > 0).float()
+    assert s.reward.unique().numel() == 2
+    loss = make_loss(toy_network())
+    whole = s.stock()
+    whole["next", "reward"] = whole["next", "reward"].to(dtype)
+    assert torch.equal(loss(whole)["loss"], loss(s.stock())["loss"])
 
 
 def test_training_on_one_window_lowers_its_loss():

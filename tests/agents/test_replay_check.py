@@ -14,13 +14,16 @@ from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import GymEnv, InitTracker, StepCounter, TransformedEnv
 from torchrl.modules import (
+    ActorValueOperator,
     EGreedyModule,
     GRUModule,
     LSTMModule,
+    MaskedCategorical,
     NormalParamExtractor,
     ProbabilisticActor,
     QValueModule,
     TanhNormal,
+    ValueOperator,
 )
 from torchrl.modules.utils import get_primers_from_module
 
@@ -196,6 +199,70 @@ def test_any_output_may_be_compared_and_continuous_actions_are_those_that_were_t
     assert check_replay(policy, batch, key="loc") < ROUNDING
     batch["loc"][7] += 1
     assert check_replay(policy, batch, key="loc") == pytest.approx(1.0, abs=ROUNDING)
+
+
+def actor_with_critic(kind: str) -> Any:
+    """A critic beside the actor, or behind the memory that both read."""
+    actor = policy_of(MEMORIES["ours"]())
+    if kind == "beside":
+        critic = ValueOperator(nn.Linear(4, 1), in_keys=["observation"])
+        return TensorDictSequential(critic, actor)
+    encode, memory, logits = actor.det_part[0]
+    critic = ValueOperator(nn.Linear(16, 1), in_keys=["remembered"])
+    head = ProbabilisticActor(
+        logits,
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+    return ActorValueOperator(TensorDictSequential(encode, memory), head, critic)
+
+
+@pytest.mark.parametrize("kind", ["beside", "behind"])
+def test_a_critic_may_run_with_the_actor(kind: str) -> None:
+    policy = actor_with_critic(kind)
+    batch = collected(policy)
+    assert check_replay(policy, batch) < ROUNDING
+    batch["action_log_prob"][7] += 1
+    assert check_replay(policy, batch) == pytest.approx(1.0, abs=ROUNDING)
+    batch["action_log_prob"][7] -= 1
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.mul_(1.5)
+    assert check_replay(policy, batch) > WRONG
+
+
+def test_a_mask_of_actions_is_none_of_steps() -> None:
+    memory = MEMORIES["ours"]()
+    encode = TensorDictModule(nn.Linear(4, 16), ["observation"], ["features"])
+    logits = TensorDictModule(nn.Linear(16, 3), ["remembered"], ["logits"])
+    allowed = TensorDictModule(
+        lambda x: torch.tensor([True, True, False]).expand(*x.shape[:-1], 3).clone(),
+        ["observation"],
+        ["mask"],
+    )
+    policy = ProbabilisticActor(
+        TensorDictSequential(encode, memory, logits, allowed),
+        in_keys=["logits", "mask"],
+        distribution_class=MaskedCategorical,
+        return_log_prob=True,
+    )
+    assert check_replay(policy, collected(policy)) < ROUNDING
+
+
+def test_start_flags_may_have_another_name() -> None:
+    memory = MemoryModule(
+        make_memory("lru", 16, 16), "features", "remembered", is_init_key="begins"
+    )
+    policy = policy_of(memory)
+    env = TransformedEnv(
+        GymEnv("CartPole-v1", categorical_action_encoding=True), InitTracker(init_key="begins")
+    ).append_transform(get_primers_from_module(policy, warn=False))
+    batch = env.rollout(STEPS, policy, break_when_any_done=False)
+    assert batch["begins"].sum() > 2 and "is_init" not in batch
+    assert check_replay(policy, batch) < ROUNDING
+    batch["begins"] = torch.zeros_like(batch["begins"])
+    assert check_replay(policy, batch) > WRONG
 
 
 def test_a_batch_that_says_nothing_of_the_policy_is_refused_in_one_line() -> None:

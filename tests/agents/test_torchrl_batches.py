@@ -135,6 +135,15 @@ def test_steps_joined_to_n_steps_are_refused():
             read(batch.clone())
 
 
+def test_a_batch_without_next_observations_says_how_they_get_there():
+    s = stream(3, 8, seed=1)
+    batch = s.stock()
+    compact = batch.exclude(*[("next", key) for key in toy_network().in_keys if key != "is_init"])
+    for read in readers():
+        with pytest.raises(KeyError, match=r"compact_obs=False.*final_frames='all'"):
+            read(compact.clone())
+
+
 @pytest.mark.parametrize("shape", [(4, 9), (36,)])
 def test_shuffled_steps_are_refused_and_ordered_ones_are_not(shape):
     batch = numbered(stream(4, 9, seed=3, ends=0.1))

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
@@ -125,6 +125,51 @@ def test_weights_are_live_and_others_can_be_copied_in() -> None:
     assert (policy[2].module.weight == 1).all()
 
 
+def two_towers(first: str) -> tuple[TensorDictSequential, ProbabilisticActor, ClipPPOLoss]:
+    """A policy of an actor and a critic whose first layers look alike, and their loss."""
+    trunk = nn.Sequential(nn.Flatten(-3), nn.Linear(192, 8), nn.Tanh())
+    critic = TensorDictSequential(
+        TensorDictModule(nn.Sequential(_Float(), copy.deepcopy(trunk)), ["pixels"], ["seen"]),
+        ValueOperator(nn.Linear(8, 1), in_keys=["seen"]),
+    )
+    actor = ProbabilisticActor(
+        TensorDictSequential(
+            TensorDictModule(nn.Sequential(_Float(), trunk), ["pixels"], ["features"]),
+            TensorDictModule(nn.Linear(8, 5), ["features"], ["logits"]),
+        ),
+        in_keys=["logits"],
+        distribution_class=torch.distributions.Categorical,
+        return_log_prob=True,
+    )
+    for weight in critic.parameters():
+        nn.init.normal_(weight)
+    towers = (critic, actor) if first == "critic" else (actor, critic)
+    return TensorDictSequential(*towers), actor, ClipPPOLoss(actor, critic)
+
+
+@pytest.mark.parametrize("first", ["critic", "actor"])
+def test_a_trainer_hands_over_a_part_of_the_policy_that_already_acts(first: str) -> None:
+    policy, actor, loss = two_towers(first)
+    before = copy.deepcopy(policy.state_dict())
+    collector = ArcadeCollector(stub_env(), policy, N * T)
+    # what TorchRL's trainers of PPO, A2C and REINFORCE do behind every window
+    collector.update_policy_weights_(TensorDict.from_module(loss.actor_network))
+    collector.update_policy_weights_(actor)
+    for name, weight in policy.state_dict().items():
+        assert torch.equal(weight, before[name]), name
+
+
+@pytest.mark.parametrize("first", ["critic", "actor"])
+def test_weights_that_are_none_of_the_policy_change_nothing(first: str) -> None:
+    policy = two_towers(first)[0]
+    before = copy.deepcopy(policy.state_dict())
+    collector = ArcadeCollector(stub_env(), policy, N * T)
+    with pytest.raises(ValueError, match=r"^the weights have module\..* of the whole policy"):
+        collector.update_policy_weights_(two_towers(first)[1])
+    for name, weight in policy.state_dict().items():
+        assert torch.equal(weight, before[name]), name
+
+
 def test_transforms_work_on_the_stock_path() -> None:
     env = TransformedEnv(stub_env(seed=1), StepCounter(max_steps=3))
     env.append_transform(ToTensorImage(in_keys=["pixels"]))
@@ -144,6 +189,20 @@ def test_batches_go_into_a_memory_mapped_replay_buffer(tmp_path: Any) -> None:
         expected = batch.clone()
     assert len(buffer) == 2 * N
     assert_same(buffer[N:], expected)
+
+
+@pytest.mark.parametrize("step", ["step", "step_and_maybe_reset"])
+def test_a_step_can_be_packed_as_a_parallel_env_without_buffers_does(step: str) -> None:
+    env = stub_env()
+    given = getattr(env, step)(env.rand_action(env.reset()))
+    td = given if step == "step" else given[0]
+    assert_same(td.consolidate(), td.clone())
+
+
+def test_a_batch_can_be_packed_and_seen_as_one_row_of_steps() -> None:
+    batch = next(iter(ArcadeCollector(stub_env(), recurrent_policy(), N * T)))
+    assert_same(batch.consolidate(), batch.clone())
+    assert_same(batch.view(-1), batch.reshape(-1))
 
 
 def make_ppo(policy_net: nn.Module) -> tuple[ProbabilisticActor, ValueOperator, ClipPPOLoss]:

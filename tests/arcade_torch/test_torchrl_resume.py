@@ -88,3 +88,17 @@ def test_an_arcade_collector_names_what_it_cannot_load() -> None:
     saved = collector_of(stub_env()).state_dict()
     with pytest.raises(ValueError, match=r"is of no ArcadeCollector; .*policy_state_dict"):
         ArcadeCollector(stub_env(), None, N * T).load_state_dict(saved)
+
+
+def test_a_state_taken_behind_shutdown_says_that_episodes_begin_anew() -> None:
+    collector = ArcadeCollector(ArcadeEnv(GAME, N, seed=2), None, N * T)
+    collector.collect()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        collector.state_dict()
+    collector.shutdown()
+    with pytest.warns(UserWarning, match=r"^a state_dict behind shutdown\(\) holds no episodes"):
+        state = collector.state_dict()
+    other = ArcadeCollector(ArcadeEnv(GAME, N, seed=5), None, N * T)
+    other.load_state_dict(state)
+    assert other.collect()["is_init"][:, 0].all()
