@@ -35,6 +35,7 @@ from arcade_torch.agents.forward import evaluating, state_of
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.tools.measures.keys import Channels, Keys, Names
+from arcade_torch.tools.measures.masked import are_near, refuse_nan
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
@@ -240,7 +241,8 @@ class Policy:
                 )
                 one_by_one.append(out)
         rounding = ROUNDING if together.dtype.itemsize > 2 else HALF_ROUNDING
-        if not _are_near(torch.cat(one_by_one, 1), together, rounding):
+        refuse_nan(together)
+        if not are_near(torch.cat(one_by_one, 1), together, rounding):
             raise ValueError(
                 "the policy must say of frames in one go what it says of them one by one: in "
                 "evaluation mode nothing may be drawn at random, entries of a batch may not mix, "
@@ -251,7 +253,7 @@ class Policy:
             frame = frames[None, :1]
             exact = self.forward_frames(frame, actions[:, :1], target=target)
             floats = self.forward_frames(frame.float(), actions[:, :1], target=target)
-            if not _are_near(floats, exact, DIFFERENT):
+            if not are_near(floats, exact, DIFFERENT):
                 raise ValueError(
                     f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got "
                     "other outputs: convert frames of any type alike (frames.float() / 255)"
@@ -264,14 +266,6 @@ class Policy:
         """Evaluation mode for a while; the modes before come back."""
         with evaluating(nn.Identity() if self.module is None else self.module):
             yield
-
-
-def _are_near(values: Tensor, others: Tensor, share: float) -> bool:
-    """Whether outputs differ by no more than a share of their size; where one is no number, the
-    other is none.
-    """
-    a, b = values.double().nan_to_num(), others.double().nan_to_num()
-    return float((a - b).norm()) <= share * float(b.norm())
 
 
 def as_policy(model: Any, **names: Unpack[Names]) -> Policy:

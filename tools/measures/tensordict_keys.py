@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -63,7 +64,9 @@ class Output:
         if self.kind == "logits" and target == "probs":
             return actions.softmax(-1)
         if self.kind == "probs" and target == "logits":
-            return actions.log()
+            # no probability has no gradient: that of log(0) is no number
+            is_possible = actions > 0
+            return torch.where(is_possible, actions, 1).log().masked_fill(~is_possible, -torch.inf)
         return actions
 
 

@@ -226,7 +226,7 @@ def _action_names(example: measure.Example) -> list[str]:
 
 def _plot_outputs(example: measure.Example, row: int, axis: Any, actions: Sequence[str]) -> None:
     """Draw the outputs of a row as bars, that of the best action in colour."""
-    best = example.values.argmax(1)
+    best = np.nanargmax(example.values, axis=1)
     axis.bar(actions, example.values[row], color=REST)
     axis.patches[best[row]].set_facecolor(OTHER_BEST)
     axis.patches[best[0]].set_facecolor(CLEAN_BEST)

@@ -29,6 +29,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
 from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.masked import differences, refuse_nan
 from arcade_torch.tools.measures.policy import Policy, Progress, Target, as_policy, outputs
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
@@ -334,7 +335,7 @@ class Exchange:
         raw = self._last_outputs(track, versions)
         if lags[0] == 0:
             alone = self._last_outputs(track, track.features[None])
-            self.clean_error = max(self.clean_error, float((raw[:1] - alone).abs().max()))
+            self.clean_error = max(self.clean_error, float(differences(raw[:1], alone).max()))
             self.certainty.append(self._certainty(raw[0]))
         return self._compare(raw[0], raw[1:], differs.ravel(), shape)
 
@@ -380,6 +381,7 @@ class Exchange:
         actions = track.last_action.expand(count, *track.last_action.shape)
         starts = track.is_init.expand(count, -1)
         out, _ = self.policy.remember(versions, actions, starts, state)
+        refuse_nan(out[:, -1])
         return out[:, -1]
 
     def _certainty(self, clean: Tensor) -> float:

@@ -23,6 +23,7 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.frames import channel_axis
 from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.masked import refuse_nan
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -31,7 +32,11 @@ from arcade_torch.tools.measures.policy import (
     outputs,
     resolve,
 )
-from arcade_torch.tools.measures.saliency.cuts import outside_inference, refuse_cuts
+from arcade_torch.tools.measures.saliency.cuts import (
+    outside_inference,
+    refuse_cuts,
+    refuse_infinite,
+)
 from arcade_torch.tools.measures.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
@@ -181,6 +186,7 @@ def _decided(
 ) -> tuple[Tensor, Tensor]:
     """The outputs [A] of a decision, and their Jacobian [K, T, E] by the features [T, E]."""
     values = decide(features)
+    refuse_nan(values)
     jacobian = _jacobian(values, features, reduce)
     if reduce == "per_action":  # a sum over actions may rightly not change
         refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
@@ -188,8 +194,11 @@ def _decided(
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
-    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E]."""
-    rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
+    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E], of those that
+    are finite: an action that is masked out is so whatever the frames are.
+    """
+    finite = values.isfinite()
+    rows = finite.to(values)[None] if reduce == "sum" else finite.to(values).diag()[finite]
     return torch.stack([_gradient(values, leaf, row) for row in rows])
 
 
@@ -218,7 +227,7 @@ def _frame_norms(
     per_pixel = jacobian.new_zeros(shape, dtype=dtype)
     per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
     needed = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
-    for index in needed.split(chunk):
+    for index in needed.split(chunk) if len(needed) else ():
         part = frames[index].to(dtype).requires_grad_()
         features = policy.encode(part)
         reached = torch.zeros_like(index, dtype=torch.bool)
@@ -231,6 +240,7 @@ def _frame_norms(
             per_frame[index] += total.sqrt() if norm == "l2" else total
             per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
         refuse_cuts(policy.encode, part, reached)
+    refuse_infinite(per_frame)
     return per_pixel, per_frame
 
 

@@ -1,0 +1,216 @@
+"""Policies of which is known what each decision rests on, in an env of somebody else: every measure
+says just that.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.data import Binary, Categorical, Composite, OneHot, Unbounded
+from torchrl.envs import EnvBase
+
+from arcade_torch.tools import contamination, counterfactual, recall_density, saliency
+
+CUES = 4
+STEPS = 8
+
+
+class CueEnv(EnvBase):
+    """Every step shows one of four cues as a vector; nobody rewards anything."""
+
+    def __init__(self, size: int | None = 4, is_one_hot: bool = False) -> None:
+        shape = [] if size is None else [size]
+        super().__init__(batch_size=shape)
+        flag = Binary(1, shape=(*shape, 1), dtype=torch.bool)
+        count = Unbounded((*shape, 1), dtype=torch.int64)
+        self.observation_spec = Composite(
+            {"cue": Unbounded((*shape, CUES)), "count": count}, shape=shape
+        )
+        action: Any = Categorical(CUES, shape=shape)
+        if is_one_hot:
+            action = OneHot(CUES, shape=(*shape, CUES))
+        self.full_action_spec = Composite({"action": action}, shape=shape)
+        self.reward_spec = Unbounded((*shape, 1))
+        self.full_done_spec = Composite({"done": flag, "terminated": flag.clone()}, shape=shape)
+        self.generator = torch.Generator()
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator.manual_seed(seed or 0)
+
+    def _observe(self, count: Tensor) -> TensorDict:
+        cue = torch.randint(CUES, self.batch_size, generator=self.generator)
+        done = count >= STEPS
+        entries = {"cue": one_hot(cue, CUES).float(), "count": count}
+        return TensorDict(entries | {"done": done, "terminated": done}, self.batch_size)
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        return self._observe(torch.zeros((*self.batch_size, 1), dtype=torch.int64))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        after = self._observe(tensordict["count"] + 1)
+        return after.set("reward", torch.zeros(*self.batch_size, 1))
+
+
+class Known(NamedTuple):
+    """A policy, the start of its state, and the lags that its last decision rests on."""
+
+    module: Any
+    start: dict[str, Tensor]
+    lags: list[int]
+    has_gradient: bool = True
+
+
+def module(forward: Callable[..., Any], *state: str, also: tuple[str, ...] = ()) -> Any:
+    """A policy of a function of the cue, its state, and other entries."""
+    writes = ["action_value", *(("next", name) for name in state)]
+    return TensorDictModule(forward, ["cue", *state, *also], writes)
+
+
+def copy_late(lag: int, dtype: torch.dtype = torch.float32) -> Known:
+    """Says the cue of ``lag`` steps ago: a ring of cues, and a whole number that goes round."""
+    size = lag + 1
+
+    def forward(cue: Tensor, ring: Tensor, place: Tensor) -> tuple[Tensor, ...]:
+        now = one_hot(place % size, size).unsqueeze(-1)
+        ring = torch.where(now.bool(), cue.unsqueeze(-2).to(dtype), ring)
+        oldest = one_hot((place + 1) % size, size).unsqueeze(-1)
+        return 2 * (ring.float() * oldest).sum(-2), ring, place + 1
+
+    start = {"ring": torch.zeros(size, CUES, dtype=dtype), "place": torch.tensor(0)}
+    return Known(module(forward, "ring", "place"), start, [lag], dtype.is_floating_point)
+
+
+def first_cue() -> Known:
+    """Says the first cue for ever: a truth value holds whether it was seen."""
+
+    def forward(cue: Tensor, held: Tensor, seen: Tensor) -> tuple[Tensor, ...]:
+        held = torch.where(seen.unsqueeze(-1), held, cue)
+        return 2 * held, held, torch.ones_like(seen)
+
+    start = {"held": torch.zeros(CUES), "seen": torch.tensor(False)}
+    return Known(module(forward, "held", "seen"), start, [STEPS - 1])
+
+
+def clock() -> Known:
+    """Looks at the time alone."""
+
+    def forward(cue: Tensor, time: Tensor) -> tuple[Tensor, ...]:
+        return one_hot(time % CUES, CUES) + 0 * cue, time + 1
+
+    return Known(module(forward, "time"), {"time": torch.tensor(0)}, [], False)
+
+
+def parity() -> Known:
+    """Whether the number of small cues so far is odd."""
+
+    def forward(cue: Tensor, odd: Tensor) -> tuple[Tensor, ...]:
+        odd = odd ^ (cue.argmax(-1) < 2)
+        values = torch.stack([odd, ~odd], -1).to(cue.dtype)
+        return torch.cat([values, torch.full_like(values, -1)], -1), odd
+
+    known = module(forward, "odd")
+    return Known(known, {"odd": torch.tensor(False)}, list(range(STEPS)), False)
+
+
+def last_action() -> Known:
+    """Goes round by its own last action."""
+
+    def forward(cue: Tensor, action: Tensor) -> Tensor:
+        if action.ndim == cue.ndim:
+            action = action.argmax(-1)
+        return one_hot((action + 1) % CUES, CUES) + 0 * cue
+
+    return Known(module(forward, also=("last_action",)), {}, [], False)
+
+
+POLICIES: dict[str, Callable[[], Known]] = {
+    "the cue": lambda: copy_late(0),
+    "one step late": lambda: copy_late(1),
+    "three steps late": lambda: copy_late(3),
+    "in half precision": lambda: copy_late(2, torch.bfloat16),
+    "in truth values": lambda: copy_late(2, torch.bool),
+    "the first": first_cue,
+    "a clock": clock,
+    "parity": parity,
+    "its last action": last_action,
+}
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_an_exchange_changes_just_what_a_decision_rests_on(name: str) -> None:
+    known = POLICIES[name]()
+    start = TensorDict(known.start, [])
+    exchanges = counterfactual(known.module, CueEnv(), episodes=24, donors=3, initial_state=start)
+    profile = exchanges.profile(differing=True)
+    lags = known.lags
+    assert np.flatnonzero(profile).tolist() == lags and len(profile) == STEPS
+    if name != "parity":  # two of three other cues change it
+        assert (profile[lags] == 1).all()
+    assert (exchanges.memory_reliance().value > 0) == any(lag > 0 for lag in lags)
+    assert (exchanges.observation_reliance().value > 0) == (0 in lags)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_noise_is_seen_just_when_the_noisy_frame_counts(name: str) -> None:
+    known = POLICIES[name]()
+    start = TensorDict(known.start, [])
+    changes = contamination(
+        known.module,
+        CueEnv(),
+        sigmas=(5.0,),
+        delays=range(STEPS - 1),
+        starts=60,
+        initial_state=start,
+    )
+    flips = np.flatnonzero(changes.mean("flip")[0]).tolist()
+    if name == "the first":  # noise on a later frame is nothing to it
+        later = changes.points[:, 1] > 0
+        assert not np.nansum(changes.flip[later]) and np.nansum(changes.flip[~later]) > 0
+    else:
+        assert flips == [lag for lag in known.lags if lag < STEPS - 1]
+    assert changes.clean_error == 0
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_gradients_are_just_where_a_decision_rests(name: str) -> None:
+    """Before: without any gradient the measure broke off where it cut no frames."""
+    known = POLICIES[name]()
+    names = {"initial_state": TensorDict(known.start, [])}
+    if name == "in truth values":
+        with pytest.raises(ValueError, match="by which they have no gradient"):
+            recall_density(known.module, CueEnv(), episodes=4, **names)
+        return
+    density = recall_density(known.module, CueEnv(), episodes=4, **names)
+    cues = one_hot(torch.arange(STEPS) % CUES, CUES).float()
+    actions = torch.zeros(STEPS, dtype=torch.int64)
+    shares = saliency(known.module, cues, actions, **names).shares()
+    if not known.has_gradient:
+        assert density.silent == 4 and not density.lengths.size and not shares.any()
+        return
+    (lag,) = known.lags
+    for row in (shares, *density.shares):
+        assert row.tolist() == [float(step == STEPS - 1 - lag) for step in range(STEPS)]
+
+
+@pytest.mark.parametrize("size", [None, 1])
+@pytest.mark.parametrize("is_one_hot", [False, True])
+def test_one_env_and_one_hot_actions_say_the_same(size: int | None, is_one_hot: bool) -> None:
+    known = copy_late(3)
+    choose = TensorDictModule(
+        lambda values: one_hot(values.argmax(-1), CUES), ["action_value"], ["action"]
+    )
+    policy = TensorDictSequential(known.module, choose) if is_one_hot else known.module
+    exchanges = counterfactual(
+        policy,
+        CueEnv(size, is_one_hot),
+        episodes=12,
+        donors=3,
+        initial_state=TensorDict(known.start, []),
+    )
+    assert exchanges.profile(differing=True).tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
