@@ -137,7 +137,7 @@ def greedy_windows(
     require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
     require(episodes >= 1, "episodes", episodes, "at least 1")
     require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
-    size = EpisodeBatch(env, _keys(agent)).size
+    size = EpisodeBatch(env, keys_of(agent)).size
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
         drawn = np.random.SeedSequence([seed, group]).generate_state(1)
@@ -179,7 +179,7 @@ def play(
     kept; episodes are cut after ``max_steps``, never by default. With ``most`` only so many envs
     are played. Returns a window of each episode, and all lengths int64 [N].
     """
-    episodes = EpisodeBatch(env, _keys(agent), most)
+    episodes = EpisodeBatch(env, keys_of(agent), most)
     size = episodes.size
     starts = torch.as_tensor([0] * size if first is None else first)
     lengths = torch.zeros(size, dtype=torch.int64)
@@ -220,7 +220,7 @@ def play(
     return windows, lengths.numpy()
 
 
-def _keys(agent: Any) -> Keys:
+def keys_of(agent: Any) -> Keys:
     """Where an env has what this agent reads."""
     return agent.keys if isinstance(agent, Policy) else Keys()
 
