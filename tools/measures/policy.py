@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from arcade_torch.agents.forward import evaluating, state_of
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.tools.measures.frames import float_type, floats_are_taken
 from arcade_torch.tools.measures.keys import Channels, Keys, Names
 from arcade_torch.tools.measures.masked import are_near, refuse_nan
 
@@ -108,15 +109,17 @@ class Policy:
         self,
         frames: Tensor,
         chunk: int = 16,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
         *,
         batch_ndim: int = 1,
     ) -> Tensor:
         """Features [T, E] of frames [T, ...] without a graph, each frame encoded once, ``chunk`` at
-        a time; with ``batch_ndim=2`` [N, T, E] of sequences [N, T, ...].
+        a time, as floats of ``dtype``, by default `float_type`; with ``batch_ndim=2`` [N, T, E] of
+        sequences [N, T, ...].
         """
         batch = frames.shape[:batch_ndim]
         flat = frames.flatten(0, batch_ndim - 1)
+        dtype = dtype or float_type(frames)
         features = torch.cat([self.encode(part.to(dtype)) for part in flat.split(chunk)])
         return features.reshape(*batch, -1)
 
@@ -210,7 +213,7 @@ class Policy:
         last_action: Tensor,
         is_init: Tensor,
         state: Any,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
     ) -> None:
         """Refuse a policy that a measure would read wrongly: one that says other things when frames
         are read in one go than when it acts on them one by one, or, of a TensorDict, that takes
@@ -220,6 +223,7 @@ class Policy:
         ``state`` on; the first few are tried. A policy that few frames were tried on is not tried
         again, so that a measure of many windows pays for one.
         """
+        dtype = dtype or float_type(frames)
         if dtype in self._tried:
             return
         few = slice(0, FEW)
@@ -227,7 +231,8 @@ class Policy:
         starts = is_init[None, few].bool()
         target = resolve(self, "auto")
         with self.evaluating():
-            features = self.features(frames[few], dtype=dtype)[None]
+            with floats_are_taken(frames.dtype):
+                features = self.features(frames[few], dtype=dtype)[None]
             # a policy may change its state in place
             first = None if state is None else state.clone()
             alone = [self.features(frame[None], dtype=dtype) for frame in frames[few]]

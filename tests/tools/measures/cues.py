@@ -16,13 +16,19 @@ STEPS = 8
 class CueEnv(EnvBase):
     """Every step shows one of four cues as a vector; nobody rewards anything."""
 
-    def __init__(self, size: int | None = 4, is_one_hot: bool = False) -> None:
+    def __init__(
+        self,
+        size: int | None = 4,
+        is_one_hot: bool = False,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
         shape = [] if size is None else [size]
         super().__init__(batch_size=shape)
+        self.dtype_of_cues = dtype
         flag = Binary(1, shape=(*shape, 1), dtype=torch.bool)
         count = Unbounded((*shape, 1), dtype=torch.int64)
         self.observation_spec = Composite(
-            {"cue": Unbounded((*shape, CUES)), "count": count}, shape=shape
+            {"cue": Unbounded((*shape, CUES), dtype=dtype), "count": count}, shape=shape
         )
         action: Any = Categorical(CUES, shape=shape)
         if is_one_hot:
@@ -38,7 +44,7 @@ class CueEnv(EnvBase):
     def _observe(self, count: Tensor) -> TensorDict:
         cue = torch.randint(CUES, self.batch_size, generator=self.generator)
         done = count >= STEPS
-        entries = {"cue": one_hot(cue, CUES).float(), "count": count}
+        entries = {"cue": one_hot(cue, CUES).to(self.dtype_of_cues), "count": count}
         return TensorDict(entries | {"done": done, "terminated": done}, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:

@@ -10,10 +10,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import one_hot
+from torchrl.modules import GRUModule
 
-from arcade_torch.tools import contamination, counterfactual, recall_density, saliency
+from arcade_torch.tools import (
+    contamination,
+    contamination_example,
+    counterfactual,
+    recall_density,
+    saliency,
+)
+from arcade_torch.tools.measures.saliency.measure import episode_saliency
 from tests.tools.measures.cues import CUES, STEPS, CueEnv
 
 
@@ -174,3 +182,61 @@ def test_one_env_and_one_hot_actions_say_the_same(size: int | None, is_one_hot: 
         initial_state=TensorDict(known.start, []),
     )
     assert exchanges.profile(differing=True).tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_floats_of_any_precision_are_read_as_the_env_gives_them(dtype: torch.dtype) -> None:
+    """Before: they were single precision, which a policy of another does not take."""
+    torch.manual_seed(0)
+    policy = TensorDictSequential(
+        TensorDictModule(nn.Linear(CUES, 6, dtype=dtype), ["cue"], ["features"]),
+        GRUModule(6, 6, in_key="features", out_key="remembered").to(dtype),
+        TensorDictModule(nn.Linear(6, CUES, dtype=dtype), ["remembered"], ["action_value"]),
+    )
+    nn.init.normal_(policy[2].module.weight)
+    env = CueEnv(dtype=dtype)
+    assert counterfactual(policy, env, episodes=8, donors=2).profile("change")[0] > 0
+    assert contamination(policy, env, delays=(0, 1), starts=8).mean("change")[:, 0].min() > 0
+    density = recall_density(policy, env, episodes=2)
+    assert density.last_share() > 0 and density.sizes.shape == (2,)
+    cues = one_hot(torch.arange(5) % CUES, CUES)
+    shares = saliency(policy, cues.to(dtype)).shares()
+    exact = saliency(policy.double(), cues.double()).shares()
+    np.testing.assert_allclose(shares, exact, rtol=0.1, atol=1e-3)
+    assert episode_saliency(policy.to(dtype), CueEnv(1, dtype=dtype)).frames.shape[1:] == (CUES,)
+    assert contamination_example(policy.to(dtype), env, horizon=4).values.shape[1] == CUES
+
+
+def test_whole_numbers_that_a_policy_takes_as_such_alone_are_refused_in_one_line() -> None:
+    """Before: what torch says of an embedding, with its traceback."""
+    grids = nn.Sequential(nn.Embedding(2, 3), nn.Flatten(-2), nn.Linear(3 * CUES, CUES))
+    policy = TensorDictModule(grids, ["cue"], ["action_value"])
+    env = CueEnv(dtype=torch.int64)
+    for measure in (counterfactual, contamination, recall_density):
+        with pytest.raises(ValueError, match=r"^the policy must take floats .*int64.*long") as told:
+            measure(policy, env)
+        assert "\n" not in str(told.value)
+
+    class Converts(nn.Sequential):
+        def forward(self, cue: Tensor) -> Tensor:
+            return super().forward(cue.long())
+
+    converts = TensorDictModule(Converts(*grids), ["cue"], ["action_value"])
+    assert np.flatnonzero(counterfactual(converts, env, episodes=8).profile()).tolist() in ([], [0])
+
+
+def test_arrays_of_an_episode_can_be_explained_again() -> None:
+    known = first_cue()
+    start = TensorDict(known.start, [])
+    episode = episode_saliency(known.module, CueEnv(1), initial_state=start)
+    again = saliency(known.module, episode.frames, initial_state=start)
+    np.testing.assert_array_equal(again.maps, episode.maps)
+
+
+def test_what_noise_is_of_no_strength_is_refused() -> None:
+    known = copy_late(0)
+    names = {"initial_state": TensorDict(known.start, [])}
+    with pytest.raises(ValueError, match=r"^delays must be whole numbers of at least 0"):
+        contamination(known.module, CueEnv(), delays=(0, 1.5), **names)
+    with pytest.raises(ValueError, match=r"^white must be above 0; got 0"):
+        contamination(known.module, CueEnv(), white=0.0, **names)

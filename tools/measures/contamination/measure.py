@@ -27,7 +27,7 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
-from arcade_torch.tools.measures.frames import pictures, white_of
+from arcade_torch.tools.measures.frames import float_type, pictures, white_of
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.masked import (
     centred,
@@ -130,7 +130,8 @@ def contamination(
         ValueError: an option is out of range, or no episode was long enough.
     """
     require(min(sigmas, default=-1) >= 0, "sigmas", list(sigmas), "numbers of at least 0")
-    require(min(delays, default=-1) >= 0, "delays", list(delays), "whole numbers of at least 0")
+    whole = len(delays) > 0 and all(int(delay) == delay >= 0 for delay in delays)
+    require(whole, "delays", list(delays), "whole numbers of at least 0")
     require(starts >= 1, "starts", starts, "at least 1")
     player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
@@ -376,7 +377,7 @@ def contamination_example(
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
-    versions = w.frames[torch.as_tensor(order)].float()
+    versions = w.frames[torch.as_tensor(order)].to(float_type(w.frames))
     white = white_of(w.frames, policy.white)
     if not shuffle:
         versions[range(1, len(order)), hits] = disturbed_frames(
@@ -395,14 +396,13 @@ def contamination_example(
 def disturbed_frames(
     frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int, white: float = 255.0
 ) -> Tensor:
-    """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame
+    """Single frames with Gaussian noise, floats [places * sigmas, ...]; the strengths of one frame
     share its draw, and 1 stands for ``white``.
     """
     generator = torch.Generator().manual_seed(seed)
-    chosen = frames[torch.as_tensor(places)].to(torch.float32)
-    noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
-    scale = torch.as_tensor(white * sigmas, dtype=torch.float32, device=chosen.device)
-    scale = scale.reshape(-1, *[1] * (frames.ndim - 1))
+    chosen = frames[torch.as_tensor(places)].to(float_type(frames))
+    noise = torch.randn(chosen.shape, generator=generator).to(chosen)
+    scale = torch.as_tensor(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
     noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
     return noisy.clamp(0.0, white) if clip else noisy
 

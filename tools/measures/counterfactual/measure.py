@@ -28,6 +28,7 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
+from arcade_torch.tools.measures.frames import as_array
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.masked import differences, refuse_nan
 from arcade_torch.tools.measures.policy import Policy, Progress, Target, as_policy, outputs
@@ -254,7 +255,7 @@ class Track:
 def _frame_ids(frames: Tensor) -> Ints:
     """A number for each frame, int64 [T], by its content."""
     ids = np.zeros(len(frames), np.int64)
-    for step, frame in enumerate(frames.cpu().numpy()):
+    for step, frame in enumerate(as_array(frames)):
         digest = hashlib.blake2b(frame.tobytes(), digest_size=8).digest()
         ids[step] = int.from_bytes(digest, "little", signed=True)
     return ids

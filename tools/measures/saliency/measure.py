@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
-from arcade_torch.tools.measures.frames import channel_axis
+from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.masked import refuse_nan
 from arcade_torch.tools.measures.policy import (
@@ -74,26 +74,24 @@ def saliency(
     norm: Norm = "l2sq",
     target: Target = "auto",
     chunk: int = 8,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
     **names: Unpack[Names],
 ) -> Saliency:
     """Gradient of the outputs at step n with respect to every frame up to n.
 
     Args:
         model: a TensorDict policy, an agent, or anything else that `as_policy` takes.
-        frames: [T, H, W, C], [T, C, H, W] or any other shape of frames, oldest first.
+        frames: [T, H, W, C], [T, C, H, W] or any other shape, oldest first; a tensor or an array.
         last_action: [T], or one-hot [T, A], the action that led to each frame; zeros by default.
         is_init: bool [T] or [T, 1], whether a frame opens an episode; all false by default.
         state: recurrent state before the first frame, batch of one; by default the initial one.
         n: index of the step to explain, negative from the end.
         reduce: ``per_action`` (the paper: norms of single actions, summed) or ``sum`` (norm of the
             gradient of the sum over actions, in which opposite effects cancel).
-        norm: ``l2sq``, ``l2`` or ``l1``, over the channels of a pixel for ``maps``, over the frame
-            for ``per_frame``.
-        target: what is differentiated, see `outputs`: Q-values or, for a policy, action
-            probabilities by default.
+        norm: ``l2sq``, ``l2`` or ``l1``, over channels for ``maps``, the frame for ``per_frame``.
+        target: what is differentiated, see `outputs`: Q-values, or a policy's probabilities.
         chunk: frames pushed through the encoder at once; bounds memory.
-        dtype: of frames and gradients, float32 or float64 (the model's parameters must match).
+        dtype: of frames and gradients; by default that of float frames, and float32 for others.
         **names: keywords of `as_policy`.
 
     Raises:
@@ -102,6 +100,8 @@ def saliency(
         TypeError: ``model`` has none of the forms above.
     """
     policy = as_policy(model, **names)
+    frames = torch.as_tensor(frames)
+    dtype = dtype or float_type(frames)
     _check_options(reduce, norm, chunk, resolve(policy, target))
     steps = _index(n, frames) + 1
     # what is computed in inference mode has no gradient, in silence
@@ -302,5 +302,5 @@ def episode_saliency(
     if progress is not None:
         progress(1, 1)
     return EpisodeSaliency(
-        **vars(result), frames=longest.frames.cpu().numpy(), action=longest.action.cpu().numpy()
+        **vars(result), frames=as_array(longest.frames), action=longest.action.cpu().numpy()
     )
