@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from arcade_torch.agents.checked import require
+
 
 def refuse_nan(out: Tensor) -> None:
     """Refuse outputs that are no numbers: NaN is the best action of any comparison.
@@ -15,6 +17,17 @@ def refuse_nan(out: Tensor) -> None:
             "the policy's outputs must be numbers, got NaN: its weights may hold some, or it "
             "cannot read noisy pixels (clip=True keeps them in their range)"
         )
+
+
+def refuse_single(values: Tensor) -> None:
+    """Refuse outputs of a single action [..., A], among which there is no decision.
+
+    Raises:
+        ValueError: there are not two.
+    """
+    require(
+        values.shape[-1] > 1, "the policy's outputs", values.shape[-1], "of two actions at least"
+    )
 
 
 def differences(values: Tensor, others: Tensor) -> Tensor:
@@ -32,6 +45,7 @@ def centred(values: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     """Outputs of actions [..., A] in two situations, minus their means; NaN for actions that are
     masked out in one of them.
     """
+    refuse_single(values)
     allowed = values.isfinite() & others.isfinite()
     values = torch.where(allowed, values, torch.nan)
     others = torch.where(allowed, others, torch.nan)

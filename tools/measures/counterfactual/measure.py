@@ -30,7 +30,7 @@ from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
 from arcade_torch.tools.measures.frames import as_array
 from arcade_torch.tools.measures.keys import Names
-from arcade_torch.tools.measures.masked import differences, refuse_nan
+from arcade_torch.tools.measures.masked import differences, refuse_nan, refuse_single
 from arcade_torch.tools.measures.policy import Policy, Progress, Target, as_policy, outputs
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
@@ -392,6 +392,7 @@ class Exchange:
 
     def _read(self, clean: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Values of actions and their distribution, double [V, A], of outputs [V, R]."""
+        refuse_single(outputs(self.policy, self.target)(raw))
         if self.target == "q":
             read = outputs(self.policy, "q")
             values = read(raw).double().cpu()
