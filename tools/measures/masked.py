@@ -5,6 +5,9 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 
+LEAST = -103.3
+"""The logarithm of the smallest number of single precision: below it a softmax says 0."""
+
 
 def refuse_nan(out: Tensor) -> None:
     """Refuse outputs that are no numbers: NaN is the best action of any comparison.
@@ -58,5 +61,8 @@ def span(values: Tensor) -> Tensor:
 
 
 def divergence(p: Tensor, q: Tensor) -> Tensor:
-    """KL(p || q) in nats [...] of logarithms of probabilities [..., A]."""
+    """KL(p || q) in nats [...] of logarithms of probabilities [..., A]; those that are 0 in q alone
+    count as `LEAST`, since one of them makes any mean infinite.
+    """
+    q = torch.where(q == -torch.inf, LEAST, q)
     return torch.where(p == -torch.inf, 0.0, p.exp() * (p - q)).sum(-1)

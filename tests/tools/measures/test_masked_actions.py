@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 
 from arcade_torch.tools import Policy, contamination, counterfactual, recall_density, saliency
+from arcade_torch.tools.measures.masked import divergence
 from arcade_torch.tools.measures.policy import read_plain
 from tests.tools.measures.toys import ACTIONS, SIZE, ToyEnv, linear_policy, window
 
@@ -83,6 +84,14 @@ def of_probs(rho: float = 0.5) -> TensorDictSequential:
         return torch.cat([out[:, 0].softmax(-1), torch.zeros(len(pixels), 1)], -1)
 
     return TensorDictSequential(TensorDictModule(probs, ["pixels"], ["probs"]))
+
+
+def test_a_probability_that_becomes_zero_has_a_large_divergence_and_no_infinite_one() -> None:
+    p = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    q = torch.tensor([[0.5, 0.5, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, 0.5]], dtype=torch.float64)
+    same, large, half = divergence(p.log(), q.log()).tolist()
+    assert same == 0 and half == pytest.approx(np.log(2))
+    assert 50 < large < 60 and divergence(p.log(), p.log()).tolist() == [0, 0, 0]
 
 
 def test_the_logits_of_probabilities_of_zero_have_no_gradient() -> None:

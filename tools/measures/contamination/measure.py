@@ -81,7 +81,7 @@ class Contamination:
 
     def mean(self, measure: Literal["flip", "change", "kl"]) -> Array:
         """Mean over start points, float64 [S, K]; NaN where there is none."""
-        values = np.ma.masked_where(np.isnan(getattr(self, measure)), getattr(self, measure))
+        values = np.ma.masked_invalid(getattr(self, measure))
         return np.asarray(values.mean(axis=0).filled(np.nan))
 
     def counts(self) -> Ints:
