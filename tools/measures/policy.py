@@ -35,7 +35,7 @@ from arcade_torch.agents.forward import evaluating, state_of
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.tools.measures.frames import float_type, floats_are_taken
-from arcade_torch.tools.measures.keys import Channels, Keys, Names
+from arcade_torch.tools.measures.keys import Channels, Keys, Names, refuse_unknown
 from arcade_torch.tools.measures.masked import are_near, refuse_nan
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
@@ -291,14 +291,15 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
             or ``probs``. ``value_key``: ``state_value`` by default. ``state_keys``: of the
             recurrent state, by default those whose next state is written under "next"; else pairs
             {key: key of the next state}. ``initial_state``: its start, a TensorDict of batch size
-            []; by default that of the module or its primer. ``channels`` ("first", "last"): by
-            default the shorter of the two ends of a frame. ``white``: the value of a white pixel,
-            by default 255 for whole numbers and 1 for floats.
+            [] or a dictionary; by default that of the module or its primer. ``channels`` ("first",
+            "last"): by default the shorter of the two ends of a frame. ``white``: the value of a
+            white pixel, by default 255 for whole numbers and 1 for floats.
 
     Raises:
-        TypeError: ``model`` has none of these forms.
+        TypeError: ``model`` has none of these forms, or there is no such keyword.
         ValueError: a TensorDict policy reads or writes entries that say nothing to a measure.
     """
+    refuse_unknown(names)
     model = getattr(model, "_orig_mod", model)  # of torch.compile
     network = getattr(model, "network", model)
     if isinstance(model, Policy):

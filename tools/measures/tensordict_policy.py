@@ -233,17 +233,23 @@ class TensorDictPolicy:
 def _start_of(
     module: TensorDictModuleBase,
     state_keys: Mapping[Key, Key],
-    given: TensorDictBase | None,
+    given: TensorDictBase | Mapping[str, Any] | None,
 ) -> Callable[[int], TensorDictBase]:
     """The function that gives the state at the start of an episode for a batch size."""
+    first: Any = given
+    if given is not None and not isinstance(given, TensorDictBase):
+        first = TensorDict(dict(given), [])
+    if first is not None:
+        size = list(first.batch_size)
+        require(size in ([], [1]), "initial_state", size, "of batch size []")
     parameter = next(module.parameters(), torch.empty(0))
 
     def start(batch_size: int) -> TensorDictBase:
         state = TensorDict({}, [batch_size], device=parameter.device)
         for part in module.modules():
             state.update(_start_of_part(part, batch_size, parameter))
-        if given is not None:
-            state.update(given.expand(batch_size))
+        if first is not None:
+            state.update(first.expand(batch_size))
         return state
 
     example = start(1)

@@ -15,6 +15,7 @@ from torch.nn.functional import one_hot
 from torchrl.modules import GRUModule
 
 from arcade_torch.tools import (
+    as_policy,
     contamination,
     contamination_example,
     counterfactual,
@@ -240,3 +241,45 @@ def test_what_noise_is_of_no_strength_is_refused() -> None:
         contamination(known.module, CueEnv(), delays=(0, 1.5), **names)
     with pytest.raises(ValueError, match=r"^white must be above 0; got 0"):
         contamination(known.module, CueEnv(), white=0.0, **names)
+
+
+WORDS: dict[str, Callable[[Any, Any], Any]] = {
+    "episode": lambda policy, env: counterfactual(policy, env, episode=4),
+    "delay": lambda policy, env: contamination(policy, env, delay=(0, 1)),
+    "tagret": lambda policy, env: recall_density(policy, env, tagret="q"),
+    "pixel_key": lambda policy, env: saliency(policy, torch.zeros(3, CUES), pixel_key="cue"),
+    "max_step": lambda policy, env: episode_saliency(policy, env, max_step=3),
+    "horizons": lambda policy, env: contamination_example(policy, env, horizons=4),
+    "stat_keys": lambda policy, env: as_policy(policy, stat_keys=["ring"]),
+}
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_a_misspelt_keyword_is_refused_and_not_passed_over(word: str) -> None:
+    """Before: a measure of a TensorDict policy took any keyword, and went by its defaults."""
+    policy = TensorDictModule(nn.Linear(CUES, CUES), ["cue"], ["action_value"])
+    for model in (policy, as_policy(policy)):
+        with pytest.raises(TypeError, match=f"^unknown keyword '{word}': .*pixels_key") as caught:
+            WORDS[word](model, CueEnv(1))
+        assert "\n" not in str(caught.value)
+
+
+def test_states_may_be_dictionaries_and_are_of_one_episode() -> None:
+    """Before: errors of TensorDicts."""
+    known = copy_late(1)
+    cues = one_hot(torch.arange(3), CUES).float()
+    start = TensorDict(known.start, [])
+    wanted = saliency(known.module, cues, initial_state=start)
+    given = [known.start, start.expand(1), start]
+    for initial_state in given:
+        same = saliency(known.module, cues, initial_state=initial_state)
+        np.testing.assert_array_equal(same.maps, wanted.maps)
+    state = {name: value[None] for name, value in known.start.items()}
+    for before in (state, TensorDict(state, [1])):
+        same = saliency(known.module, cues, state=before, initial_state=start)
+        np.testing.assert_array_equal(same.output, wanted.output)
+    with pytest.raises(ValueError, match=r"^initial_state must be of batch size \[\]; got \[3\]"):
+        saliency(known.module, cues, initial_state=start.expand(3))
+    for wrong in (start, start.expand(2)):
+        with pytest.raises(ValueError, match=r"^state must be of batch size \[1\]"):
+            saliency(known.module, cues, state=wrong, initial_state=start)

@@ -11,13 +11,14 @@ Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation 
 sum over actions instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Unpack, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
@@ -108,7 +109,7 @@ def saliency(
     with torch.inference_mode(False), torch.enable_grad(), policy.evaluating():
         actions = outside_inference(_last_actions(policy, last_action, frames)[:steps])
         starts = outside_inference(_starts(is_init, frames)[:steps])
-        before = policy.initial_state(1) if state is None else outside_inference(state)
+        before = policy.initial_state(1) if state is None else outside_inference(_of_one(state))
         frames = outside_inference(frames[:steps])
         policy.check(frames, actions, starts, before, dtype)
 
@@ -165,6 +166,15 @@ def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
     if is_init is None:
         return torch.zeros(frames.shape[0], dtype=torch.bool, device=frames.device)
     return _one_a_frame("is_init", is_init, frames).bool()
+
+
+def _of_one(state: Any) -> Any:
+    """A state of a batch of one; a dictionary as a TensorDict."""
+    if isinstance(state, Mapping) and not isinstance(state, TensorDictBase):
+        state = TensorDict(dict(state), [1])
+    size = list(state.batch_size if isinstance(state, TensorDictBase) else state.shape[:1])
+    require(size == [1], "state", size, "of batch size [1]")
+    return state
 
 
 def _decision(
