@@ -10,6 +10,9 @@ from arcade_torch.agents.checked import require
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys
 
+keeps_generator = torch.random.fork_rng(devices=[])
+"""Decorates what plays episodes: envs may draw from torch's own generator, and seed it."""
+
 
 class EpisodeBatch:
     """Plays an env with any names, with or without a batch size, with categorical or one-hot

@@ -18,7 +18,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
-from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
 
@@ -149,7 +149,13 @@ def greedy_windows(
         if late.any():
             del windows
             first = np.where(late, ends - cap + 1, 0).tolist()
-            windows, _ = play(agent, env, seed=batch_seed, keep=cap, first=first)
+            windows, again = play(agent, env, seed=batch_seed, keep=cap, first=first)
+            if (again != lengths).any():
+                raise ValueError(
+                    f"env must play the same episodes after set_seed({batch_seed}), of which long "
+                    f"ones are played twice, got lengths {lengths.tolist()} and {again.tolist()}: "
+                    "let it draw from that seed alone, or take a larger cap"
+                )
             ends = np.where(late, cap - 1, ends)
         for window, n in zip(windows[: episodes - group * size], ends, strict=False):
             yield window.up_to(int(n))
@@ -163,6 +169,7 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
 
 
 @torch.no_grad()
+@keeps_generator
 def play(
     agent: Any,
     env: Any,

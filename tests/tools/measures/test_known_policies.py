@@ -16,11 +16,14 @@ from torchrl.modules import GRUModule
 
 from arcade_torch.tools import (
     as_policy,
+    beliefs,
     contamination,
     contamination_example,
     counterfactual,
+    patching,
     recall_density,
     saliency,
+    steering,
 )
 from arcade_torch.tools.measures.saliency.measure import episode_saliency
 from tests.tools.measures.cues import CUES, STEPS, CueEnv
@@ -283,3 +286,56 @@ def test_states_may_be_dictionaries_and_are_of_one_episode() -> None:
     for wrong in (start, start.expand(2)):
         with pytest.raises(ValueError, match=r"^state must be of batch size \[1\]"):
             saliency(known.module, cues, state=wrong, initial_state=start)
+
+
+class Tutorial(CueEnv):
+    """Draws from torch's own generator, as the env of TorchRL's tutorial does."""
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator = torch.manual_seed(seed or 0)
+
+    def facts(self) -> dict[str, Tensor]:
+        """A number for each env."""
+        return {"chance": torch.rand(self.batch_size)}
+
+
+PLAYS: dict[str, Callable[[Any, Any], Any]] = {
+    "counterfactual": lambda policy, env: counterfactual(policy, env, episodes=8),
+    "contamination": lambda policy, env: contamination(policy, env, starts=4, delays=(0,)),
+    "recall density": lambda policy, env: recall_density(policy, env, episodes=2),
+    "beliefs": lambda policy, env: beliefs(policy, env, episodes=16),
+    "patching": lambda policy, env: patching(policy, env, episodes=8),
+    "steering": lambda policy, env: steering(policy, env, episodes=16),
+}
+
+
+@pytest.mark.parametrize("measure", PLAYS)
+def test_an_env_that_draws_from_torch_leaves_its_generator_as_it_was(measure: str) -> None:
+    """Before: whoever measured while training went on with the same random numbers each time."""
+    policy = TensorDictModule(nn.Linear(CUES, CUES), ["cue"], ["action_value"])
+    env = Tutorial(4)
+    torch.manual_seed(5)
+    wanted = torch.rand(3)
+    torch.manual_seed(5)
+    PLAYS[measure](policy, env)
+    assert torch.equal(torch.rand(3), wanted)
+
+
+class Unseeded(CueEnv):
+    """Plays other episodes each time, of other lengths."""
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+    def _observe(self, count: Tensor) -> TensorDict:
+        after = super()._observe(count)
+        ends = torch.rand(count.shape, generator=self.generator) < 0.1
+        return after.set("done", ends & (count > 0)).set("terminated", ends & (count > 0))
+
+
+def test_an_env_that_does_not_play_an_episode_again_is_refused_where_that_is_needed() -> None:
+    """Before: the window ended somewhere in another episode."""
+    policy = TensorDictModule(nn.Linear(CUES, CUES), ["cue"], ["action_value"])
+    with pytest.raises(ValueError, match=r"^env must play the same episodes after set_seed\(\d+\)"):
+        recall_density(policy, Unseeded(8), episodes=8, cap=4)
+    assert recall_density(policy, Unseeded(8), episodes=8).lengths.max() > 4

@@ -19,7 +19,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.beliefs.recording import check_seen, first_row
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
-from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import Twin, held_out, keys_of, resolve_agent
@@ -133,6 +133,7 @@ def patching(
 
 
 @torch.no_grad()
+@keeps_generator
 def _patch_batch(
     agent: Any, played: EpisodeBatch, seed: int, max_steps: int, rng: np.random.Generator
 ) -> Ints:

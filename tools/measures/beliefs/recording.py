@@ -12,7 +12,7 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
-from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import held_out, keys_of
 
@@ -93,6 +93,7 @@ def record(
     return _joined(parts)
 
 
+@keeps_generator
 def _record_batch(agent: Any, played: EpisodeBatch, seed: int, max_steps: int) -> Recording:
     """The first episode of every env of a batch."""
     policy = policy_of(agent)

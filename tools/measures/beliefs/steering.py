@@ -31,7 +31,7 @@ from arcade_torch.tools.measures.beliefs.recording import (
     shifted_state,
 )
 from arcade_torch.tools.measures.bootstrap import Array
-from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import Progress, policy_of
 from arcade_torch.tools.measures.windows import Twin, held_out, keys_of, resolve_agent
@@ -222,6 +222,7 @@ def exists(flat: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 @torch.no_grad()
+@keeps_generator
 def _steer_batch(
     agent: Any,
     played: EpisodeBatch,
