@@ -15,7 +15,7 @@ _PUBLIC = {
     "beliefs": "measures.beliefs.measure",
     "contamination": "measures.contamination.measure",
     "contamination_example": "measures.contamination.measure",
-    "contamination_example_figure": "measures.contamination.figure",
+    "contamination_example_figure": "measures.contamination.example",
     "contamination_figure": "measures.contamination.figure",
     "counterfactual": "measures.counterfactual.measure",
     "counterfactual_figure": "measures.counterfactual.figure",
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from arcade_torch.tools.measures.beliefs.measure import beliefs
     from arcade_torch.tools.measures.beliefs.patching import patching
     from arcade_torch.tools.measures.beliefs.steering import steering
+    from arcade_torch.tools.measures.contamination.example import contamination_example_figure
     from arcade_torch.tools.measures.contamination.figure import (
-        contamination_example_figure,
         contamination_figure,
     )
     from arcade_torch.tools.measures.contamination.measure import (

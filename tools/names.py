@@ -3,7 +3,8 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import Any, get_args, get_type_hints
 
 from arcade_torch.agents.differences import flatten
 from arcade_torch.envs_jax import resolve_id
@@ -125,11 +126,34 @@ def _several(words: Iterable[str]) -> bool:
     return len(set(words) - {""}) > 1
 
 
-def memory_free(agent: str, baseline: str) -> re.Match[str] | None:
+def memory_free(agent: str, baseline: str, others: Iterable[str] = ()) -> re.Match[str] | None:
     """Whether an agent is the memory-free one, in any case and size; group 1 is its algorithm,
     ``ppo-``, or empty.
+
+    A word in front is an algorithm if it is one of ours, or if one of the ``others``, with memory,
+    has it too: ``gated-mlp`` alone is a memory of its own.
     """
+    match = _named_like(agent, baseline)
+    if match is None or match[1].lower().removesuffix("-") in ("", *algorithms()):
+        return match
+    prefix = match[1].lower()
+    for other in others:
+        if other.lower().startswith(prefix) and _named_like(other, baseline) is None:
+            return match
+    return None
+
+
+def _named_like(agent: str, baseline: str) -> re.Match[str] | None:
+    """The name of an agent as that of the memory-free one, with a word in front and a size."""
     return re.fullmatch(rf"(|\S*-){re.escape(baseline)}( .*)?", agent, re.IGNORECASE)
+
+
+@cache
+def algorithms() -> tuple[str, ...]:
+    """The algorithms of our agents."""
+    from arcade_torch.agents.config import TrainConfig
+
+    return get_args(get_type_hints(TrainConfig)["algorithm"])
 
 
 def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
@@ -138,7 +162,7 @@ def find_baselines(agents: Sequence[str], baseline: str) -> dict[str, str]:
     """
     prefixes = {}  # of the memory-free agents: ``ppo-``, or empty
     for agent in agents:
-        match = memory_free(agent, baseline)
+        match = memory_free(agent, baseline, agents)
         if match is not None:
             prefixes[agent] = match[1].lower()
 

@@ -22,6 +22,7 @@ from arcade_torch.tools.measures.bootstrap import (
 )
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, figure
 from arcade_torch.tools.measures.gap_bias.measure import GapBias, game_of, normalise
+from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import read_scores
 
@@ -260,6 +261,34 @@ def test_bias_is_measured_against_the_memory_free_agent_of_the_same_algorithm() 
         scores(values), baseline="ppo-mlp", draws=10
     )  # who names one agent measures all against it
     assert {row.agent: row.bias.value + 0.9 for row in table.rows} == pytest.approx(mdp)
+
+
+@pytest.mark.parametrize("name", ["gated-mlp", "mlp-mixer", "my mlp", "GATED-MLP"])
+def test_a_memory_whose_name_ends_like_the_memory_free_agent_is_none(name: str) -> None:
+    """Before: it was the memory-free agent of an algorithm of its own, with a Bias of 0."""
+    values = {
+        (agent, twin): [value] * 2
+        for agent, value in {"mlp": 0.9, name: 0.5}.items()
+        for twin in ("full", "partial")
+    }
+    table = gap_and_bias(scores(values), draws=10)
+    assert table.baselines == {"mlp": "mlp", name: "mlp"}
+    assert table.row(name).bias.value == pytest.approx(-0.4)
+    assert memory_free("mlp 2x64", "mlp") and memory_free("PPO-mlp", "mlp")
+    assert not memory_free(name, "mlp")
+
+
+def test_an_algorithm_that_nobody_here_knows_is_one_where_two_agents_have_it() -> None:
+    values = {
+        (agent, twin): [0.5] * 2
+        for agent in ("mlp", "lru", "sac-mlp", "sac-lru", "own-mlp")
+        for twin in ("full", "partial")
+    }
+    table = gap_and_bias(scores(values), draws=10)
+    wanted = {"mlp": "mlp", "lru": "mlp", "sac-mlp": "sac-mlp", "sac-lru": "sac-mlp"}
+    assert table.baselines == wanted | {"own-mlp": "mlp"}
+    with pytest.raises(ValueError, match="no scores for the memory-free agent 'mlp', only for own"):
+        gap_and_bias([score for score in scores(values) if score.agent == "own-mlp"], draws=10)
 
 
 def test_the_order_of_the_runs_does_not_matter() -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,15 @@ def test_the_headline_claims_only_what_the_interval_allows() -> None:
 def test_few_seeds_come_with_a_caution() -> None:
     assert "With 2 seeds" in findings.coverage_sentence(table([0.1, 0.2], [0.3, 0.4]))
     assert "no intervals" in findings.coverage_sentence(table([0.1], [0.3]))
+
+
+def test_an_interval_that_keeps_its_word_is_not_called_narrow() -> None:
+    """Before: it was, whatever the simulated studies said."""
+    few = table([0.1, 0.2], [0.3, 0.4])
+    rows = tuple(replace(row, seeds=100, coverage=0.95) for row in few.rows)
+    assert "than it claims" in findings.coverage_sentence(few)
+    kept = findings.coverage_sentence(replace(few, rows=rows))
+    assert "in 95 % of simulated studies." in kept and "than it claims" not in kept
 
 
 def test_the_way_from_random_to_oracle_is_a_share() -> None:

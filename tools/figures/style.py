@@ -161,6 +161,12 @@ def legend_name(name: str) -> str:
     return f"\u200b{name}" if name.startswith("_") else name
 
 
+def plain_legend(axis: Any) -> None:
+    """The legend of a panel, its names as they are written: no mathematics between dollars."""
+    for text in axis.legend(fontsize="small").get_texts():
+        text.set_parse_math(False)
+
+
 def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str, str]:
     """A marker for every agent: two that share a colour have different ones, up to 64 agents."""
     markers: dict[str, str] = {}

@@ -10,6 +10,9 @@ from arcade_torch.agents.checked import require
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys
 
+keeps_generator = torch.random.fork_rng(devices=[])
+"""Decorates what plays episodes: envs may draw from torch's own generator, and seed it."""
+
 
 class EpisodeBatch:
     """Plays an env with any names, with or without a batch size, with categorical or one-hot
@@ -27,7 +30,8 @@ class EpisodeBatch:
         size: N, or ``most``.
 
     Raises:
-        ValueError: it has more than one batch dimension or reward, or reads no such action.
+        ValueError: it has more than one batch dimension or reward, or reads no such action, or one
+            that is no single choice.
     """
 
     def __init__(self, env: Any, keys: Keys, most: int | None = None) -> None:
@@ -43,6 +47,7 @@ class EpisodeBatch:
         self._reward = ("next", *_path(rewards[0]))
         self._ends = [("next", *_path(key)) for key in _keys_of(env, "done")]
         spec = _action_spec(env, keys.action)
+        _refuse_other_actions(spec, keys.action, self._envs)
         self._one_hot = spec if _is_one_hot(spec) else None
         self._count = getattr(spec, "n", None)  # of actions
         self._action_shape = None if spec is None else spec.shape
@@ -148,6 +153,20 @@ def _action_spec(env: Any, key: Key) -> Any:
     keys = list(specs.keys(True, True))
     require(key in keys, "the action of env", keys, f"under {key!r}, or be named with action_key")
     return specs[key]
+
+
+def _refuse_other_actions(spec: Any, key: Key, envs: int) -> None:
+    """Refuse actions that are no choice of one among several: the measures compare choices."""
+    # imported here: who measures windows of their own needs no TorchRL
+    from torchrl.data import MultiCategorical, MultiOneHot
+
+    if spec is None:
+        return
+    is_one = not isinstance(spec, MultiCategorical | MultiOneHot)
+    if not _is_one_hot(spec):
+        is_one = is_one and not spec.dtype.is_floating_point and spec.shape.numel() == envs
+    words = f"{type(spec).__name__} of {spec.dtype} {list(spec.shape)}"
+    require(is_one, f"the action {key!r} of env", words, "one choice, Categorical or OneHot")
 
 
 def _is_one_hot(spec: Any) -> bool:

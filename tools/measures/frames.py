@@ -1,6 +1,7 @@
 """Frames of any kind: where their channels are, how bright white is, and pictures of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.keys import Channels
 
 BYTE = 255.0  # white in whole numbers
@@ -33,6 +35,36 @@ def channel_axis(shape: Sequence[int], channels: Channels | None = None) -> int 
     return 0 if channels == "first" else -1
 
 
+def float_type(frames: Tensor) -> torch.dtype:
+    """The type in which frames are read as floats: their own, single precision for whole numbers
+    and truth values.
+    """
+    return frames.dtype if frames.is_floating_point() else torch.float32
+
+
+@contextmanager
+def floats_are_taken(dtype: torch.dtype) -> Iterator[None]:
+    """Say in one line of a policy that breaks off where frames of ``dtype`` are handed to it as
+    floats.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if dtype.is_floating_point:
+            raise
+        raise ValueError(
+            f"the policy must take floats where the env gives {dtype}, for noise and gradients: "
+            "convert them inside of it, for an embedding by frames.long(); got "
+            f"{str(error).splitlines()[0]}"
+        ) from error
+
+
+def as_array(frames: Tensor) -> NDArray[Any]:
+    """Frames as an array; NumPy has no bfloat16."""
+    values = frames.float() if frames.dtype == torch.bfloat16 else frames
+    return np.asarray(values.cpu().numpy())
+
+
 def white_of(frames: Tensor, white: float | None = None) -> float:
     """The value of a white pixel: 255 for whole numbers, 1 for floats and truth values.
 
@@ -40,6 +72,7 @@ def white_of(frames: Tensor, white: float | None = None) -> float:
         ValueError: floats that reach far beyond 1, and nobody says what white is.
     """
     if white is not None:
+        require(white > 0, "white", white, "above 0")
         return white
     if frames.dtype != torch.bool and not frames.is_floating_point():
         return BYTE

@@ -1,8 +1,8 @@
 """The keywords that all measures share, and which entries a policy and its env have where."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -24,9 +24,23 @@ class Names(TypedDict, total=False):
     output_kind: Kind | None
     value_key: Key
     state_keys: Sequence[Key] | Mapping[Key, Key] | None
-    initial_state: TensorDictBase | None
+    initial_state: TensorDictBase | Mapping[str, Any] | None
     channels: Channels | None
     white: float | None
+
+
+def refuse_unknown(names: Iterable[str]) -> None:
+    """Refuse keywords that are none of `Names`: those of a measure that are misspelt end here.
+
+    Raises:
+        TypeError: there is one.
+    """
+    for name in names:
+        if name not in Names.__annotations__:
+            raise TypeError(
+                f"unknown keyword {name!r}: beside those that the measure lists there are "
+                f"{', '.join(Names.__annotations__)}"
+            )
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,9 @@ from torch import Tensor, nn
 from arcade_torch.agents.forward import evaluating, state_of
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
-from arcade_torch.tools.measures.keys import Channels, Keys, Names
+from arcade_torch.tools.measures.frames import float_type, floats_are_taken
+from arcade_torch.tools.measures.keys import Channels, Keys, Names, refuse_unknown
+from arcade_torch.tools.measures.masked import are_near, refuse_nan
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
@@ -107,15 +109,17 @@ class Policy:
         self,
         frames: Tensor,
         chunk: int = 16,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
         *,
         batch_ndim: int = 1,
     ) -> Tensor:
         """Features [T, E] of frames [T, ...] without a graph, each frame encoded once, ``chunk`` at
-        a time; with ``batch_ndim=2`` [N, T, E] of sequences [N, T, ...].
+        a time, as floats of ``dtype``, by default `float_type`; with ``batch_ndim=2`` [N, T, E] of
+        sequences [N, T, ...].
         """
         batch = frames.shape[:batch_ndim]
         flat = frames.flatten(0, batch_ndim - 1)
+        dtype = dtype or float_type(frames)
         features = torch.cat([self.encode(part.to(dtype)) for part in flat.split(chunk)])
         return features.reshape(*batch, -1)
 
@@ -209,7 +213,7 @@ class Policy:
         last_action: Tensor,
         is_init: Tensor,
         state: Any,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
     ) -> None:
         """Refuse a policy that a measure would read wrongly: one that says other things when frames
         are read in one go than when it acts on them one by one, or, of a TensorDict, that takes
@@ -219,6 +223,7 @@ class Policy:
         ``state`` on; the first few are tried. A policy that few frames were tried on is not tried
         again, so that a measure of many windows pays for one.
         """
+        dtype = dtype or float_type(frames)
         if dtype in self._tried:
             return
         few = slice(0, FEW)
@@ -226,7 +231,8 @@ class Policy:
         starts = is_init[None, few].bool()
         target = resolve(self, "auto")
         with self.evaluating():
-            features = self.features(frames[few], dtype=dtype)[None]
+            with floats_are_taken(frames.dtype):
+                features = self.features(frames[few], dtype=dtype)[None]
             # a policy may change its state in place
             first = None if state is None else state.clone()
             alone = [self.features(frame[None], dtype=dtype) for frame in frames[few]]
@@ -240,7 +246,8 @@ class Policy:
                 )
                 one_by_one.append(out)
         rounding = ROUNDING if together.dtype.itemsize > 2 else HALF_ROUNDING
-        if not _are_near(torch.cat(one_by_one, 1), together, rounding):
+        refuse_nan(together)
+        if not are_near(torch.cat(one_by_one, 1), together, rounding):
             raise ValueError(
                 "the policy must say of frames in one go what it says of them one by one: in "
                 "evaluation mode nothing may be drawn at random, entries of a batch may not mix, "
@@ -251,7 +258,7 @@ class Policy:
             frame = frames[None, :1]
             exact = self.forward_frames(frame, actions[:, :1], target=target)
             floats = self.forward_frames(frame.float(), actions[:, :1], target=target)
-            if not _are_near(floats, exact, DIFFERENT):
+            if not are_near(floats, exact, DIFFERENT):
                 raise ValueError(
                     f"the policy must read floats of 0 to 255 as it reads {frames.dtype}, got "
                     "other outputs: convert frames of any type alike (frames.float() / 255)"
@@ -264,14 +271,6 @@ class Policy:
         """Evaluation mode for a while; the modes before come back."""
         with evaluating(nn.Identity() if self.module is None else self.module):
             yield
-
-
-def _are_near(values: Tensor, others: Tensor, share: float) -> bool:
-    """Whether outputs differ by no more than a share of their size; where one is no number, the
-    other is none.
-    """
-    a, b = values.double().nan_to_num(), others.double().nan_to_num()
-    return float((a - b).norm()) <= share * float(b.norm())
 
 
 def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
@@ -292,14 +291,15 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
             or ``probs``. ``value_key``: ``state_value`` by default. ``state_keys``: of the
             recurrent state, by default those whose next state is written under "next"; else pairs
             {key: key of the next state}. ``initial_state``: its start, a TensorDict of batch size
-            []; by default that of the module or its primer. ``channels`` ("first", "last"): by
-            default the shorter of the two ends of a frame. ``white``: the value of a white pixel,
-            by default 255 for whole numbers and 1 for floats.
+            [] or a dictionary; by default that of the module or its primer. ``channels`` ("first",
+            "last"): by default the shorter of the two ends of a frame. ``white``: the value of a
+            white pixel, by default 255 for whole numbers and 1 for floats.
 
     Raises:
-        TypeError: ``model`` has none of these forms.
+        TypeError: ``model`` has none of these forms, or there is no such keyword.
         ValueError: a TensorDict policy reads or writes entries that say nothing to a measure.
     """
+    refuse_unknown(names)
     model = getattr(model, "_orig_mod", model)  # of torch.compile
     network = getattr(model, "network", model)
     if isinstance(model, Policy):

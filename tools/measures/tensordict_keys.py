@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -14,8 +15,9 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor
-from torchrl.modules import EGreedyModule, QValueModule
+from torchrl.modules import EGreedyModule, GRUModule, LSTMModule, QValueModule
 
+from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys, Kind, Names
 
@@ -29,6 +31,8 @@ OFFERS: Mapping[Kind, tuple[str, ...]] = {
 """How outputs of a kind can be read; with a value beside them also as "value"."""
 CHOOSERS = (QValueModule, EGreedyModule, ProbabilisticTensorDictModule)
 """Modules that choose an action and compute nothing that a measure looks at."""
+READ_AT_ONCE = (MemoryModule, LSTMModule, GRUModule)
+"""Memories that read a sequence in one call, and give the state after it alone."""
 IN_A_ROW = (TensorDictSequential.forward, ProbabilisticTensorDictSequential.forward)
 """What runs the modules of a sequence one after the other, and does nothing else."""
 
@@ -60,13 +64,15 @@ class Output:
         if self.kind == "logits" and target == "probs":
             return actions.softmax(-1)
         if self.kind == "probs" and target == "logits":
-            return actions.log()
+            # no probability has no gradient: that of log(0) is no number
+            is_possible = actions > 0
+            return torch.where(is_possible, actions, 1).log().masked_fill(~is_possible, -torch.inf)
         return actions
 
 
 def unravelled(keys: Sequence[Any]) -> set[Key]:
-    """Keys as tensordict compares them."""
-    return {unravel_key(key) for key in keys}
+    """Keys as tensordict compares them; ``_`` is none, but an output that is thrown away."""
+    return {unravel_key(key) for key in keys} - {"_"}
 
 
 def parts_of(module: TensorDictModuleBase) -> Iterator[TensorDictModuleBase]:
@@ -159,9 +165,25 @@ def _kinds_read_by(part: TensorDictModuleBase) -> dict[Key, Kind]:
 
 
 def needed_parts(
-    parts: Sequence[TensorDictModuleBase], keys: Sequence[Key]
+    parts: Sequence[TensorDictModuleBase], keys: Sequence[Key], state_keys: Mapping[Key, Key]
 ) -> list[TensorDictModuleBase]:
-    """The modules without which some entries could not be computed, in their order."""
+    """The modules without which some entries could not be computed, at any step, in their order:
+    also those that write the next state, where they read it.
+    """
+    wanted = set(keys)
+    while True:
+        needed = _writers(parts, wanted)
+        read = set[Key]()
+        for part in needed:
+            read |= unravelled(part.in_keys)
+        after = {state_keys[key] for key in read if key in state_keys}
+        if after <= wanted:
+            return needed
+        wanted |= after
+
+
+def _writers(parts: Sequence[TensorDictModuleBase], keys: set[Key]) -> list[TensorDictModuleBase]:
+    """The modules that some entries are computed by, in their order."""
     wanted = set(keys)
     needed = list[TensorDictModuleBase]()
     for part in reversed(parts):
@@ -171,3 +193,52 @@ def needed_parts(
             wanted -= written
             wanted |= unravelled(part.in_keys)
     return needed[::-1]
+
+
+def joined_by_state(
+    parts: Sequence[TensorDictModuleBase], state_keys: Mapping[Key, Key]
+) -> list[TensorDictModuleBase]:
+    """The modules in their order; from the first to the last of those that pass a state on to one
+    another they are one sequence, which has to go step by step.
+    """
+    last = list(range(len(parts)))  # the module up to which each is joined
+    for key, after in state_keys.items():
+        ends = _ends_of(parts, key, after)
+        if ends is not None:
+            last[ends[0]] = max(last[ends[0]], ends[1])
+    joined = list[TensorDictModuleBase]()
+    begin = 0
+    while begin < len(parts):
+        end = begin
+        place = begin
+        while place <= end:
+            end = max(end, last[place])
+            place += 1
+        some = parts[begin:place]
+        joined.append(some[0] if len(some) == 1 else TensorDictSequential(*some))
+        begin = place
+    return joined
+
+
+def _ends_of(parts: Sequence[TensorDictModuleBase], key: Key, after: Key) -> tuple[int, int] | None:
+    """The first and the last of the modules that have to be joined for a state; None where each can
+    read sequences by itself: one that reads the state when all of the next one is written can.
+    """
+    readers = list[int]()
+    writers = list[int]()
+    users = list[int]()
+    is_hidden = key == after  # whether a sequence does not show the states between its steps
+    for place, part in enumerate(parts):
+        reads = unravelled(part.in_keys)
+        writes = unravelled(part.out_keys)
+        if key in reads:
+            readers.append(place)
+        if after in writes:
+            writers.append(place)
+        if {key, after} & (reads | writes):
+            users.append(place)
+            is_hidden |= isinstance(part, READ_AT_ONCE)
+    is_passed_on = bool(readers and writers) and readers[0] < writers[-1]
+    if len(users) > 1 and (is_hidden or is_passed_on):
+        return users[0], users[-1]
+    return None

@@ -3,8 +3,9 @@
 The modules of a policy are sorted once, by their keys. Those that read nothing but frames are the
 encoder, which sees every frame once. The rest, memory and heads, reads sequences from a recurrent
 state that is handed to it: our ``MemoryModule`` and TorchRL's ``LSTMModule`` and ``GRUModule`` in
-one call, any other module with a state step by step, as it acts. A policy that reads frames and
-state in one module cannot be cut in two; its features are the frames.
+one call, any other module with a state step by step, as it acts, and so do modules together that
+pass a state on to one another. A policy that reads frames and state in one module cannot be cut in
+two; its features are the frames.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,7 @@ from arcade_torch.tools.measures.tensordict_keys import (
     find_input_keys,
     find_output,
     find_state_keys,
+    joined_by_state,
     needed_parts,
     parts_of,
     unravelled,
@@ -64,9 +66,10 @@ class TensorDictPolicy:
         self.keys = find_input_keys(module, self.state_keys, names)
         self.reads_last_action = self.keys.last_action in unravelled(module.in_keys)
         self.output = find_output(parts, names)
-        needed = needed_parts(parts, self.output.keys)
+        needed = needed_parts(parts, self.output.keys, self.state_keys)
         self.only_part = needed[0] if len(needed) == 1 else None
-        self._encoder, self._rest = self._split(needed)
+        self._encoder, rest = self._split(needed)
+        self._rest = joined_by_state(rest, self.state_keys)
         self._features = self._boundary()
         self.splits = self.keys.pixels not in self._features
         self._shapes = dict[Key, torch.Size]()
@@ -77,7 +80,8 @@ class TensorDictPolicy:
     ) -> tuple[list[TensorDictModuleBase], list[TensorDictModuleBase]]:
         """The modules that see nothing but frames, and those behind them."""
         visible = {self.keys.pixels}
-        touched = set[Key]()  # by what stands behind the encoder
+        # by what stands behind the encoder; a state that is written in its place belongs there
+        touched = {key for key, after in self.state_keys.items() if key == after}
         encoder = list[TensorDictModuleBase]()
         rest = list[TensorDictModuleBase]()
         for part in needed:
@@ -99,10 +103,13 @@ class TensorDictPolicy:
             encoded |= unravelled(part.out_keys)
         features = list[Key]()
         written = set[Key]()
+        wanted = list(self.output.keys)
         for part in self._rest:
-            features += [unravel_key(key) for key in part.in_keys if unravel_key(key) in encoded]
+            reads = [unravel_key(key) for key in part.in_keys]
+            features += [key for key in reads if key in encoded]
+            wanted += [self.state_keys[key] for key in reads if key in self.state_keys]
             written |= unravelled(part.out_keys)
-        features += [key for key in self.output.keys if key in encoded - written]
+        features += [key for key in wanted if key in encoded - written]
         if not features:
             raise ValueError(
                 f"{self.output.key!r} does not depend on {self.keys.pixels!r}: name the entry that "
@@ -145,9 +152,10 @@ class TensorDictPolicy:
             steps[self.keys.last_action] = last_action
         self._set_flags(steps, is_init)
         start = self.initial_state(batch[0])
-        state = start if state is None else start.clone(recurse=False).update(state)
+        before = start if state is None else start.clone(recurse=False).update(state)
+        after = before.clone(recurse=False)
         for module in self._rest:
-            state = self._run(module, steps, is_init, state, start)
+            after.update(self._run(module, steps, is_init, before, start))
         outputs = [steps[key] for key in self.output.keys]
         for key, output in zip(self.output.keys, outputs, strict=True):
             require(
@@ -157,7 +165,7 @@ class TensorDictPolicy:
                 "one number an action, [*, A]: a distribution of values needs its mean beside it, "
                 "named with output_key",
             )
-        return torch.cat(outputs, -1), state
+        return torch.cat(outputs, -1), after
 
     def _set_flags(self, steps: TensorDictBase, is_init: Tensor) -> None:
         """Write start flags [*batch, 1] where the policy reads them, and where TorchRL's modules
@@ -175,7 +183,9 @@ class TensorDictPolicy:
         state: TensorDictBase,
         start: TensorDictBase,
     ) -> TensorDictBase:
-        """Run one module over sequences, write its outputs into ``steps``, and return the state."""
+        """Run one module over sequences, write its outputs into ``steps``, and return the state
+        after them, as far as it reads it.
+        """
         keys = [key for key in self.state_keys if key in unravelled(module.in_keys)]
         if isinstance(module, MemoryModule):
             return _read_with_memory(module, steps, is_init, state)
@@ -183,7 +193,7 @@ class TensorDictPolicy:
             flat = steps.reshape(-1)
             written = module(flat).select(*module.out_keys, strict=False)
             steps.update(written.reshape(steps.batch_size))
-            return state
+            return state.empty()
         states = {key: self.state_keys[key] for key in keys}
         if isinstance(module, LSTMModule | GRUModule):
             return _read_at_once(module, steps, is_init, state, start, states)
@@ -223,17 +233,23 @@ class TensorDictPolicy:
 def _start_of(
     module: TensorDictModuleBase,
     state_keys: Mapping[Key, Key],
-    given: TensorDictBase | None,
+    given: TensorDictBase | Mapping[str, Any] | None,
 ) -> Callable[[int], TensorDictBase]:
     """The function that gives the state at the start of an episode for a batch size."""
+    first: Any = given
+    if given is not None and not isinstance(given, TensorDictBase):
+        first = TensorDict(dict(given), [])
+    if first is not None:
+        size = list(first.batch_size)
+        require(size in ([], [1]), "initial_state", size, "of batch size []")
     parameter = next(module.parameters(), torch.empty(0))
 
     def start(batch_size: int) -> TensorDictBase:
         state = TensorDict({}, [batch_size], device=parameter.device)
         for part in module.modules():
             state.update(_start_of_part(part, batch_size, parameter))
-        if given is not None:
-            state.update(given.expand(batch_size))
+        if first is not None:
+            state.update(first.expand(batch_size))
         return state
 
     example = start(1)
@@ -284,7 +300,7 @@ def _read_with_memory(
         before.update(state[prefix])
     y, after = module.memory(steps[module.in_key], before, is_init.bool())
     steps[module.out_key] = y
-    return state if prefix is None else state.clone(recurse=False).set(prefix, after)
+    return state.empty() if prefix is None else state.empty().set(prefix, after)
 
 
 def _read_at_once(
@@ -306,7 +322,7 @@ def _read_at_once(
     # cuDNN has no backward pass in evaluation mode
     with set_recurrent_mode(True), torch.backends.cudnn.flags(enabled=False):
         written = module(steps)
-    after = state.clone(recurse=False)
+    after = state.empty()
     for key, next_key in states.items():
         after[key] = written[next_key][:, -1]
     return after
@@ -321,7 +337,7 @@ def _read_by_steps(
     states: Mapping[Key, Key],
 ) -> TensorDictBase:
     """Let any module with a state read sequences, as it acts."""
-    state = state.clone(recurse=False)
+    state = state.select(*states)
     outputs = list[TensorDictBase]()
     for t in range(is_init.shape[1]):
         step = steps[:, t].clone(recurse=False)
@@ -331,7 +347,7 @@ def _read_by_steps(
             step = module(step)
         for key, next_key in states.items():
             state[key] = step[next_key]
-        outputs.append(step.select(*module.out_keys))
+        outputs.append(step.select(*unravelled(module.out_keys)))
     steps.update(torch.stack(outputs, 1))
     return state
 

@@ -19,7 +19,7 @@ from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
-from arcade_torch.tools.measures.envs import EpisodeBatch
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
 
@@ -138,7 +138,7 @@ def greedy_windows(
     require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
     require(episodes >= 1, "episodes", episodes, "at least 1")
     require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
-    size = EpisodeBatch(env, _keys(agent)).size
+    size = EpisodeBatch(env, keys_of(agent)).size
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
         drawn = np.random.SeedSequence([seed, group]).generate_state(1)
@@ -150,7 +150,13 @@ def greedy_windows(
         if late.any():
             del windows
             first = np.where(late, ends - cap + 1, 0).tolist()
-            windows, _ = play(agent, env, seed=batch_seed, keep=cap, first=first)
+            windows, again = play(agent, env, seed=batch_seed, keep=cap, first=first)
+            if (again != lengths).any():
+                raise ValueError(
+                    f"env must play the same episodes after set_seed({batch_seed}), of which long "
+                    f"ones are played twice, got lengths {lengths.tolist()} and {again.tolist()}: "
+                    "let it draw from that seed alone, or take a larger cap"
+                )
             ends = np.where(late, cap - 1, ends)
         for window, n in zip(windows[: episodes - group * size], ends, strict=False):
             yield window.up_to(int(n))
@@ -164,6 +170,7 @@ def _end(length: int, end: End, cap: int, rng: np.random.Generator) -> int:
 
 
 @torch.no_grad()
+@keeps_generator
 def play(
     agent: Any,
     env: Any,
@@ -180,7 +187,7 @@ def play(
     kept; episodes are cut after ``max_steps``, never by default. With ``most`` only so many envs
     are played. Returns a window of each episode, and all lengths int64 [N].
     """
-    episodes = EpisodeBatch(env, _keys(agent), most)
+    episodes = EpisodeBatch(env, keys_of(agent), most)
     size = episodes.size
     starts = torch.as_tensor([0] * size if first is None else first)
     lengths = torch.zeros(size, dtype=torch.int64)
@@ -221,7 +228,7 @@ def play(
     return windows, lengths.numpy()
 
 
-def _keys(agent: Any) -> Keys:
+def keys_of(agent: Any) -> Keys:
     """Where an env has what this agent reads."""
     return agent.keys if isinstance(agent, Policy) else Keys()
 

@@ -112,11 +112,11 @@ def coverage_sentence(table: GapBias) -> str:
             "difference."
         )
     seeds, share = min(table.coverage.items())
+    narrow = ", so it is narrower than it claims" if share < table.confidence else ""
     return (
         f"Intervals are nominal {100 * table.confidence:g} % percentile bootstrap over seeds. "
         f"With {seeds} seeds such an interval held the true gap in {100 * share:.0f} % of "
-        "simulated "
-        "studies, so it is narrower than it claims."
+        f"simulated studies{narrow}."
     )
 
 

@@ -2,13 +2,23 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.data import Binary, Categorical, Composite, OneHot, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    Unbounded,
+)
 from torchrl.envs import (
     EnvBase,
     GymEnv,
@@ -371,3 +381,89 @@ def test_white_and_pictures_of_frames() -> None:
     assert pictures(torch.rand(3, 7)).shape == (3, 1, 7, 3)
     with pytest.raises(ValueError, match=r"^float frames must be shares of white, got 255"):
         white_of(torch.full((1, 2, 2, 3), 255.0))
+
+
+class Choices(Foreign):
+    """Reads other actions."""
+
+    def __init__(self, spec: Any, batch: tuple[int, ...] = ()) -> None:
+        super().__init__("vector", batch)
+        self.action_spec = Composite(move=spec, shape=batch)
+
+
+@pytest.mark.parametrize(
+    ("spec", "batch"),
+    [
+        (Bounded(-1.0, 1.0, (1,)), ()),
+        (Bounded(-1.0, 1.0, (2,)), (2,)),
+        (MultiCategorical([4, 4]), ()),
+        (MultiOneHot([2, 2]), ()),
+        (Bounded(0, 3, (2, 2), dtype=torch.int64), (2,)),
+    ],
+    ids=["continuous", "one for two envs", "two choices", "two one-hot", "two whole numbers"],
+)
+def test_actions_that_are_not_one_choice_are_refused_in_one_line(
+    spec: Any, batch: tuple[int, ...]
+) -> None:
+    """Before: two one-hot choices got a single one, and a continuous action was 0 or 1."""
+    if batch and spec.shape[0] != batch[0]:
+        spec = spec.expand(*batch, *spec.shape)
+    for measure in (counterfactual, contamination):
+        with pytest.raises(ValueError, match=r"^the action 'move' of env must be one choice") as it:
+            measure(policy_of("vector"), Choices(spec, batch), **NAMES)
+        assert "\n" not in str(it.value)
+
+
+def test_one_choice_of_any_form_is_played() -> None:
+    for spec, batch in (
+        (Categorical(ACTIONS), ()),
+        (Categorical(ACTIONS, (1,)), ()),
+        (Categorical(ACTIONS, (3, 1)), (3,)),
+        (OneHot(ACTIONS), ()),
+        (OneHot(ACTIONS, (3, ACTIONS), dtype=torch.float32), (3,)),
+        (Bounded(0, ACTIONS - 1, (3,), dtype=torch.int64), (3,)),
+        (Bounded(0, ACTIONS - 1, (1,), dtype=torch.int32), ()),
+    ):
+        window = play(as_policy(policy_of("vector"), **NAMES), Choices(spec, batch), seed=0, keep=4)
+        assert window[0][0].action.shape == (4,), (spec, batch)
+
+
+def test_one_output_is_no_choice() -> None:
+    """Before: an index out of range, out of torch."""
+    one = TensorDictModule(nn.Linear(7, 1), [("view", "image")], ["action_value"])
+    for measure in (counterfactual, contamination):
+        with pytest.raises(
+            ValueError, match=r"^the policy's outputs must be of two actions at least"
+        ):
+            measure(one, Foreign("vector"), pixels_key=("view", "image"), action_key="move")
+
+
+class Corridor:
+    """Walk right for four cells; the observation is the cell."""
+
+    def reset(self, key: Any) -> tuple[Any, Any]:
+        """Begin."""
+        return jnp.zeros(4, jnp.float32).at[0].set(1), jnp.int32(0)
+
+    def step(self, key: Any, state: Any, action: Any) -> tuple[Any, ...]:
+        """Go on."""
+        state = state + action
+        there = state >= 3
+        seen = jnp.zeros(4, jnp.float32).at[state].set(1)
+        return seen, state, there.astype(jnp.float32), there, {}
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_an_env_of_jax_is_played_to_its_ends(size: int) -> None:
+    from arcade_torch import from_jax
+
+    def walk(seen: Tensor) -> Tensor:
+        return torch.stack([0.1 + 0 * seen[..., 0], 1 + seen[..., 1]], -1)
+
+    policy = TensorDictModule(walk, ["observation"], ["action_value"])
+    env = from_jax(
+        Corridor(), num_envs=size, max_steps=10, action_spec=Categorical(2, shape=(size,)), seed=0
+    )
+    exchanges = counterfactual(policy, env, episodes=4, donors=2)
+    assert exchanges.lengths.tolist() == [3] * 4 and not exchanges.flip[..., 0].any()
+    assert recall_density(policy, env, episodes=2).deltas.tolist() == [0, 0, 1] * 2

@@ -1,6 +1,7 @@
 """Figures of measures of any policy: frames of any kind, any number of actions, one seed or some."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from arcade_torch.tools import (
     contamination_example,
     contamination_example_figure,
     contamination_figure,
+    counterfactual,
+    counterfactual_figure,
     greedy_window,
     recall_density,
     recall_density_figure,
@@ -80,3 +83,82 @@ def test_an_example_has_bars_for_as_many_actions_as_there_are() -> None:
     assert len(bars.patches) == ACTIONS
     named = contamination_example_figure(example, actions=["left", "right", "up", "down"])
     assert named.axes[3].get_xticklabels()[0].get_text() == "left"
+
+
+DOLLARS = ["$x^$", "lr $0.1$ wd $0$", r"\frac", "_under", "50 %"]
+
+
+def test_names_with_dollars_are_text_in_figures_of_ones_own() -> None:
+    """Before: a parse error of matplotlib, or letters in italics without their dollars."""
+    options: dict[str, Any] = {"sigmas": (1.0,), "delays": (0, 1), "starts": 4}
+    changes = contamination(policy_of(), Foreign(), **options, **NAMES)
+    exchanges = counterfactual(policy_of(), Foreign(), episodes=4, donors=1, **NAMES)
+    density = recall_density(policy_of(), Foreign(), episodes=2, **NAMES)
+    for figure in (
+        contamination_figure(dict.fromkeys(DOLLARS, changes)),
+        counterfactual_figure(dict.fromkeys(DOLLARS, exchanges)),
+        recall_density_figure(dict.fromkeys(DOLLARS, density)),
+    ):
+        figure.canvas.draw()
+        texts = figure.axes[0].get_legend().get_texts()
+        assert [text.get_text().lstrip("\u200b") for text in texts][: len(DOLLARS)] == DOLLARS
+        assert not any(text.get_parse_math() for text in texts)
+    example = contamination_example(policy_of(), Foreign(), horizon=6, **NAMES)
+    figure = contamination_example_figure(example, title="$x^$", actions=DOLLARS[:ACTIONS])
+    figure.canvas.draw()
+    ticks = figure.axes[-1].get_xticklabels()
+    assert [tick.get_text() for tick in ticks] == DOLLARS[:ACTIONS]
+
+
+def test_actions_of_one_name_have_a_bar_each_and_all_have_a_name() -> None:
+    """Before: bars of one name stood behind each other, and one name was that of all."""
+    example = contamination_example(policy_of(), Foreign(), horizon=6, **NAMES)
+    figure = contamination_example_figure(example, actions=["a", "a", "b", "b"])
+    places = [bar.get_x() for bar in figure.axes[-1].patches]
+    assert len(set(places)) == ACTIONS
+    with pytest.raises(ValueError, match=r"^actions must be 4 names; got \['a'\]"):
+        contamination_example_figure(example, actions=["a"])
+
+
+def test_contaminations_of_other_delays_or_strengths_are_not_drawn_as_one() -> None:
+    """Before: numbers of delays 0, 2, 3 stood at 0, 1, 2, and were pooled with those."""
+    options: dict[str, Any] = {"starts": 8, **NAMES}
+    changes = contamination(policy_of(), Foreign(), sigmas=(1.0,), delays=(0, 1, 2), **options)
+    later = contamination(policy_of(), Foreign(), sigmas=(1.0,), delays=(0, 2, 3), **options)
+    weaker = contamination(policy_of(), Foreign(), sigmas=(0.1,), delays=(0, 1, 2), **options)
+    shuffled = replace(changes, sigmas=np.array([np.nan]))
+    for other in (later, weaker, shuffled):
+        for together in ({"a": changes, "b": other}, {"a": [changes, other]}):
+            with pytest.raises(ValueError, match="must have the same sigmas and delays"):
+                contamination_figure(together)
+    contamination_figure({"a": shuffled, "b": [shuffled, shuffled]})
+
+
+def test_what_cannot_be_drawn_is_refused_in_one_line() -> None:
+    changes = contamination(policy_of(), Foreign(), sigmas=(1.0,), delays=(0, 1), starts=4, **NAMES)
+    exchanges = counterfactual(policy_of(), Foreign(), episodes=4, donors=1, **NAMES)
+    frames = np.zeros((5, 4, 4, 3), np.uint8)
+    maps = np.ones((5, 4, 4), np.float32)
+    wrong: list[tuple[Any, str]] = [
+        (lambda: contamination_figure({}), "changes must be of one policy at least"),
+        (lambda: contamination_figure({"a": []}), "changes must be of one policy at least"),
+        (
+            lambda: contamination_figure({"a": changes}, name="x"),
+            "name must be one of flip, change",
+        ),
+        (lambda: counterfactual_figure({}), "effects must be of one policy at least"),
+        (lambda: counterfactual_figure({"a": exchanges}, effect="x"), "effect must be one of flip"),
+        (lambda: recall_density_figure({}), "densities must be of one policy at least"),
+        (lambda: saliency_figure([]), "rows must be one at least"),
+        (lambda: saliency_figure([("a", frames, maps)], show=0), "show must be at least 1"),
+        (
+            lambda: saliency_figure([("a", frames, maps[1:])]),
+            r"the maps of 'a' must be \[5, 4, 4\]",
+        ),
+        (lambda: saliency_figure([("a", frames, maps.reshape(5, 2, 8))]), "the maps of 'a' must"),
+        (lambda: saliency_figure([("a", frames, maps * np.nan)]), "the maps of 'a' must be finite"),
+    ]
+    for draw, message in wrong:
+        with pytest.raises(ValueError, match=f"^{message}") as caught:
+            draw()
+        assert "\n" not in str(caught.value)

@@ -28,6 +28,7 @@ from arcade_torch.tools.measures.bootstrap import Interval, pooled, pooled_episo
 from arcade_torch.tools.measures.checkpoints import Label, by_task
 from arcade_torch.tools.measures.contamination import ContaminationOptions
 from arcade_torch.tools.measures.contamination import figure as contamination
+from arcade_torch.tools.measures.contamination.example import CLEAN_BEST, OTHER_BEST, REST
 from arcade_torch.tools.measures.contamination.measure import Contamination, Example
 from arcade_torch.tools.measures.counterfactual import figure as counterfactual
 from arcade_torch.tools.measures.counterfactual.measure import Counterfactual
@@ -508,7 +509,7 @@ def test_the_bars_of_an_example_say_where_the_best_action_changed() -> None:
             and bars[0].get_ylim()[0] < -4
             and bars[0].get_ylim()[1] > 3
         )
-    grey, blue, red = contamination.REST, contamination.CLEAN_BEST, contamination.OTHER_BEST
+    grey, blue, red = REST, CLEAN_BEST, OTHER_BEST
     assert colours == [[grey, blue, grey, grey, grey]] * 2 + [[red, blue, grey, grey, grey]]
     assert "sigma = 0.3" in note and [row["value"] for row in rows] == values.ravel().tolist()
 

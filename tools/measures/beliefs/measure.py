@@ -23,13 +23,14 @@ counterfactual exchanges (`arcade_torch.tools.measures.counterfactual`).
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.beliefs.recording import (
+    CLASSES,
     MIN_EPISODES,
     Floats,
     Ints,
@@ -38,6 +39,7 @@ from arcade_torch.tools.measures.beliefs.recording import (
 )
 from arcade_torch.tools.measures.beliefs.ridge import Ridge
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval, resampled
+from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import Progress
 from arcade_torch.tools.measures.windows import Twin, resolve_agent
 
@@ -135,6 +137,7 @@ def beliefs(
     seed: int = 0,
     observability: Twin | None = None,
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> Beliefs:
     """Read hidden facts off the recurrent state of an agent, and off its frames.
 
@@ -145,6 +148,7 @@ def beliefs(
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, and of their division.
         progress: called with (episodes played, episodes).
+        **names: keywords of `as_policy`.
 
     Returns:
         Arrays.
@@ -152,7 +156,7 @@ def beliefs(
     Raises:
         ValueError: an option is out of range, the env names no facts, or all of them are constant.
     """
-    player, env = resolve_agent(agent, env, observability)
+    player, env = resolve_agent(agent, env, observability, **names)
     recording = record(
         player, env, episodes=episodes, max_steps=max_steps, seed=seed, progress=progress
     )
@@ -247,7 +251,7 @@ class Fact:
     def of(cls, values: NDArray[Any], split: Split) -> "Fact":
         """The cells of an array [E, T, ...] that vary, where they have a value to fit."""
         flat = values.reshape(*values.shape[:2], -1)
-        is_class = flat.dtype.kind in "bi"
+        is_class = flat.dtype.kind in CLASSES
         missing = flat < 0 if is_class else np.isnan(flat)
         exists = ~missing & (split.fit | split.choose | split.score)[..., None]
         is_fitted = exists & split.fit[..., None]

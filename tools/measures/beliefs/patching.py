@@ -8,7 +8,7 @@ says whether it is used.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 import torch
@@ -19,8 +19,10 @@ from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.beliefs.recording import check_seen, first_row
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
+from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
-from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
+from arcade_torch.tools.measures.windows import Twin, held_out, keys_of, resolve_agent
 
 Ints = NDArray[np.int64]
 Outcome = Literal["follows", "stays", "other"]
@@ -86,6 +88,7 @@ def patching(
     seed: int = 0,
     observability: Twin | None = None,
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> Patches:
     """Exchange recurrent states between greedy episodes of an agent, step by step.
 
@@ -96,6 +99,7 @@ def patching(
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, and of the donors.
         progress: called with (episodes played, episodes).
+        **names: keywords of `as_policy`.
 
     Returns:
         Actions.
@@ -105,16 +109,17 @@ def patching(
     """
     require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
     require(max_steps >= 1, "max_steps", max_steps, "at least 1")
-    player, env = resolve_agent(agent, env, observability)
-    size = int(env.batch_size[0])
+    player, env = resolve_agent(agent, env, observability, **names)
+    played = EpisodeBatch(env, keys_of(player))
+    size = played.size
     require(size >= MIN_EPISODES, "the batch size of env", size, "at least 2, for donors")
     parts = list[Ints]()
     with policy_of(player).evaluating():
         for group in range(-(-episodes // size)):
             drawn = np.random.SeedSequence([seed, group]).generate_state(1)
-            env.set_seed(held_out(int(drawn[0]) % SEED_LIMIT))
+            batch_seed = held_out(int(drawn[0]) % SEED_LIMIT)
             rng = np.random.default_rng([seed, group, 4])
-            part = _patch_batch(player, env, max_steps, rng)
+            part = _patch_batch(player, played, batch_seed, max_steps, rng)
             parts.append(part[:, : episodes - group * size])
             if progress is not None:
                 progress(min(episodes, (group + 1) * size), episodes)
@@ -128,12 +133,15 @@ def patching(
 
 
 @torch.no_grad()
-def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator) -> Ints:
+@keeps_generator
+def _patch_batch(
+    agent: Any, played: EpisodeBatch, seed: int, max_steps: int, rng: np.random.Generator
+) -> Ints:
     """The first episode of every env of a batch: own, donor's and patched actions [3, N, T]."""
-    size = int(env.batch_size[0])
+    size = played.size
     playing = torch.ones(size, dtype=torch.bool)
     steps = list[Ints]()
-    obs = env.reset()
+    obs = played.reset(seed)
     state = agent.initial_state(size)
     seen = list[TensorDictBase]()
     while playing.any() and len(steps) < max_steps:
@@ -152,8 +160,8 @@ def _patch_batch(agent: Any, env: Any, max_steps: int, rng: np.random.Generator)
             actions[1, rows] = decided[donors][rows]
             actions[2, rows] = patched.cpu().numpy()[rows]
         steps.append(actions)
-        step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+        obs, _, done = played.step(action)
+        playing &= ~done.cpu()
     check_seen(agent, seen)
     return np.stack(steps, axis=-1)
 

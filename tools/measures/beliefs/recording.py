@@ -12,12 +12,15 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
-from arcade_torch.tools.measures.windows import held_out
+from arcade_torch.tools.measures.windows import held_out, keys_of
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.floating[Any]]  # single precision as recorded: states may be wide
 MIN_EPISODES = 8
+CLASSES = "biu"
+"""Kinds of types whose facts are classes."""
 NO_FACTS = "this game names no facts"
 
 
@@ -29,6 +32,30 @@ class Recording:
     features: Floats  # [E, T, F], of the frame of the step
     facts: Mapping[str, NDArray[Any]]  # [E, T, ...], bool, integers or floats
     lengths: Ints  # [E]
+
+    def __post_init__(self) -> None:
+        """Refuse what no probe can read (ValueError)."""
+        episodes, steps = self.states.shape[:2]
+        lengths = np.asarray(self.lengths)
+        fits = lengths.shape == (episodes,) and ((lengths >= 1) & (lengths <= steps)).all()
+        require(fits, "lengths", lengths.tolist(), f"from 1 to {steps} for each of {episodes}")
+        exists = np.arange(steps) < lengths[:, None]
+        for name, values in (("states", self.states), ("features", self.features)):
+            self._check_shape(name, values)
+            require(bool(np.isfinite(values[exists]).all()), name, "NaN or infinity", "finite")
+        for name, values in self.facts.items():
+            fact = f"the fact {name!r}"
+            self._check_shape(fact, values)
+            allowed = "bool, integers or floats"
+            require(values.dtype.kind in CLASSES + "f", fact, str(values.dtype), allowed)
+            has_infinity = values.dtype.kind == "f" and np.isinf(values[exists]).any()
+            require(not has_infinity, fact, "infinity", "finite, or NaN where it has no value")
+
+    def _check_shape(self, name: str, values: NDArray[Any]) -> None:
+        """Refuse values that are none of each episode and step."""
+        episodes, steps = self.states.shape[:2]
+        fits = values.shape[:2] == (episodes, steps)
+        require(fits, name, list(values.shape), f"[{episodes}, {steps}, ...] as the states are")
 
 
 @torch.no_grad()
@@ -52,39 +79,41 @@ def record(
             f"{type(env).__name__} has no facts(): hand over an ArcadeEnv, or an env whose facts() "
             "gives tensors [N, ...] by name"
         )
-    size = int(env.batch_size[0])
+    played = EpisodeBatch(env, keys_of(agent))
+    size = played.size
     parts = list[Recording]()
     with policy_of(agent).evaluating():
         for group in range(-(-episodes // size)):
             drawn = np.random.SeedSequence([seed, group]).generate_state(1)
-            env.set_seed(held_out(int(drawn[0]) % SEED_LIMIT))
-            part = _record_batch(agent, env, max_steps)
+            batch_seed = held_out(int(drawn[0]) % SEED_LIMIT)
+            part = _record_batch(agent, played, batch_seed, max_steps)
             parts.append(_first(part, episodes - group * size))
             if progress is not None:
                 progress(min(episodes, (group + 1) * size), episodes)
     return _joined(parts)
 
 
-def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
+@keeps_generator
+def _record_batch(agent: Any, played: EpisodeBatch, seed: int, max_steps: int) -> Recording:
     """The first episode of every env of a batch."""
     policy = policy_of(agent)
-    size = int(env.batch_size[0])
+    size = played.size
     lengths = np.zeros(size, np.int64)
     playing = torch.ones(size, dtype=torch.bool)
     steps = list[tuple[Floats, Floats, dict[str, NDArray[Any]]]]()
-    obs = env.reset()
+    obs = played.reset(seed)
     state = agent.initial_state(size)
     seen = list[TensorDictBase]()
     while playing.any() and len(steps) < max_steps:
         if len(seen) < FEW:
             seen.append(first_row(obs))
-        facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
+        facts = facts_of(played)
         features = policy.features(obs["pixels"])
         action, _, state = agent.act(obs, state)
         steps.append((flat_state(state, size), features.float().cpu().numpy(), facts))
         lengths += playing.numpy()
-        step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+        obs, _, done = played.step(action)
+        playing &= ~done.cpu()
     check_seen(agent, seen)
     states, all_features, all_facts = zip(*steps, strict=True)
     if not all_facts[0]:
@@ -93,6 +122,25 @@ def _record_batch(agent: Any, env: Any, max_steps: int) -> Recording:
     for name in all_facts[0]:
         by_name[name] = np.stack([facts[name] for facts in all_facts], axis=1)
     return Recording(np.stack(states, 1), np.stack(all_features, 1), by_name, lengths)
+
+
+def facts_of(played: EpisodeBatch) -> dict[str, NDArray[Any]]:
+    """The facts of the present states by name, each [N, ...].
+
+    Raises:
+        ValueError: a fact has not one value for each of the N envs.
+    """
+    facts = dict[str, NDArray[Any]]()
+    for name, value in played.env.facts().items():
+        values = torch.as_tensor(value).cpu().numpy().copy()
+        facts[name] = values if played.is_batch else values[None]
+        require(
+            facts[name].shape[:1] == (played.size,),
+            f"the fact {name!r}",
+            list(facts[name].shape),
+            f"[{played.size}, ...], one for each env",
+        )
+    return facts
 
 
 def first_row(obs: TensorDictBase) -> TensorDictBase:

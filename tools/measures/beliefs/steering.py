@@ -11,7 +11,7 @@ the state equally far in a random direction.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
 
 import numpy as np
 import torch
@@ -22,15 +22,19 @@ from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.beliefs.measure import Targets
 from arcade_torch.tools.measures.beliefs.patching import NOBODY, Patches, draw_donors
 from arcade_torch.tools.measures.beliefs.recording import (
+    CLASSES,
     Floats,
     Ints,
     Recording,
+    facts_of,
     record,
     shifted_state,
 )
 from arcade_torch.tools.measures.bootstrap import Array
+from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
+from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import Progress, policy_of
-from arcade_torch.tools.measures.windows import Twin, held_out, resolve_agent
+from arcade_torch.tools.measures.windows import Twin, held_out, keys_of, resolve_agent
 
 Arm = Literal["state", "fact", "random"]
 ARMS: tuple[Arm, ...] = ("state", "fact", "random")
@@ -85,6 +89,7 @@ def steering(
     seed: int = 0,
     observability: Twin | None = None,
     progress: Progress | None = None,
+    **names: Unpack[Names],
 ) -> Steering:
     """Move the recurrent states of greedy episodes along the directions of all facts.
 
@@ -95,6 +100,7 @@ def steering(
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, of donors and of random directions.
         progress: called with (episodes played, all of them).
+        **names: keywords of `as_policy`.
 
     Returns:
         Actions.
@@ -102,8 +108,9 @@ def steering(
     Raises:
         ValueError: an option is out of range, or the env names no facts or holds a single episode.
     """
-    player, env = resolve_agent(agent, env, observability)
-    size = int(env.batch_size[0])
+    player, env = resolve_agent(agent, env, observability, **names)
+    played = EpisodeBatch(env, keys_of(player))
+    size = played.size
     require(size >= 2, "the batch size of env", size, "at least 2, for donors")
 
     def fitted(done: int, count: int) -> None:
@@ -118,9 +125,9 @@ def steering(
     with policy_of(player).evaluating():
         for group in range(-(-episodes // size)):
             drawn = np.random.SeedSequence([seed, group, 5]).generate_state(1)
-            env.set_seed(held_out(int(drawn[0]) % SEED_LIMIT))
+            batch_seed = held_out(int(drawn[0]) % SEED_LIMIT)
             rng = np.random.default_rng([seed, group, 6])
-            part = _steer_batch(player, env, directions, max_steps, rng)
+            part = _steer_batch(player, played, batch_seed, directions, max_steps, rng)
             parts.append(part[:, : episodes - group * size])
             if progress is not None:
                 progress(episodes + min(episodes, (group + 1) * size), 2 * episodes)
@@ -131,8 +138,8 @@ def steering(
         padded.append(np.pad(part, missing, constant_values=NOBODY))
     action, donor_action, exchanged, *arms = np.concatenate(padded, axis=1)
     of_facts = np.array(arms, np.int64).reshape(2, -1, *action.shape)
-    names = np.array(directions.names, dtype=str)
-    return Steering(names, action, donor_action, exchanged, of_facts[0], of_facts[1])
+    facts = np.array(directions.names, dtype=str)
+    return Steering(facts, action, donor_action, exchanged, of_facts[0], of_facts[1])
 
 
 class Directions:
@@ -149,7 +156,7 @@ class Directions:
             present = flat[self.alive & exists(flat)]
             if len(present) and (present != present[0]).any():
                 self.facts[name] = flat
-                self.targets[name] = Targets.of(present, flat.dtype.kind in "bi")
+                self.targets[name] = Targets.of(present, flat.dtype.kind in CLASSES)
 
     @property
     def names(self) -> list[str]:
@@ -210,28 +217,34 @@ def flat_fact(values: NDArray[Any], batch_ndim: int) -> NDArray[Any]:
 
 def exists(flat: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether all cells [..., C] have a value."""
-    missing = flat < 0 if flat.dtype.kind in "bi" else np.isnan(flat)
+    missing = flat < 0 if flat.dtype.kind in CLASSES else np.isnan(flat)
     return np.asarray(~missing.any(axis=-1), np.bool_)
 
 
 @torch.no_grad()
+@keeps_generator
 def _steer_batch(
-    agent: Any, env: Any, directions: Directions, max_steps: int, rng: np.random.Generator
+    agent: Any,
+    played: EpisodeBatch,
+    seed: int,
+    directions: Directions,
+    max_steps: int,
+    rng: np.random.Generator,
 ) -> Ints:
     """The first episode of every env of a batch, [3 + 2 F, N, T]: own, donor's and exchanged
     decisions, then those moved for each fact, then those moved at random.
     """
-    size = int(env.batch_size[0])
+    size = played.size
     count = len(directions.names)
     playing = torch.ones(size, dtype=torch.bool)
     steps = list[Ints]()
     before = dict[str, NDArray[Any]]()  # facts of the step before
-    obs = env.reset()
+    obs = played.reset(seed)
     state = agent.initial_state(size)
     while playing.any() and len(steps) < max_steps:
         rows = playing.nonzero().flatten().numpy()
         donors = draw_donors(rows, size, rng)
-        facts = {name: value.cpu().numpy().copy() for name, value in env.facts().items()}
+        facts = facts_of(played)
         actions = np.full((3 + 2 * count, size), NOBODY, np.int64)
         if steps and len(rows) > 1 and count:
             # before the decision itself: acting may change the state in place
@@ -253,6 +266,6 @@ def _steer_batch(
             actions[1, rows] = decided[donors][rows]
         steps.append(actions)
         before = facts
-        step, obs = env.step_and_maybe_reset(obs.set("action", action))
-        playing &= ~step.get(("next", "done")).reshape(-1).cpu()
+        obs, _, done = played.step(action)
+        playing &= ~done.cpu()
     return np.stack(steps, axis=-1)

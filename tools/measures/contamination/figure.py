@@ -3,11 +3,12 @@ single examples.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
@@ -20,6 +21,11 @@ from arcade_torch.tools.measures.checkpoints import (
     measure_runs,
 )
 from arcade_torch.tools.measures.contamination import ContaminationOptions, measure
+from arcade_torch.tools.measures.contamination.example import (
+    action_names,
+    contamination_example_figure,
+    row_names,
+)
 from arcade_torch.tools.measures.section import Cells, section
 from arcade_torch.tools.options import at_least
 
@@ -31,10 +37,6 @@ MEASURES = {
 LEAST_SCALE = 0.1  # axes reach at least so far, so that small effects look small
 POWERLESS_BELOW = 0.02
 """Noise on the very frame that decides changes so few decisions: it cannot matter to any other."""
-# bars of an example, as in the paper
-CLEAN_BEST = "#354e6a"
-OTHER_BEST = "#a33a2f"
-REST = "#b3b3b3"
 
 NOISE: Mapping[str, Any] = {
     "sigmas": (0.3,),
@@ -142,7 +144,7 @@ def _example(label: Label, example: measure.Example) -> tuple[Any, str, list[dic
     agent, game, twin = label.task
     title = f"{label.agent}, {label.game}, {style.TWIN_NAMES[label.observability]}"
     figure = contamination_example_figure(example, title=title, figure=style.new_figure())
-    names = _row_names(example)
+    names = row_names(example)
     numbers = list[dict[str, Any]]()
     for row, hit in enumerate(example.hits):
         numbers += style.rows_of(
@@ -151,87 +153,13 @@ def _example(label: Label, example: measure.Example) -> tuple[Any, str, list[dic
             observability=twin,
             row=names[row],
             hit=None if hit < 0 else hit,
-            action=_action_names(example),
+            action=action_names(example),
             value=example.values[row],
         )
     shuffle = example.hits[1] < 0
     noise = "frames 2 to 10 shuffled" if shuffle else f"noise sigma = {example.sigma:g}"
     note = f"n = 1 episode, {noise}; blue: best action when clean, red: best if another"
     return figure, note, numbers
-
-
-def contamination_example_figure(
-    example: measure.Example,
-    *,
-    title: str = "",
-    actions: Sequence[str] | None = None,
-    figure: Any = None,
-) -> Any:
-    """Draw what `contamination_example` gave: rows are an episode as it was, and disturbed; columns
-    some of its frames, and bars of the outputs on its last, blue the best action when clean, red
-    the best if it is another.
-
-    Args:
-        example: of `contamination_example`.
-        title: stands above it.
-        actions: names of the actions; by default those of our games, or numbers.
-        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
-
-    Returns:
-        A matplotlib figure.
-    """
-    figure = need("matplotlib.pyplot").figure() if figure is None else figure
-    n = example.frames.shape[1] - 1
-    shuffle = example.hits[1] < 0
-    names = _row_names(example)
-    columns = 6 if shuffle else 3
-    figure.set_size_inches(1.6 * (columns + 1.7), 1.7 * len(names) + 0.8)
-    figure.set_layout_engine("constrained")
-    widths = [1.0] * columns + [1.7]
-    axes = figure.subplots(
-        len(names), columns + 1, squeeze=False, sharey="col", width_ratios=widths
-    )
-    for row, (*pictures, bars) in enumerate(axes):
-        if shuffle:
-            early = range(measure.FIRST + 1, measure.FIRST + 4)
-            late = range(n - 2, n + 1)
-            steps = [*early, *late]
-        else:
-            steps = [0, max(example.hits[row], example.hits[1]), n]
-        for axis, t in zip(pictures, steps, strict=True):
-            axis.imshow(example.frames[row, t], interpolation="nearest")
-            axis.set(xticks=[], yticks=[], frame_on=False)
-            axis.set_title(f"$o_{{{example.order[row, t]}}}$", parse_math=True)
-        pictures[0].set_ylabel(names[row], fontsize="small")
-        _plot_outputs(example, row, bars, _action_names(example) if actions is None else actions)
-    outputs = "probabilities" if example.target == "probs" else f"centred {example.target}"
-    axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
-    figure.suptitle(title, x=0.01, ha="left")
-    return figure
-
-
-def _row_names(example: measure.Example) -> list[str]:
-    """How the rows of an example are called."""
-    shuffle = example.hits[1] < 0
-    noisy = ["shuffled" if shuffle else f"noise on frame {hit}" for hit in example.hits[1:]]
-    return ["clean", *noisy]
-
-
-def _action_names(example: measure.Example) -> list[str]:
-    """The names of our games' actions where there are as many, or else numbers."""
-    count = example.values.shape[1]
-    names = list(ACTION_NAMES)
-    return names if count == len(names) else [str(action) for action in range(count)]
-
-
-def _plot_outputs(example: measure.Example, row: int, axis: Any, actions: Sequence[str]) -> None:
-    """Draw the outputs of a row as bars, that of the best action in colour."""
-    best = example.values.argmax(1)
-    axis.bar(actions, example.values[row], color=REST)
-    axis.patches[best[row]].set_facecolor(OTHER_BEST)
-    axis.patches[best[0]].set_facecolor(CLEAN_BEST)
-    axis.axhline(0.0, color=style.NEUTRAL, lw=0.8)
-    axis.tick_params(labelsize="small")
 
 
 def _table(label: Label, changes: measure.Contamination) -> Table:
@@ -308,8 +236,14 @@ def contamination_figure(
     seeds = dict[tuple[str, str, str], list[measure.Contamination]]()
     for agent, given in changes.items():
         seeds[agent, "", ""] = [given] if isinstance(given, measure.Contamination) else list(given)
+    all_seeds = list(chain.from_iterable(seeds.values()))
+    require(
+        all(seeds.values()) and len(all_seeds) > 0, "changes", changes, "of one policy at least"
+    )
+    require(name in MEASURES, "name", name, f"one of {', '.join(MEASURES)}")
+    _check_alike(all_seeds)
     agents = {task[0]: measures for task, measures in pool(seeds).items()}
-    first = next(iter(seeds.values()))[0]
+    first = all_seeds[0]
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(max(5.4, 3.2 * len(first.sigmas)), 3.2)
     figure.set_layout_engine("constrained")
@@ -322,8 +256,20 @@ def contamination_figure(
         axis.set_xlabel("steps to the decision")
     axes[0].set_ylabel(MEASURES[name])
     from_zero(axes[0])
-    axes[0].legend(fontsize="small")
+    style.plain_legend(axes[0])
     return figure
+
+
+def _check_alike(seeds: Sequence[measure.Contamination]) -> None:
+    """Refuse contaminations of other strengths or delays than the first has."""
+    for other in seeds[1:]:
+        same_sigmas = np.array_equal(seeds[0].sigmas, other.sigmas, equal_nan=True)
+        if not same_sigmas or not np.array_equal(seeds[0].delays, other.delays):
+            raise ValueError(
+                "changes in one figure must have the same sigmas and delays, got "
+                f"{seeds[0].sigmas.tolist()} and {other.sigmas.tolist()}, "
+                f"{seeds[0].delays.tolist()} and {other.delays.tolist()}"
+            )
 
 
 def reached(agents: Iterable[Measures]) -> int:

@@ -27,8 +27,15 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
-from arcade_torch.tools.measures.frames import pictures, white_of
+from arcade_torch.tools.measures.frames import float_type, pictures, white_of
 from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.masked import (
+    centred,
+    differences,
+    divergence,
+    refuse_nan,
+    span,
+)
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -123,7 +130,8 @@ def contamination(
         ValueError: an option is out of range, or no episode was long enough.
     """
     require(min(sigmas, default=-1) >= 0, "sigmas", list(sigmas), "numbers of at least 0")
-    require(min(delays, default=-1) >= 0, "delays", list(delays), "whole numbers of at least 0")
+    whole = len(delays) > 0 and all(int(delay) == delay >= 0 for delay in delays)
+    require(whole, "delays", list(delays), "whole numbers of at least 0")
     require(starts >= 1, "starts", starts, "at least 1")
     player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
@@ -263,7 +271,7 @@ class Probe:
         middle = window.n // 2
         features[middle] = self.policy.features(window.frames[middle : middle + 1])[0]
         again = replayed(self.policy, window, features[None], changed, self.feedback)
-        return float((again - raw).abs().max())
+        return float(differences(again, raw).max())
 
     def result(self) -> Contamination:
         """All changes; a ``ValueError`` if there is none."""
@@ -295,28 +303,23 @@ def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     clean = raw[0, steps]
     disturbed = raw[rows, steps]
     scalars = outputs(model, target)
-    a = _centred(scalars(clean))
-    b = _centred(scalars(disturbed))
-    spread = a.amax(-1) - a.amin(-1)
-    change = torch.where(spread > 0, (b - a).abs().amax(-1) / spread, torch.nan)
-    flip = (a.argmax(-1) != b.argmax(-1)).double()
+    before = scalars(clean).double().cpu()
+    after = scalars(disturbed).double().cpu()
+    flip = (before.argmax(-1) != after.argmax(-1)).double()
+    a, b = centred(before.expand_as(after), after)
+    spread = span(a)
+    change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
     kl = torch.full_like(flip, torch.nan)
     if target in ("logits", "probs"):
         logits = outputs(model, "logits")
         p = logits(clean).double().cpu().log_softmax(-1)
         q = logits(disturbed).double().cpu().log_softmax(-1)
-        kl = (p.exp() * (p - q)).sum(-1)
+        kl = divergence(p.expand_as(q), q)
 
     def where_reached(values: Tensor) -> Array:
         return np.asarray(torch.where(reached, values, torch.nan).numpy())
 
     return Changes(where_reached(flip), where_reached(change), where_reached(kl))
-
-
-def _centred(values: Tensor) -> Tensor:
-    """Outputs of actions minus their mean, in double precision on the CPU."""
-    values = values.double().cpu()
-    return values - values.mean(-1, keepdim=True)
 
 
 @dataclass(frozen=True)
@@ -329,7 +332,8 @@ class Example:
     frames: NDArray[np.uint8]
     order: Ints  # [R, T], the step of the trajectory at which each frame was seen
     hits: Ints  # [R], index of the noisy frame, -1 in rows without one
-    # float64 [R, A], outputs on the last frame minus their mean; of probabilities as they are
+    # float64 [R, A], outputs on the last frame minus their mean, NaN for actions that are masked
+    # out; of probabilities as they are
     values: Array
     target: str  # which outputs
     sigma: float  # standard deviation of the noise
@@ -373,7 +377,7 @@ def contamination_example(
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
-    versions = w.frames[torch.as_tensor(order)].float()
+    versions = w.frames[torch.as_tensor(order)].to(float_type(w.frames))
     white = white_of(w.frames, policy.white)
     if not shuffle:
         versions[range(1, len(order)), hits] = disturbed_frames(
@@ -382,24 +386,23 @@ def contamination_example(
     with policy.evaluating():
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
-        values = outputs(player, output)(raw).double().cpu().numpy()
-    values = values if output == "probs" else values - values.mean(1, keepdims=True)
+        values = outputs(player, output)(raw).double().cpu()
+    values = values if output == "probs" else centred(values, values)[0]
     drawn = pictures(versions.flatten(0, 1), policy.channels, white)
     drawn = drawn.reshape(*order.shape, *drawn.shape[1:])
-    return Example(drawn, order, np.array([-1, *hits]), values, output, sigma)
+    return Example(drawn, order, np.array([-1, *hits]), values.numpy(), output, sigma)
 
 
 def disturbed_frames(
     frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int, white: float = 255.0
 ) -> Tensor:
-    """Single frames with Gaussian noise, float32 [places * sigmas, ...]; the strengths of one frame
+    """Single frames with Gaussian noise, floats [places * sigmas, ...]; the strengths of one frame
     share its draw, and 1 stands for ``white``.
     """
     generator = torch.Generator().manual_seed(seed)
-    chosen = frames[torch.as_tensor(places)].to(torch.float32)
-    noise = torch.randn(chosen.shape, generator=generator).to(chosen.device)
-    scale = torch.as_tensor(white * sigmas, dtype=torch.float32, device=chosen.device)
-    scale = scale.reshape(-1, *[1] * (frames.ndim - 1))
+    chosen = frames[torch.as_tensor(places)].to(float_type(frames))
+    noise = torch.randn(chosen.shape, generator=generator).to(chosen)
+    scale = torch.as_tensor(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
     noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
     return noisy.clamp(0.0, white) if clip else noisy
 
@@ -430,7 +433,9 @@ def replayed(
     actions = window.last_action.expand(count, *window.last_action.shape)
     starts = window.is_init.bool().expand(count, -1)
     if not feedback:
-        return policy.remember(features, actions, starts, state)[0]
+        out = policy.remember(features, actions, starts, state)[0]
+        refuse_nan(out)
+        return out
     # Up to the first difference nothing has been chosen by the replay yet: the recorded actions
     # lead there.
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
@@ -440,5 +445,6 @@ def replayed(
         if actions.ndim == 3:
             action = one_hot(action, actions.shape[-1]).to(actions)
         out, state = policy.remember(features[:, t : t + 1], action, starts[:, t : t + 1], state)
+        refuse_nan(out)
         parts.append(out)
     return torch.cat(parts, 1)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
@@ -219,6 +220,8 @@ def counterfactual_figure(
     Returns:
         A matplotlib figure.
     """
+    require(len(effects) > 0, "effects", dict(effects), "of one policy at least")
+    require(effect in EFFECTS, "effect", effect, f"one of {', '.join(EFFECTS)}")
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(8.0, 3.2)
     figure.set_layout_engine("constrained")
@@ -233,7 +236,7 @@ def counterfactual_figure(
         axis.set_title(title)
         axis.set_xlabel("steps back from the decision")
     axes[0].set_ylabel(EFFECTS[effect])
-    axes[0].legend(fontsize="small")
+    style.plain_legend(axes[0])
     return figure
 
 

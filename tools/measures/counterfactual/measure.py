@@ -28,7 +28,9 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
+from arcade_torch.tools.measures.frames import as_array
 from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.masked import differences, refuse_nan, refuse_single
 from arcade_torch.tools.measures.policy import Policy, Progress, Target, as_policy, outputs
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
@@ -253,7 +255,7 @@ class Track:
 def _frame_ids(frames: Tensor) -> Ints:
     """A number for each frame, int64 [T], by its content."""
     ids = np.zeros(len(frames), np.int64)
-    for step, frame in enumerate(frames.cpu().numpy()):
+    for step, frame in enumerate(as_array(frames)):
         digest = hashlib.blake2b(frame.tobytes(), digest_size=8).digest()
         ids[step] = int.from_bytes(digest, "little", signed=True)
     return ids
@@ -334,7 +336,7 @@ class Exchange:
         raw = self._last_outputs(track, versions)
         if lags[0] == 0:
             alone = self._last_outputs(track, track.features[None])
-            self.clean_error = max(self.clean_error, float((raw[:1] - alone).abs().max()))
+            self.clean_error = max(self.clean_error, float(differences(raw[:1], alone).max()))
             self.certainty.append(self._certainty(raw[0]))
         return self._compare(raw[0], raw[1:], differs.ravel(), shape)
 
@@ -380,6 +382,7 @@ class Exchange:
         actions = track.last_action.expand(count, *track.last_action.shape)
         starts = track.is_init.expand(count, -1)
         out, _ = self.policy.remember(versions, actions, starts, state)
+        refuse_nan(out[:, -1])
         return out[:, -1]
 
     def _certainty(self, clean: Tensor) -> float:
@@ -389,6 +392,7 @@ class Exchange:
 
     def _read(self, clean: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Values of actions and their distribution, double [V, A], of outputs [V, R]."""
+        refuse_single(outputs(self.policy, self.target)(raw))
         if self.target == "q":
             read = outputs(self.policy, "q")
             values = read(raw).double().cpu()

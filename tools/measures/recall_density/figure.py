@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.comparable import listed
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
@@ -284,6 +285,7 @@ def recall_density_figure(
     Returns:
         A matplotlib figure.
     """
+    require(len(densities) > 0, "densities", dict(densities), "of one policy at least")
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(5.4, 3.2)
     figure.set_layout_engine("constrained")
@@ -300,7 +302,7 @@ def recall_density_figure(
     plot(series, axis, bins, lengths)
     axis.set_xlabel("time in the trajectory (1: the decision)")
     axis.set_ylabel(f"share of the gradient in 1/{bins}")
-    axis.legend(fontsize="small")
+    style.plain_legend(axis)
     return figure
 
 

@@ -1,5 +1,6 @@
-"""Whether a gradient of exactly zero is the truth, or a cut: a policy that detaches its state, or
-runs a part of it without gradients, depends on what autograd says nothing of.
+"""Gradients that say nothing: those that are no numbers, and zeros that are no truth but a cut. A
+policy that detaches its state, or runs a part of it without gradients, depends on what autograd
+says nothing of.
 """
 
 from collections.abc import Callable
@@ -8,6 +9,8 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+
+from arcade_torch.tools.measures.masked import differences
 
 NUDGE = 1e-2  # how far inputs are moved, of their mean size
 CHANGED = 1e-5  # of the outputs: more than rounding changes them
@@ -35,14 +38,30 @@ def refuse_cuts(outputs_of: Callable[[Tensor], Tensor], inputs: Tensor, reached:
     nudge = torch.rand(inputs.shape, generator=generator).to(inputs) * inputs.abs().mean() * NUDGE
     nudge[reached] = 0
     values = outputs_of(inputs)
-    raised = (outputs_of(inputs + nudge) - values).abs().max()
-    lowered = (outputs_of(inputs - nudge) - values).abs().max()
-    if torch.minimum(raised, lowered) > CHANGED * values.abs().max():
+    size = values.nan_to_num(posinf=0.0, neginf=0.0).abs().max()
+    raised = differences(outputs_of(inputs + nudge), values).max()
+    lowered = differences(outputs_of(inputs - nudge), values).max()
+    if torch.minimum(raised, lowered) > CHANGED * size:
         raise ValueError(
             f"the outputs change with {int((~reached).sum())} of {len(inputs)} frames by which they"
             " have no gradient: the policy detaches something, or runs a part under "
             "torch.no_grad(); let gradients through, or measure counterfactual recall, which needs "
             "none"
+        )
+
+
+def refuse_infinite(norms: Tensor) -> None:
+    """Refuse gradients that are NaN or infinite, by their norms.
+
+    Raises:
+        ValueError: one of them is.
+    """
+    if not norms.isfinite().all():
+        count = int((~norms.isfinite()).sum())
+        raise ValueError(
+            f"gradients must be numbers, got NaN or infinity for {count} of {len(norms)} frames: "
+            "the policy takes log(0), sqrt(0) or the like; or measure counterfactual recall, which "
+            "needs no gradient"
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arcade_torch.agents.checked import require
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress
@@ -98,6 +99,10 @@ def saliency_figure(
     Returns:
         A matplotlib figure.
     """
+    require(len(rows) > 0, "rows", list(rows), "one at least")
+    require(show >= 1, "show", show, "at least 1")
+    for title, frames, maps in rows:
+        _check_maps(title, np.shape(frames), maps)
     longest = max(len(frames) for _, frames, _ in rows)
     columns = min(show, longest)
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
@@ -111,6 +116,17 @@ def saliency_figure(
             f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False
         )
     return figure
+
+
+def _check_maps(title: str, frames: Sequence[int], maps: NDArray[np.floating]) -> None:
+    """Refuse maps that are not those of frames of a shape [T, *frame], or hold NaN."""
+    allowed = [list(frames)]
+    if len(frames) == 4:  # channels last, or first
+        allowed = [[*frames[:3]], [frames[0], *frames[2:]]]
+    name = f"the maps of {title!r}"
+    fits = list(np.shape(maps)) in allowed
+    require(fits, name, list(np.shape(maps)), " or ".join(map(str, allowed)))
+    require(bool(np.isfinite(maps).all()), name, "NaN or infinity", "finite")
 
 
 def plot(

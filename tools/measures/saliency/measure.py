@@ -11,18 +11,20 @@ Source: POPGym Arcade (ICML 2026), pixel saliency; the reference implementation 
 sum over actions instead (``reduce="sum", norm="l1"``, divided by 3).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Unpack, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
-from arcade_torch.tools.measures.frames import channel_axis
+from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
+from arcade_torch.tools.measures.masked import refuse_nan
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -31,7 +33,11 @@ from arcade_torch.tools.measures.policy import (
     outputs,
     resolve,
 )
-from arcade_torch.tools.measures.saliency.cuts import outside_inference, refuse_cuts
+from arcade_torch.tools.measures.saliency.cuts import (
+    outside_inference,
+    refuse_cuts,
+    refuse_infinite,
+)
 from arcade_torch.tools.measures.windows import MAX_STEPS, Twin, Window, greedy_window
 
 Reduce = Literal["per_action", "sum"]
@@ -69,26 +75,24 @@ def saliency(
     norm: Norm = "l2sq",
     target: Target = "auto",
     chunk: int = 8,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
     **names: Unpack[Names],
 ) -> Saliency:
     """Gradient of the outputs at step n with respect to every frame up to n.
 
     Args:
         model: a TensorDict policy, an agent, or anything else that `as_policy` takes.
-        frames: [T, H, W, C], [T, C, H, W] or any other shape of frames, oldest first.
+        frames: [T, H, W, C], [T, C, H, W] or any other shape, oldest first; a tensor or an array.
         last_action: [T], or one-hot [T, A], the action that led to each frame; zeros by default.
         is_init: bool [T] or [T, 1], whether a frame opens an episode; all false by default.
         state: recurrent state before the first frame, batch of one; by default the initial one.
         n: index of the step to explain, negative from the end.
         reduce: ``per_action`` (the paper: norms of single actions, summed) or ``sum`` (norm of the
             gradient of the sum over actions, in which opposite effects cancel).
-        norm: ``l2sq``, ``l2`` or ``l1``, over the channels of a pixel for ``maps``, over the frame
-            for ``per_frame``.
-        target: what is differentiated, see `outputs`: Q-values or, for a policy, action
-            probabilities by default.
+        norm: ``l2sq``, ``l2`` or ``l1``, over channels for ``maps``, the frame for ``per_frame``.
+        target: what is differentiated, see `outputs`: Q-values, or a policy's probabilities.
         chunk: frames pushed through the encoder at once; bounds memory.
-        dtype: of frames and gradients, float32 or float64 (the model's parameters must match).
+        dtype: of frames and gradients; by default that of float frames, and float32 for others.
         **names: keywords of `as_policy`.
 
     Raises:
@@ -97,13 +101,15 @@ def saliency(
         TypeError: ``model`` has none of the forms above.
     """
     policy = as_policy(model, **names)
+    frames = torch.as_tensor(frames)
+    dtype = dtype or float_type(frames)
     _check_options(reduce, norm, chunk, resolve(policy, target))
     steps = _index(n, frames) + 1
     # what is computed in inference mode has no gradient, in silence
     with torch.inference_mode(False), torch.enable_grad(), policy.evaluating():
         actions = outside_inference(_last_actions(policy, last_action, frames)[:steps])
         starts = outside_inference(_starts(is_init, frames)[:steps])
-        before = policy.initial_state(1) if state is None else outside_inference(state)
+        before = policy.initial_state(1) if state is None else outside_inference(_of_one(state))
         frames = outside_inference(frames[:steps])
         policy.check(frames, actions, starts, before, dtype)
 
@@ -162,6 +168,15 @@ def _starts(is_init: Tensor | None, frames: Tensor) -> Tensor:
     return _one_a_frame("is_init", is_init, frames).bool()
 
 
+def _of_one(state: Any) -> Any:
+    """A state of a batch of one; a dictionary as a TensorDict."""
+    if isinstance(state, Mapping) and not isinstance(state, TensorDictBase):
+        state = TensorDict(dict(state), [1])
+    size = list(state.batch_size if isinstance(state, TensorDictBase) else state.shape[:1])
+    require(size == [1], "state", size, "of batch size [1]")
+    return state
+
+
 def _decision(
     policy: Policy, actions: Tensor, starts: Tensor, state: Any, target: Target
 ) -> Callable[[Tensor], Tensor]:
@@ -181,6 +196,7 @@ def _decided(
 ) -> tuple[Tensor, Tensor]:
     """The outputs [A] of a decision, and their Jacobian [K, T, E] by the features [T, E]."""
     values = decide(features)
+    refuse_nan(values)
     jacobian = _jacobian(values, features, reduce)
     if reduce == "per_action":  # a sum over actions may rightly not change
         refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
@@ -188,8 +204,11 @@ def _decided(
 
 
 def _jacobian(values: Tensor, leaf: Tensor, reduce: Reduce) -> Tensor:
-    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E]."""
-    rows = torch.ones_like(values)[None] if reduce == "sum" else torch.eye(len(values)).to(values)
+    """Jacobian [K, T, E] (K = 1 for "sum") of the outputs [A] by the features [T, E], of those that
+    are finite: an action that is masked out is so whatever the frames are.
+    """
+    finite = values.isfinite()
+    rows = finite.to(values)[None] if reduce == "sum" else finite.to(values).diag()[finite]
     return torch.stack([_gradient(values, leaf, row) for row in rows])
 
 
@@ -218,7 +237,7 @@ def _frame_norms(
     per_pixel = jacobian.new_zeros(shape, dtype=dtype)
     per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
     needed = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
-    for index in needed.split(chunk):
+    for index in needed.split(chunk) if len(needed) else ():
         part = frames[index].to(dtype).requires_grad_()
         features = policy.encode(part)
         reached = torch.zeros_like(index, dtype=torch.bool)
@@ -231,6 +250,7 @@ def _frame_norms(
             per_frame[index] += total.sqrt() if norm == "l2" else total
             per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
         refuse_cuts(policy.encode, part, reached)
+    refuse_infinite(per_frame)
     return per_pixel, per_frame
 
 
@@ -292,5 +312,5 @@ def episode_saliency(
     if progress is not None:
         progress(1, 1)
     return EpisodeSaliency(
-        **vars(result), frames=longest.frames.cpu().numpy(), action=longest.action.cpu().numpy()
+        **vars(result), frames=as_array(longest.frames), action=longest.action.cpu().numpy()
     )

@@ -1,0 +1,170 @@
+"""Actions that are masked out, with values of minus infinity or no probability, and outputs that are
+no numbers.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor
+
+from arcade_torch.tools import Policy, contamination, counterfactual, recall_density, saliency
+from arcade_torch.tools.measures.masked import divergence
+from arcade_torch.tools.measures.policy import read_plain
+from tests.tools.measures.toys import ACTIONS, SIZE, ToyEnv, linear_policy, window
+
+TARGETS = ["q", "logits", "probs"]
+
+
+def with_masked(policy: Policy, kind: str, value: float = -torch.inf) -> Policy:
+    """The same policy with one more action, which is masked out; the mask is added to its outputs,
+    which are of ``kind``.
+    """
+
+    def remember(*read: Any) -> tuple[Tensor, Any]:
+        out, state = policy.remember(*read)
+        return torch.cat(
+            [out[..., :1], torch.full_like(out[..., :1], value), out[..., 1:]], -1
+        ), state
+
+    offers = ("q", "value") if kind == "q" else ("logits", "probs")
+    return replace(policy, remember=remember, read=read_plain, offers=offers)
+
+
+def plain(kind: str) -> Policy:
+    """A memory that forgets by halves, whose outputs are of ``kind``."""
+    policy = linear_policy(0.5, dtype=torch.float32, pixel_scale=255.0)
+    return replace(policy, offers=("q", "value") if kind == "q" else ("logits", "probs"))
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+def test_an_action_that_is_masked_out_changes_no_measure(kind: str) -> None:
+    target: Any = kind
+    noise = {"sigmas": (1.0,), "delays": (0, 1, 2), "starts": 20, "target": target}
+    without, with_mask = (
+        contamination(policy, ToyEnv([6, 8]), **noise)
+        for policy in (plain(kind), with_masked(plain(kind), kind))
+    )
+    assert without.mean("flip")[0, 0] > 0.2
+    np.testing.assert_array_equal(with_mask.flip, without.flip)
+    if kind != "probs":  # there the mean goes over one more action, which has 0
+        np.testing.assert_allclose(with_mask.change, without.change, rtol=1e-5)
+    np.testing.assert_allclose(with_mask.kl, without.kl, rtol=1e-5, atol=1e-9)
+    assert np.isfinite(with_mask.kl).any() == (kind != "q")
+    exchange = {"episodes": 6, "donors": 2, "target": target}
+    without, with_mask = (
+        counterfactual(policy, ToyEnv([6] * 6), **exchange)
+        for policy in (plain(kind), with_masked(plain(kind), kind))
+    )
+    for effect in ("flip", "distance", "change"):
+        values = getattr(with_mask, effect)
+        assert np.isfinite(values).any()
+        # of Q-values the softmax is in units of the gap, in which a masked action has no part
+        np.testing.assert_allclose(values, getattr(without, effect), rtol=1e-5, atol=1e-9)
+    frames = window(5).frames
+    one, other = (
+        saliency(policy, frames, target=target).per_frame
+        for policy in (plain(kind), with_masked(plain(kind), kind))
+    )
+    np.testing.assert_allclose(other, one, rtol=1e-5)
+
+
+def of_probs(rho: float = 0.5) -> TensorDictSequential:
+    """A policy that writes probabilities, one of them 0, of the last frame alone."""
+    policy = linear_policy(rho, dtype=torch.float32, pixel_scale=255.0)
+
+    def probs(pixels: Tensor) -> Tensor:
+        out, _ = policy.remember(
+            policy.encode(pixels)[:, None], None, torch.ones(len(pixels), 1).bool(), None
+        )
+        return torch.cat([out[:, 0].softmax(-1), torch.zeros(len(pixels), 1)], -1)
+
+    return TensorDictSequential(TensorDictModule(probs, ["pixels"], ["probs"]))
+
+
+def test_a_probability_that_becomes_zero_has_a_large_divergence_and_no_infinite_one() -> None:
+    p = torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    q = torch.tensor([[0.5, 0.5, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, 0.5]], dtype=torch.float64)
+    same, large, half = divergence(p.log(), q.log()).tolist()
+    assert same == 0 and half == pytest.approx(np.log(2))
+    assert 50 < large < 60 and divergence(p.log(), p.log()).tolist() == [0, 0, 0]
+
+
+def test_the_logits_of_probabilities_of_zero_have_no_gradient() -> None:
+    """Before: 0 times infinity, and all shares were 0."""
+    found = saliency(of_probs(), window(4).frames, target="logits")
+    assert len(found.output) == ACTIONS + 1 and np.isfinite(found.maps).all()
+    assert found.shares().tolist() == [0, 0, 0, 1]
+    assert recall_density(of_probs(), ToyEnv([4]), episodes=1, target="logits").silent == 0
+    changes = contamination(of_probs(), ToyEnv([6]), sigmas=(1.0,), delays=(0, 1), starts=4)
+    assert np.isfinite(changes.kl).all() and changes.kl[:, 0, 0].max() > 0
+
+
+def test_gradients_that_are_no_numbers_are_refused() -> None:
+    """Before: all shares were 0, and recall density counted a trajectory without any gradient."""
+    encode = linear_policy(0.5, dtype=torch.float32).encode
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        return (features - features.detach()).sqrt() + features, None
+
+    policy = Policy(encode, remember)
+    with pytest.raises(ValueError, match=r"^gradients must be numbers, got NaN or infinity for 4"):
+        saliency(policy, window(4).frames)
+    with pytest.raises(ValueError, match=r"^gradients must be numbers"):
+        recall_density(policy, ToyEnv([4]), episodes=1)
+
+
+def test_a_masked_policy_is_tried_like_any_other() -> None:
+    """Before: nothing was small beside infinity."""
+    causal = linear_policy(0.5, dtype=torch.float32)
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        out, state = causal.remember(features, *rest)
+        return out + out.mean(1, keepdim=True), state
+
+    ahead = with_masked(Policy(causal.encode, remember, causal.initial_state), "q")
+    with pytest.raises(ValueError, match="in one go"):
+        saliency(ahead, window(5).frames)
+
+    def detached(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        return causal.remember(features.detach(), *rest)
+
+    cut = with_masked(Policy(causal.encode, detached, causal.initial_state), "q")
+    with pytest.raises(ValueError, match="no gradient"):
+        saliency(cut, window(5).frames)
+
+
+MEASURES: dict[str, Callable[[Any], Any]] = {
+    "saliency": lambda policy: saliency(policy, window(6).frames),
+    "recall density": lambda policy: recall_density(policy, ToyEnv([9]), episodes=1),
+    "counterfactual": lambda policy: counterfactual(policy, ToyEnv([9] * 2), episodes=2, donors=1),
+    "contamination": lambda policy: contamination(
+        policy, ToyEnv([9]), sigmas=(1.0,), delays=(0, 1), starts=4
+    ),
+}
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("measure", MEASURES)
+def test_outputs_that_are_no_numbers_are_refused(measure: str, late: bool) -> None:
+    """Before: NaN was the best action of all frames, and nothing changed it."""
+    causal = linear_policy(0.5, dtype=torch.float32)
+
+    def encode(frames: Tensor) -> Tensor:
+        features = causal.encode(frames)
+        is_late = frames.reshape(-1, SIZE * SIZE * 3)[:, :1] == 5  # the first pixel counts steps
+        return torch.where(is_late | (not late), torch.nan, features)
+
+    policy = replace(causal, encode=encode)
+    if measure == "saliency" and late:
+        frames = window(6).frames
+        frames[-1, 0, 0, 0] = 5
+        with pytest.raises(ValueError, match=r"^the policy's outputs must be numbers, got NaN"):
+            saliency(policy, frames)
+        return
+    with pytest.raises(ValueError, match=r"^the policy's outputs must be numbers, got NaN"):
+        MEASURES[measure](policy)
