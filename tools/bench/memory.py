@@ -54,7 +54,8 @@ class Options(BenchOptions):
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
 
-    memories: tuple[str, ...] = ()  # Memory models; all of them by default.
+    memories: tuple[str, ...] = ()
+    """Memory models, which may stand first without this word; all of them by default."""
     steps: tuple[int, ...] = (132, 1024)  # Lengths of the sequences.
     layers: tuple[int, ...] = (1, 2)  # Cells one above the other.
     size: int = 512  # Width of input and output.
