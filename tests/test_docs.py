@@ -224,6 +224,24 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(linked), f"{name(page)} links to {target}"
 
 
+def test_files_of_the_repository_that_a_page_names_are_there() -> None:
+    folders = ("agents", "arcade_torch", "envs_jax", "models", "tools", "tests", "examples")
+    ours = re.compile(rf"`((?:{'|'.join(folders)})/[\w/.-]+\.\w+)`")
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":  # what it names was there once
+            continue
+        for path in ours.findall(page.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{name(page)} names {path}"
+
+
+def test_the_index_of_results_names_all_of_them() -> None:
+    index = (ROOT / "results/README.md").read_text(encoding="utf-8")
+    made_by_hand = {"README.md", "gpu.md", "bench.json", "bench.md"}  # the last three by make
+    for path in (ROOT / "results").iterdir():
+        stem = path.name.rpartition(".")[0] or path.name
+        assert path.name in made_by_hand or stem in index, f"results/README.md: {path.name}"
+
+
 def test_the_table_of_environments_is_true() -> None:
     from arcade_torch.envs_jax import make, registered_ids
 
