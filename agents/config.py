@@ -86,8 +86,9 @@ class LearnerConfig(Checked):
     average_share: Fraction = 0.0
     """The weights that act and are saved are a mean of those that learn, over about this share of
     the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824). The share grows with the
-    training return: none at the lowest that the game can pay, all of it at the highest, a fourth
-    power between (``agents.learner.window_share``). 0: no mean.
+    training return: none at the lowest that the game can pay, all of it at the highest, between
+    them by the fourth power, or a higher one in games that pay less than 0 (``window_share`` in
+    ``agents/learner.py``). 0: no mean.
     """
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the

@@ -5,7 +5,7 @@ import importlib
 import re
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -288,3 +288,32 @@ def test_every_layer_and_name_of_the_readme_exists() -> None:
         assert hasattr(models, public)
     for folder in first_cells(section(ROOT / "docs/architecture.md", "Layers")):
         assert (ROOT / folder.rstrip("/")).is_dir()
+
+
+def test_the_files_of_a_step_are_those_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    import arcade_torch
+    from arcade_torch import compiled
+
+    part = section(ROOT / "docs/architecture.md", "One step of an environment")
+    rows = [path.replace("<game>", "minesweeper") for path in first_cells(part)]
+    monkeypatch.setattr(compiled, "_compile", compiled._compile.__wrapped__)  # compile it anew
+    env = arcade_torch.make("MineSweeperEasy", num_envs=2)
+    root = env.rand_action(env.reset())
+    seen: dict[str, None] = {}
+
+    def note(frame: Any, event: str, argument: object) -> None:
+        seen.setdefault(frame.f_code.co_filename)
+
+    sys.setprofile(note)
+    try:
+        env.step(root)
+    finally:
+        sys.setprofile(None)
+    ours = [file for file in seen if "site-packages" not in file and not file.startswith("<")]
+    paths = [Path(file).resolve() for file in ours]
+    opened = [path.relative_to(ROOT).as_posix() for path in paths if path.is_relative_to(ROOT)]
+    assert [path for path in opened if path in rows] == rows
+    others = {path.removeprefix("arcade_torch/") for path in opened if path not in rows}
+    assert others - {"tests/test_docs.py"} <= set(re.findall(r"`([\w/]+\.py)`", part))
