@@ -306,7 +306,9 @@ class TrainConfig(Checked):
     network without any.
     """
     network: Text = "paper"
-    """Network preset around the memory model: ``"paper"`` or ``"small"``."""
+    """Network preset around the memory model: ``"paper"``, ``"small"`` or ``"small64"``, which sees
+    64 instead of 32 pixels.
+    """
     network_options: Options = field(default_factory=dict)
     """Further options of ``make_network``."""
     algorithm: Literal["pqn", "ppo", "dqn"] = "pqn"

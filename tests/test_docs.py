@@ -317,3 +317,28 @@ def test_the_files_of_a_step_are_those_of_the_page(monkeypatch: pytest.MonkeyPat
     assert [path for path in opened if path in rows] == rows
     others = {path.removeprefix("arcade_torch/") for path in opened if path not in rows}
     assert others - {"tests/test_docs.py"} <= set(re.findall(r"`([\w/]+\.py)`", part))
+
+
+def test_the_presets_on_the_page_are_those_that_there_are() -> None:
+    from arcade_torch.agents import preset, preset_names
+
+    text = (ROOT / "docs/guides/training.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| (\w+) \| ([\d,]+) \|", text, re.MULTILINE)
+    assert sorted(row[0] for row in rows) == preset_names()
+    for chosen, algorithm, network, frames in rows:
+        config = preset(chosen, env="SkittlesEasy")
+        assert (config.algorithm, config.network) == (algorithm, network)
+        assert config.total_frames == int(frames.replace(",", ""))
+
+
+def test_variables_of_the_shell_that_are_read_are_on_a_page() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    reads = re.compile(r"environ(?:\.get|\.setdefault)?[(\[]\s*\"([A-Z_]+)\"")
+    read = set()
+    for folder in ("agents", "arcade_torch", "envs_jax", "models", "tools"):
+        for path in (ROOT / folder).rglob("*.py"):
+            read |= set(reads.findall(path.read_text(encoding="utf-8")))
+    known_to_all = {"COLUMNS", "PYGAME_HIDE_SUPPORT_PROMPT", "PYTHONOPTIMIZE", "TERM"}
+    assert len(read) > 4
+    for variable in read - known_to_all:
+        assert f"`{variable}" in text, variable
