@@ -342,3 +342,14 @@ def test_variables_of_the_shell_that_are_read_are_on_a_page() -> None:
     assert len(read) > 4
     for variable in read - known_to_all:
         assert f"`{variable}" in text, variable
+
+
+def test_the_keys_of_a_study_on_the_page_are_those_that_it_takes() -> None:
+    from dataclasses import fields
+
+    from arcade_torch.tools.studies.grid import Study
+
+    part = section(ROOT / "docs/cluster.md", "The file of a study")
+    first = re.findall(r"^\| (`.+?`) \|", part, re.MULTILINE)
+    named = {key for cell in first for key in re.findall(r"`(\w+)`", cell)}
+    assert named == {field.name for field in fields(Study)}
