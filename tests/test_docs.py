@@ -353,3 +353,14 @@ def test_the_keys_of_a_study_on_the_page_are_those_that_it_takes() -> None:
     first = re.findall(r"^\| (`.+?`) \|", part, re.MULTILINE)
     named = {key for cell in first for key in re.findall(r"`(\w+)`", cell)}
     assert named == {field.name for field in fields(Study)}
+
+
+def test_the_arguments_of_make_on_the_page_are_those_that_it_takes() -> None:
+    import inspect
+
+    import arcade_torch
+
+    named = first_cells(section(ROOT / "docs/environments.md", "What `make` takes"))
+    taken = list(inspect.signature(arcade_torch.make).parameters)
+    taken.remove("partial_obs")  # stands beside what it is an alias of
+    assert named == taken
