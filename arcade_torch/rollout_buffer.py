@@ -175,12 +175,23 @@ class RolloutBuffer:
         if not reuse:
             self._allocate()
         self._wanted = np.zeros_like(wanted)
-        # the next window begins with it
+        # also where nobody wants them now: the overlap of the next window begins with them
         self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")
         if self._fills_dense and self._dense is None:
             self._dense = _taken(self._new_dense)
-        if not carry:
-            return self._first
+        if carry:
+            self._carry_overlap(before, final, wanted)
+        return self._first
+
+    def _carry_overlap(
+        self,
+        before: Mapping[NestedKey, torch.Tensor],
+        final: Mapping[NestedKey, torch.Tensor],
+        wanted: np.ndarray,
+    ) -> None:
+        """Put the last steps of the window before in front of this one: its buffers, final
+        observations, and whose were wanted.
+        """
         for key, target in self._buffers().items():
             if key in self._kept:
                 target[:, : self.overlap] = self._kept[key]
@@ -201,7 +212,6 @@ class RolloutBuffer:
             source_place = upload(then, self.device)
             for key, places in self._final.items():
                 places[row, target_place] = final[key][row, source_place]
-        return self._first
 
     def place(self, step: int) -> Place | None:
         """Where the ``pixels`` that a step sees may be drawn; None on a GPU, or if the window ends
