@@ -20,6 +20,10 @@ from arcade_torch.agents.checked import (
 )
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
+MOST_EPISODES = 2**16
+"""Of an evaluation. They are played side by side, one an environment: the frames of one step of so
+many take 3 GB at 128 pixels.
+"""
 # Names that are no options, because other fields decide them and learners rely on them.
 OF_ENV = (
     "id",
@@ -46,6 +50,7 @@ OF_NETWORK = (
 DEVICE = re.compile(r"cpu(:0)?|cuda(:(0|[1-9][0-9]{0,2}))?")
 Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", DEVICE.fullmatch)]
 Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
+Episodes = Annotated[int, Range(f"from 1 to {MOST_EPISODES}", lambda x: 1 <= x <= MOST_EPISODES)]
 TimeLimit = Literal["bootstrap", "terminal"]
 Bootstrap = Literal["next", "last"]
 
@@ -335,7 +340,7 @@ class TrainConfig(Checked):
     """
     eval_every: CountOrZero = 1_000_000
     """Frames between greedy evaluations; 0 evaluates only at the end."""
-    eval_episodes: Annotated[int, Range("from 1 to 65536", lambda x: 1 <= x <= 2**16)] = 128
+    eval_episodes: Episodes = 128
     """Episodes of each evaluation, one in each of as many fresh environments."""
     checkpoint_every: CountOrZero = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""
