@@ -364,3 +364,11 @@ def test_the_arguments_of_make_on_the_page_are_those_that_it_takes() -> None:
     taken = list(inspect.signature(arcade_torch.make).parameters)
     taken.remove("partial_obs")  # stands beside what it is an alias of
     assert named == taken
+
+
+def test_the_columns_of_human_scores_on_the_page_are_those_that_are_written() -> None:
+    from arcade_torch.tools.play.scores import COLUMNS
+
+    text = (ROOT / "docs/play.md").read_text(encoding="utf-8").split("### Scores of people")[1]
+    first = re.findall(r"^\| (`.+?`) \|", text, re.MULTILINE)
+    assert tuple(column for cell in first for column in re.findall(r"`(\w+)`", cell)) == COLUMNS
