@@ -13,8 +13,6 @@ from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 
-PARTS_BEFORE_TRAINING = 5
-
 
 @dataclass
 class Card(Command):
