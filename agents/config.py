@@ -303,7 +303,7 @@ class TrainConfig(Checked):
     obs_size: Count = 128
     """Height and width of the frames, pixels."""
     rules: Literal["default", "reference"] = "default"
-    """Law of the games; ``"reference"`` is the one the published numbers were made with."""
+    """Rules of the games; ``"reference"``: those that the published numbers were made with."""
     env_options: Options = field(default_factory=dict)
     """Further options of the game."""
     memory: Text = "lru"
