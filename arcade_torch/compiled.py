@@ -128,8 +128,8 @@ class CompiledGame:
         return (memory, *leaves)
 
     def calls_back(self, batch: Batch) -> bool:
-        """Whether a step of this batch runs Python code of a game, or what else may fail while it
-        runs.
+        """Whether a step of this batch calls Python or foreign code of a game, which may fail while
+        the step runs.
         """
         if self._calls_back is None:
             action = np.zeros(len(batch.step_count), np.int32)
@@ -216,7 +216,7 @@ def compiled_game(
             nor a list.
     """
     # what a bare name means may change
-    ids = resolve_id(id) if isinstance(id, str) else tuple(_checked(id))
+    ids = resolve_id(id) if isinstance(id, str) else tuple(_resolved_ids(id))
     obs_size = plain(obs_size)
     options = {name: plain(options[name]) for name in sorted(options)}
     try:
@@ -229,8 +229,8 @@ def compiled_game(
     return compiled
 
 
-def _checked(ids: Any) -> Sequence[str]:
-    """Refuse what is no list of ids."""
+def _resolved_ids(ids: Any) -> Sequence[str]:
+    """Ids with their versions; refuse what is no list of ids."""
     if not isinstance(ids, Sequence) or isinstance(ids, bytes):
         raise TypeError(
             f"the env id is {format_value(ids)}, expected a string such as 'CartPoleEasy', or a "
